@@ -1,0 +1,1 @@
+"""Geo-registered feature maps: value types, geodesy, features, store and index."""

@@ -1,0 +1,59 @@
+"""One tree of errors under `FeatureDbError`.
+
+A message says what was expected, what was found, in which object, and what to do. Outcomes that a
+user must expect (not localised, not registered, rejected by a gate) are values, not errors.
+"""
+
+
+class FeatureDbError(Exception):
+    """Base of every error that this system raises on purpose."""
+
+
+class InvalidValueError(FeatureDbError, ValueError):
+    """A value breaks the rules of its type (shape, finiteness, range, unit)."""
+
+
+class GeodesyError(FeatureDbError):
+    """A coordinate or CRS cannot be used: outside UTM's limits, unknown EPSG code, wrong kind of CRS."""
+
+
+class ImageError(FeatureDbError):
+    """An image cannot be read: not an image, truncated, too large, too small."""
+
+
+class IncompatibleExtractorError(FeatureDbError):
+    """Features of one extractor meet a map of another; their descriptors cannot be compared."""
+
+
+class StoreError(FeatureDbError):
+    """The database cannot do what was asked: no database there, unknown map, broken table."""
+
+
+class DatabaseNotFoundError(StoreError):
+    """There is no database at the given place."""
+
+
+class MapNotFoundError(StoreError):
+    """The snapshot has no map with that id."""
+
+
+class SnapshotNotFoundError(StoreError):
+    """The database has no snapshot with that number or before that time."""
+
+
+class ConflictError(StoreError):
+    """Concurrent writers collided more often than the bounded retries allow."""
+
+
+class IngestError(FeatureDbError):
+    """An ingest cannot go on: nothing usable in the folder, or a work folder of another job."""
+
+
+class ServiceError(FeatureDbError):
+    """The server answered with an error; `code` is one of the wire's error codes."""
+
+    def __init__(self, code: str, message: str, request_id: str | None = None) -> None:
+        super().__init__(f"{code}: {message}")
+        self.code = code
+        self.message = message
+        self.request_id = request_id

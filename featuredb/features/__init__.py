@@ -1,0 +1,1 @@
+"""Keypoints and RootSIFT descriptors: the one extractor that ingest and queries share."""

@@ -1,0 +1,69 @@
+"""The features of one image."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import frozen_array
+
+DESCRIPTOR_SIZE = 128
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Features:
+    """Keypoints with RootSIFT descriptors of one image, in the image's own full-size pixels.
+
+    Attributes:
+        xy: (n, 2) float32, pixels of the full-size image; centre of the top-left pixel is (0.5, 0.5).
+        scale: (n,) float32, keypoint diameter in full-size pixels.
+        angle: (n,) float32, degrees in [0, 360), clockwise from the x axis (OpenCV); 0 when upright.
+        response: (n,) float32, the detector's contrast; larger is stronger.
+        descriptors: (n, 128) uint8, round(512 sqrt(d / |d|_1)) clipped to 255; length about 512.
+        width, height: full size of the image in pixels.
+        fingerprint: which extractor made the descriptors; only equal fingerprints may be compared.
+    """
+
+    xy: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    response: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    width: int
+    height: int
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        xy = frozen_array("Features.xy", self.xy, (None, 2), np.float32)
+        n = len(xy)
+        checked: dict[str, NDArray[Any]] = {
+            "xy": xy,
+            "scale": frozen_array("Features.scale", self.scale, (n,), np.float32),
+            "angle": frozen_array("Features.angle", self.angle, (n,), np.float32),
+            "response": frozen_array("Features.response", self.response, (n,), np.float32),
+            "descriptors": frozen_array(
+                "Features.descriptors", self.descriptors, (n, DESCRIPTOR_SIZE), np.uint8
+            ),
+        }
+        if self.width <= 0 or self.height <= 0:
+            raise InvalidValueError(f"Features: expected a size > 0, found {self.width}x{self.height}")
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def take(self, rows: NDArray[Any]) -> "Features":
+        """The features of the given rows (index or boolean array (n,)), in that order."""
+        return Features(
+            xy=self.xy[rows],
+            scale=self.scale[rows],
+            angle=self.angle[rows],
+            response=self.response[rows],
+            descriptors=self.descriptors[rows],
+            width=self.width,
+            height=self.height,
+            fingerprint=self.fingerprint,
+        )

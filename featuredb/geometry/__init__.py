@@ -1,0 +1,1 @@
+"""Rotations, rigid and similarity transforms, cameras: pure functions and values, no I/O."""

@@ -1,0 +1,137 @@
+"""Rigid transforms of space, with the covariance of their left perturbation."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rotation import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotation_angle,
+    skew,
+    so3_exp,
+    so3_log,
+)
+
+_SMALL_ANGLE = 1e-6  # below this the series' next term is under float64's resolution
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rigid3:
+    """x_target = rotation @ x_source + translation; name instances `target_from_source`.
+
+    The tangent vector is (omega, nu): rotation in radians before translation in metres. A covariance
+    that belongs to a Rigid3 is that of its left perturbation: T_true = exp(xi) T, xi ~ N(0, cov), with
+    axes of the target frame.
+
+    Attributes:
+        rotation: (3, 3) float64, orthonormal, determinant +1.
+        translation: (3,) float64, metres (or the unit of the target frame).
+    """
+
+    rotation: FloatArray
+    translation: FloatArray
+
+    def __post_init__(self) -> None:
+        rotation = frozen_array("Rigid3.rotation", self.rotation, (3, 3))
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+            raise InvalidValueError(
+                "Rigid3.rotation: expected an orthonormal matrix with determinant +1, "
+                f"found {rotation.tolist()}; use nearest_rotation() to clean up a noisy one"
+            )
+        object.__setattr__(self, "rotation", rotation)
+        object.__setattr__(self, "translation", frozen_array("Rigid3.translation", self.translation, (3,)))
+
+    @classmethod
+    def identity(cls) -> Self:
+        return cls(rotation=np.eye(3), translation=np.zeros(3))
+
+    @classmethod
+    def from_quaternion(cls, xyzw: ArrayLike, translation: ArrayLike) -> Self:
+        """From a Hamilton quaternion (x, y, z, w) and a translation (3,)."""
+        return cls(
+            rotation=matrix_from_quaternion(xyzw), translation=np.asarray(translation, dtype=np.float64)
+        )
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Self:
+        """From a (3, 4) or (4, 4) matrix [R | t]."""
+        m = np.asarray(matrix, dtype=np.float64)
+        return cls(rotation=m[:3, :3], translation=m[:3, 3])
+
+    @classmethod
+    def exp(cls, tangent: ArrayLike) -> Self:
+        """Exponential of se(3), tangent (6,) = (omega, nu). Barfoot, State Estimation for Robotics, 7.1.3."""
+        xi = frozen_array("Rigid3.exp tangent", tangent, (6,))
+        return cls(rotation=so3_exp(xi[:3]), translation=_left_jacobian(xi[:3]) @ xi[3:])
+
+    def log(self) -> FloatArray:
+        """Inverse of `exp`: (6,) = (omega, nu), |omega| <= pi."""
+        omega = so3_log(self.rotation)
+        return np.concatenate([omega, np.linalg.solve(_left_jacobian(omega), self.translation)])
+
+    def __matmul__(self, other: "Rigid3") -> "Rigid3":
+        """c_from_b @ b_from_a = c_from_a."""
+        return Rigid3(
+            rotation=self.rotation @ other.rotation,
+            translation=self.rotation @ other.translation + self.translation,
+        )
+
+    def inverse(self) -> "Rigid3":
+        return Rigid3(rotation=self.rotation.T, translation=-self.rotation.T @ self.translation)
+
+    def act(self, points: ArrayLike) -> FloatArray:
+        """Transform points (..., 3) of the source frame into the target frame, (..., 3) float64."""
+        return np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
+
+    def adjoint(self) -> FloatArray:
+        """(6, 6) matrix with T exp(xi) = exp(Ad xi) T for xi = (omega, nu)."""
+        ad = np.zeros((6, 6))
+        ad[:3, :3] = ad[3:, 3:] = self.rotation
+        ad[3:, :3] = skew(self.translation) @ self.rotation
+        return ad
+
+    def inverse_covariance(self, covariance: ArrayLike) -> FloatArray:
+        """Covariance (6, 6) of `self.inverse()`, given that of `self`: moved by the adjoint of the inverse."""
+        ad = self.inverse().adjoint()
+        return ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
+
+    def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
+        """Covariance (6, 6) of `self @ other` for independent errors of both, to first order."""
+        ad = self.adjoint()
+        return np.asarray(covariance, dtype=np.float64) + ad @ np.asarray(other_covariance) @ ad.T
+
+    @property
+    def quaternion_xyzw(self) -> FloatArray:
+        """Hamilton quaternion (x, y, z, w), w >= 0."""
+        return quaternion_from_matrix(self.rotation)
+
+    @property
+    def center(self) -> FloatArray:
+        """Origin of the target frame in the source frame, (3,): for cam_from_world the camera centre."""
+        return -self.rotation.T @ self.translation
+
+    def matrix(self) -> FloatArray:
+        """(4, 4) homogeneous matrix."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.rotation, self.translation
+        return m
+
+    def angle_to_deg(self, other: "Rigid3") -> float:
+        """Angle in degrees between the two rotations."""
+        return float(np.degrees(rotation_angle(self.rotation @ other.rotation.T)))
+
+
+def _left_jacobian(omega: FloatArray) -> FloatArray:
+    """Left Jacobian of SO(3): V with exp(omega, nu) = (exp(omega), V nu)."""
+    theta = float(np.linalg.norm(omega))
+    k = skew(omega)
+    if theta < _SMALL_ANGLE:
+        return np.eye(3) + 0.5 * k + k @ k / 6.0
+    a = (1.0 - np.cos(theta)) / theta**2
+    b = (theta - np.sin(theta)) / theta**3
+    return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)

@@ -1,0 +1,50 @@
+"""Rotations: SO(3) exponential and logarithm, Hamilton quaternions in xyzw order."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from featuredb.geometry.arrays import FloatArray
+
+
+def skew(vector: ArrayLike) -> FloatArray:
+    """The matrix [v]x with [v]x w = v x w. vector (3,) -> (3, 3)."""
+    x, y, z = np.asarray(vector, dtype=np.float64)
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def so3_exp(omega: ArrayLike) -> FloatArray:
+    """Rotation matrix (3, 3) of the axis-angle vector omega (3,), radians."""
+    matrix: FloatArray = Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+    return matrix
+
+
+def so3_log(rotation: ArrayLike) -> FloatArray:
+    """Axis-angle vector (3,) in radians, length in [0, pi], of a rotation matrix (3, 3)."""
+    vector: FloatArray = Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_rotvec()
+    return vector
+
+
+def matrix_from_quaternion(xyzw: ArrayLike) -> FloatArray:
+    """Rotation matrix (3, 3) of a Hamilton quaternion (x, y, z, w); the norm is taken out."""
+    matrix: FloatArray = Rotation.from_quat(np.asarray(xyzw, dtype=np.float64)).as_matrix()
+    return matrix
+
+
+def quaternion_from_matrix(rotation: ArrayLike) -> FloatArray:
+    """Hamilton quaternion (x, y, z, w) with w >= 0 of a rotation matrix (3, 3)."""
+    quaternion: FloatArray = Rotation.from_matrix(np.asarray(rotation, dtype=np.float64)).as_quat(
+        canonical=True
+    )
+    return quaternion
+
+
+def rotation_angle(rotation: ArrayLike) -> float:
+    """Angle in radians, [0, pi], of a rotation matrix (3, 3)."""
+    return float(np.linalg.norm(so3_log(rotation)))
+
+
+def nearest_rotation(matrix: ArrayLike) -> FloatArray:
+    """The rotation (3, 3) nearest to a 3x3 matrix in the Frobenius norm (orthogonal Procrustes)."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)

@@ -1,0 +1,163 @@
+"""Similarity transforms of space: the group in which a feature map is placed on Earth."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew, so3_exp, so3_log
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Sim3:
+    """x_target = scale * rotation @ x_source + translation; name instances `target_from_source`.
+
+    The tangent vector is (sigma, omega, nu), in the order of the structure-projection paper (eq. 8):
+    log of scale, rotation in radians, translation. A covariance that belongs to a Sim3 is the (7, 7) of
+    its left perturbation: S_true = exp(xi) S, axes of the target frame.
+
+    Attributes:
+        scale: target units per source unit, > 0.
+        rotation: (3, 3) float64, orthonormal, determinant +1.
+        translation: (3,) float64, unit of the target frame.
+    """
+
+    scale: float
+    rotation: FloatArray
+    translation: FloatArray
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.scale) and self.scale > 0):
+            raise InvalidValueError(f"Sim3.scale: expected a finite number > 0, found {self.scale!r}")
+        rigid = Rigid3(rotation=self.rotation, translation=self.translation)
+        object.__setattr__(self, "scale", float(self.scale))
+        object.__setattr__(self, "rotation", rigid.rotation)
+        object.__setattr__(self, "translation", rigid.translation)
+
+    @classmethod
+    def identity(cls) -> Self:
+        return cls(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))
+
+    @classmethod
+    def from_rigid3(cls, rigid: Rigid3) -> Self:
+        return cls(scale=1.0, rotation=rigid.rotation, translation=rigid.translation)
+
+    @classmethod
+    def exp(cls, tangent: ArrayLike) -> Self:
+        """Exponential of sim(3), tangent (7,) = (sigma, omega, nu).
+
+        The exact closed form (Strasdat, Local Accuracy and Global Consistency for Efficient Visual SLAM,
+        2012, A.3). The structure-projection paper's eq. 9 multiplies Rodrigues' formula by e^sigma, which
+        is the exponential only for sigma = 0 or omega = 0 to first order; tests compare this one with
+        `scipy.linalg.expm`.
+        """
+        xi = frozen_array("Sim3.exp tangent", tangent, (7,))
+        sigma, omega, nu = float(xi[0]), xi[1:4], xi[4:]
+        return cls(
+            scale=float(np.exp(sigma)),
+            rotation=so3_exp(omega),
+            translation=_translation_factor(sigma, omega) @ nu,
+        )
+
+    def log(self) -> FloatArray:
+        """Inverse of `exp`: (7,) = (sigma, omega, nu), |omega| <= pi."""
+        sigma, omega = float(np.log(self.scale)), so3_log(self.rotation)
+        nu = np.linalg.solve(_translation_factor(sigma, omega), self.translation)
+        return np.concatenate([[sigma], omega, nu])
+
+    def __matmul__(self, other: "Sim3") -> "Sim3":
+        """c_from_b @ b_from_a = c_from_a."""
+        return Sim3(
+            scale=self.scale * other.scale,
+            rotation=self.rotation @ other.rotation,
+            translation=self.scale * self.rotation @ other.translation + self.translation,
+        )
+
+    def inverse(self) -> "Sim3":
+        inverse_scale = 1.0 / self.scale
+        return Sim3(
+            scale=inverse_scale,
+            rotation=self.rotation.T,
+            translation=-inverse_scale * self.rotation.T @ self.translation,
+        )
+
+    def act(self, points: ArrayLike) -> FloatArray:
+        """Transform points (..., 3) of the source frame into the target frame, (..., 3) float64."""
+        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+
+    def act_on_pose(self, cam_from_source: Rigid3) -> Rigid3:
+        """The camera pose cam_from_target of a camera given as cam_from_source.
+
+        The camera keeps its own metric: its centre moves with the similarity, its axes turn with it, and
+        its frame takes the target's unit.
+        """
+        rotation = cam_from_source.rotation @ self.rotation.T
+        return Rigid3(rotation=rotation, translation=-rotation @ self.act(cam_from_source.center))
+
+    def adjoint(self) -> FloatArray:
+        """(7, 7) matrix with S exp(xi) = exp(Ad xi) S for xi = (sigma, omega, nu)."""
+        ad = np.zeros((7, 7))
+        ad[0, 0] = 1.0
+        ad[1:4, 1:4] = self.rotation
+        ad[4:, 0] = -self.translation
+        ad[4:, 1:4] = skew(self.translation) @ self.rotation
+        ad[4:, 4:] = self.scale * self.rotation
+        return ad
+
+    def inverse_covariance(self, covariance: ArrayLike) -> FloatArray:
+        """Covariance (7, 7) of `self.inverse()`, given that of `self`."""
+        ad = self.inverse().adjoint()
+        return ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
+
+    def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
+        """Covariance (7, 7) of `self @ other` for independent errors of both, to first order."""
+        ad = self.adjoint()
+        return np.asarray(covariance, dtype=np.float64) + ad @ np.asarray(other_covariance) @ ad.T
+
+    def matrix(self) -> FloatArray:
+        """(4, 4) homogeneous matrix [sR t; 0 1]."""
+        m = np.eye(4)
+        m[:3, :3], m[:3, 3] = self.scale * self.rotation, self.translation
+        return m
+
+
+def point_jacobian(points_target: ArrayLike) -> FloatArray:
+    """Derivative (..., 3, 7) of exp(xi) x at xi = 0 for points x (..., 3) already in the target frame."""
+    points = np.asarray(points_target, dtype=np.float64)
+    jacobian = np.zeros((*points.shape[:-1], 3, 7))
+    jacobian[..., :, 0] = points
+    x, y, z = points[..., 0], points[..., 1], points[..., 2]
+    jacobian[..., 0, 2], jacobian[..., 0, 3] = z, -y
+    jacobian[..., 1, 1], jacobian[..., 1, 3] = -z, x
+    jacobian[..., 2, 1], jacobian[..., 2, 2] = y, -x
+    jacobian[..., :, 4:] = np.eye(3)
+    return jacobian
+
+
+def _translation_factor(sigma: float, omega: FloatArray) -> FloatArray:
+    """W = integral over t in [0, 1] of exp(t sigma) exp(t [omega]x), so that exp's translation is W nu."""
+    theta = float(np.linalg.norm(omega))
+    k = skew(omega)
+    if abs(sigma) < 1e-5 and theta < 1e-5:
+        # Third-order series; the next term is of order 1e-20.
+        return np.asarray(
+            (1 + sigma / 2 + sigma**2 / 6) * np.eye(3) + (0.5 + sigma / 3) * k + k @ k / 6, dtype=np.float64
+        )
+    scale = np.exp(sigma)
+    c0 = np.expm1(sigma) / sigma if abs(sigma) > 1e-12 else 1.0 + sigma / 2
+    if theta < 1e-5:
+        # Limits theta -> 0 of the coefficients below.
+        c1 = (scale * (sigma - 1) + 1) / sigma**2
+        c2 = (scale * (sigma**2 / 2 - sigma + 1) - 1) / sigma**3
+    else:
+        # integrals of e^(st) sin(theta t) and e^(st) cos(theta t)
+        norm = sigma**2 + theta**2
+        sine = (scale * (sigma * np.sin(theta) - theta * np.cos(theta)) + theta) / norm
+        cosine = (scale * (sigma * np.cos(theta) + theta * np.sin(theta)) - sigma) / norm
+        c1 = sine / theta
+        c2 = (c0 - cosine) / theta**2
+    return np.asarray(c0 * np.eye(3) + c1 * k + c2 * (k @ k), dtype=np.float64)

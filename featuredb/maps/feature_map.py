@@ -1,0 +1,245 @@
+"""A feature map: a sparse reconstruction of a place, placed on Earth, with descriptors.
+
+One map has one UTM zone and one local east-north-up frame. Poses and covariances are held in the
+local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes between the two.
+"""
+
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
+
+MapMethod = Literal["gps", "lidar", "gcp", "map"]
+MapStatus = Literal["quarantined", "active", "retired"]
+MAP_METHODS: tuple[MapMethod, ...] = ("gps", "lidar", "gcp", "map")
+MAP_STATUSES: tuple[MapStatus, ...] = ("quarantined", "active", "retired")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GeoPrior:
+    """Where the photo says it was taken.
+
+    Attributes:
+        latitude_deg, longitude_deg: WGS84 degrees.
+        height_m: metres in the photo's own datum (rarely a known one), or None.
+        sigma_horizontal_m, sigma_vertical_m: one standard deviation, metres.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float | None
+    sigma_horizontal_m: float
+    sigma_vertical_m: float
+
+    def __post_init__(self) -> None:
+        if not (-90 <= self.latitude_deg <= 90 and -180 <= self.longitude_deg <= 180):
+            raise InvalidValueError(
+                "GeoPrior: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, "
+                f"found {self.latitude_deg}, {self.longitude_deg}"
+            )
+        if not (0 < self.sigma_horizontal_m < np.inf and 0 < self.sigma_vertical_m < np.inf):
+            raise InvalidValueError("GeoPrior: expected standard deviations > 0 m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapImage:
+    """One registered image of a map.
+
+    Attributes:
+        image_id: number within the map, unique, from 0.
+        name: path within the ingested folder, with forward slashes.
+        sha256: hex digest of the file's bytes.
+        camera_id: index into FeatureMap.cameras.
+        cam_from_local: pose, local ENU frame of the map to camera (x right, y down, z forward), metres.
+        covariance: (6, 6) of cam_from_local's left perturbation, relative to the map's points, or None.
+        capture_time: as the photo says, timezone-aware where it says so, or None.
+        gps: the photo's own position, or None.
+        owner, licence: attribution, "" where unknown.
+    """
+
+    image_id: int
+    name: str
+    sha256: str
+    camera_id: int
+    cam_from_local: Rigid3
+    covariance: FloatArray | None = None
+    capture_time: datetime | None = None
+    gps: GeoPrior | None = None
+    owner: str = ""
+    licence: str = ""
+
+    def __post_init__(self) -> None:
+        if self.covariance is not None:
+            object.__setattr__(
+                self, "covariance", frozen_array("MapImage.covariance", self.covariance, (6, 6))
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapPoints:
+    """The 3D points of a map.
+
+    Attributes:
+        utm: (n, 3) float64 easting, northing, height in metres; EPSG code and datum are the map's.
+        rgb: (n, 3) uint8.
+        track_length: (n,) int32, number of images that see the point.
+        error_px: (n,) float32, mean reprojection error in full-size pixels.
+        covariance: (n, 6) float32, upper triangle (ee, en, eu, nn, nu, uu) of the covariance in the map's
+            local frame, square metres, relative to the map's gauge.
+    """
+
+    utm: FloatArray
+    rgb: NDArray[np.uint8]
+    track_length: NDArray[np.int32]
+    error_px: NDArray[np.float32]
+    covariance: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        utm = frozen_array("MapPoints.utm", self.utm, (None, 3))
+        n = len(utm)
+        for name, value in (
+            ("utm", utm),
+            ("rgb", frozen_array("MapPoints.rgb", self.rgb, (n, 3), np.uint8)),
+            ("track_length", frozen_array("MapPoints.track_length", self.track_length, (n,), np.int32)),
+            ("error_px", frozen_array("MapPoints.error_px", self.error_px, (n,), np.float32)),
+            ("covariance", frozen_array("MapPoints.covariance", self.covariance, (n, 6), np.float32)),
+        ):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.utm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapObservations:
+    """Keypoints that see the map's points. Only tracks long enough carry descriptors.
+
+    Attributes:
+        point_index: (m,) int64, row in MapPoints.
+        image_id: (m,) int32.
+        xy: (m, 2) float32, full-size pixels, top-left pixel centre at (0.5, 0.5).
+        scale, angle: (m,) float32, as in Features.
+        has_descriptor: (m,) bool.
+        descriptors: (m, 128) uint8 RootSIFT; zeros where has_descriptor is false.
+    """
+
+    point_index: NDArray[np.int64]
+    image_id: NDArray[np.int32]
+    xy: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    has_descriptor: NDArray[np.bool_]
+    descriptors: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        index = frozen_array("MapObservations.point_index", self.point_index, (None,), np.int64)
+        m = len(index)
+        for name, value in (
+            ("point_index", index),
+            ("image_id", frozen_array("MapObservations.image_id", self.image_id, (m,), np.int32)),
+            ("xy", frozen_array("MapObservations.xy", self.xy, (m, 2), np.float32)),
+            ("scale", frozen_array("MapObservations.scale", self.scale, (m,), np.float32)),
+            ("angle", frozen_array("MapObservations.angle", self.angle, (m,), np.float32)),
+            (
+                "has_descriptor",
+                frozen_array("MapObservations.has_descriptor", self.has_descriptor, (m,), np.bool_),
+            ),
+            ("descriptors", frozen_array("MapObservations.descriptors", self.descriptors, (m, 128), np.uint8)),
+        ):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.point_index)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Placement:
+    """How the map came to its place on Earth.
+
+    Attributes:
+        method: gps, lidar, gcp or map (placed by other maps).
+        local_from_sfm: the similarity that placed the reconstruction in the local frame.
+        covariance: (7, 7) of its left perturbation (sigma, omega, nu), local frame: the map's own
+            uncertainty on Earth, shared by all its points.
+        residual_rms_m: root mean square of what the placement could not explain, metres.
+        evidence: figures behind the decision (counts, residuals, gates), JSON-able.
+    """
+
+    method: MapMethod
+    local_from_sfm: Sim3
+    covariance: FloatArray
+    residual_rms_m: float
+    evidence: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.method not in MAP_METHODS:
+            raise InvalidValueError(f"Placement.method: expected one of {MAP_METHODS}, found {self.method!r}")
+        object.__setattr__(self, "covariance", frozen_array("Placement.covariance", self.covariance, (7, 7)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FeatureMap:
+    """A geo-registered feature map, complete.
+
+    Attributes:
+        map_id: unique in the database; ingest derives it from the photos and options, so that the same
+            job gives the same map.
+        name: for people.
+        epsg: UTM zone of the points, 326zz or 327zz.
+        height_datum: vertical datum of all heights, see featuredb.geo.datum.
+        frame: the local east-north-up frame of poses and covariances.
+        extractor_fingerprint: of all descriptors.
+        generation: 0 for maps placed by GPS, LiDAR or control points; parents' maximum + 1 otherwise.
+        parents: map ids that placed this one.
+        provenance: options and versions that made it, JSON-able.
+    """
+
+    map_id: str
+    name: str
+    epsg: int
+    height_datum: str
+    frame: LocalFrame
+    cameras: tuple[Camera, ...]
+    images: tuple[MapImage, ...]
+    points: MapPoints
+    observations: MapObservations
+    placement: Placement
+    extractor_fingerprint: str
+    status: MapStatus = "active"
+    generation: int = 0
+    parents: tuple[str, ...] = ()
+    source: str = ""
+    licence: str = ""
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        where = f"FeatureMap {self.map_id}"
+        if self.status not in MAP_STATUSES:
+            raise InvalidValueError(f"{where}: expected a status of {MAP_STATUSES}, found {self.status!r}")
+        ids = [image.image_id for image in self.images]
+        if len(set(ids)) != len(ids):
+            raise InvalidValueError(f"{where}: image ids repeat")
+        if any(not 0 <= image.camera_id < len(self.cameras) for image in self.images):
+            raise InvalidValueError(f"{where}: an image names a camera that the map does not have")
+        observations = self.observations
+        if len(observations):
+            if observations.point_index.min() < 0 or observations.point_index.max() >= len(self.points):
+                raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
+            if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
+                raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
+
+    def points_local(self, frame: LocalFrame | None = None) -> FloatArray:
+        """Points (n, 3) in metres in the given local frame (default: the map's own)."""
+        return (frame or self.frame).enu_from_utm(self.points.utm, self.epsg)
+
+    def with_status(self, status: MapStatus) -> "FeatureMap":
+        return replace(self, status=status)
