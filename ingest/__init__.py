@@ -1,0 +1,1 @@
+"""Photos to geo-registered feature maps: scan, match, structure from motion, placement, report."""

@@ -1,0 +1,49 @@
+"""What is known of one file of an ingest."""
+
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Literal
+
+from featuredb.maps.feature_map import GeoPrior
+
+PhotoStatus = Literal["ok", "skipped"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Photo:
+    """One file of the folder, usable or not.
+
+    Attributes:
+        name: path within the ingested folder, with forward slashes; unique within the ingest.
+        path: where the file lies.
+        sha256: hex digest of its bytes, "" where it could not be read.
+        status: ok, or skipped with a `reason` for people and a `reason_code` for programs.
+        width, height: size in pixels as stored (before EXIF orientation is applied), 0 if unknown.
+        orientation: EXIF orientation 1..8; features and cameras are in the pixels as stored, the
+            orientation is kept for display only.
+        make, model: camera maker and model from EXIF, "" where absent.
+        camera_key: photos with equal keys share one set of intrinsics.
+        focal_px: focal length from EXIF in pixels of the stored image, or None.
+        capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.
+        gps: position prior from EXIF, or None.
+        owner, licence: attribution from EXIF (Artist, Copyright) or the ingest's options.
+    """
+
+    name: str
+    path: Path
+    sha256: str = ""
+    status: PhotoStatus = "ok"
+    reason_code: str = ""
+    reason: str = ""
+    width: int = 0
+    height: int = 0
+    orientation: int = 1
+    make: str = ""
+    model: str = ""
+    camera_key: str = ""
+    focal_px: float | None = None
+    capture_time: datetime | None = None
+    gps: GeoPrior | None = None
+    owner: str = ""
+    licence: str = ""
