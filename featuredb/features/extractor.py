@@ -1,0 +1,152 @@
+"""RootSIFT as 8-bit integers: the one extractor of ingest and queries.
+
+The half pixel between OpenCV (centre of the top-left pixel at (0, 0)) and this project's convention
+(at (0.5, 0.5), COLMAP's) is added here and nowhere else.
+"""
+
+import hashlib
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.features import Features
+from featuredb.features.selection import spread_strongest
+
+# Raise when a change to this module makes descriptors that older maps cannot be compared with.
+_DESCRIPTOR_VERSION = "rootsift8-opencv-1"
+_OCTAVE_LAYERS = 3
+_SIGMA = 1.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtractorOptions:
+    """How features are extracted.
+
+    Attributes:
+        max_side_px: the image is area-averaged down to this longer side first. SIFT is scale-invariant,
+            so maps and queries may differ in it.
+        max_features: the strongest, spatially spread, are kept.
+        contrast_threshold: SIFT's; half of OpenCV's 0.04, so that asphalt and lawn still give keypoints.
+        edge_threshold: SIFT's (Lowe's 10).
+        upright: angles are set to zero, for image pairs whose rotation is known; more distinctive.
+    """
+
+    max_side_px: int = 1600
+    max_features: int = 6000
+    contrast_threshold: float = 0.02
+    edge_threshold: float = 10.0
+    upright: bool = False
+
+    def __post_init__(self) -> None:
+        if not 64 <= self.max_side_px <= 32_000:
+            raise InvalidValueError(
+                f"ExtractorOptions.max_side_px: expected 64..32000 px, found {self.max_side_px}"
+            )
+        if not 1 <= self.max_features <= 1_000_000:
+            raise InvalidValueError(
+                f"ExtractorOptions.max_features: expected 1..1000000, found {self.max_features}"
+            )
+
+    @property
+    def fingerprint(self) -> str:
+        """Names the space of the descriptors. Equal fingerprints can be compared, others never.
+
+        Size and number of features are not part of it: they change how many keypoints there are,
+        not what a descriptor means.
+        """
+        text = f"{_DESCRIPTOR_VERSION};upright={self.upright};layers={_OCTAVE_LAYERS};sigma={_SIGMA}"
+        return (
+            f"{_DESCRIPTOR_VERSION}{'-upright' if self.upright else ''}-"
+            + (hashlib.sha256(text.encode()).hexdigest()[:12])
+        )
+
+
+def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) -> Features:
+    """Detect and describe the features of one image.
+
+    Args:
+        gray: (h, w) uint8, pixels as stored in the file (EXIF orientation not applied).
+
+    Returns:
+        Features in full-size pixels, strongest and best-spread first.
+
+    Raises:
+        ImageError: not a two-dimensional uint8 array, or smaller than 32 pixels.
+    """
+    options = options or ExtractorOptions()
+    if gray.ndim != 2 or gray.dtype != np.uint8:
+        raise ImageError(f"extract: expected a (h, w) uint8 image, found {gray.shape} {gray.dtype}")
+    height, width = gray.shape
+    if min(height, width) < 32:
+        raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
+    small = _shrink(gray, options.max_side_px)
+    sift = cv2.SIFT_create(
+        nfeatures=0,
+        nOctaveLayers=_OCTAVE_LAYERS,
+        contrastThreshold=options.contrast_threshold,
+        edgeThreshold=options.edge_threshold,
+        sigma=_SIGMA,
+        enable_precise_upscale=True,
+    )
+    keypoints = sift.detect(small, None)
+    if options.upright:
+        keypoints = _upright(keypoints)
+    if not keypoints:
+        return _features([], np.zeros((0, 128), np.uint8), gray.shape, small.shape, options)
+    xy = cv2.KeyPoint.convert(keypoints)
+    response = np.array([k.response for k in keypoints], dtype=np.float32)
+    rows = spread_strongest(xy, response, small.shape[1], small.shape[0], options.max_features)
+    keypoints, raw = sift.compute(small, [keypoints[i] for i in rows])
+    return _features(keypoints, rootsift_8bit(raw), gray.shape, small.shape, options)
+
+
+def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """RootSIFT (Arandjelovic and Zisserman 2012) of SIFT descriptors (n, 128), as 8-bit integers.
+
+    round(512 sqrt(d / |d|_1)) clipped to 255, as COLMAP has it: length 512 up to clipping and rounding.
+    """
+    total = np.maximum(sift.sum(axis=1, keepdims=True), np.float32(1e-9))
+    return np.clip(np.rint(512.0 * np.sqrt(sift / total)), 0, 255).astype(np.uint8)
+
+
+def _shrink(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:
+    height, width = gray.shape
+    factor = max_side_px / max(height, width)
+    if factor >= 1.0:
+        return gray
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _upright(keypoints: "list[cv2.KeyPoint]") -> "list[cv2.KeyPoint]":
+    """One keypoint per place and scale, with angle zero (a place may have several orientations)."""
+    seen: dict[tuple[float, float, float], cv2.KeyPoint] = {}
+    for keypoint in keypoints:
+        keypoint.angle = 0.0
+        seen.setdefault((*keypoint.pt, keypoint.size), keypoint)
+    return list(seen.values())
+
+
+def _features(
+    keypoints: "list[cv2.KeyPoint]",
+    descriptors: NDArray[np.uint8],
+    shape: tuple[int, ...],
+    small_shape: tuple[int, ...],
+    options: ExtractorOptions,
+) -> Features:
+    """Back to full-size pixels, with the half pixel."""
+    ratio = np.array([shape[1] / small_shape[1], shape[0] / small_shape[0]])
+    xy = np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2)
+    return Features(
+        xy=((xy + 0.5) * ratio).astype(np.float32),
+        scale=np.array([k.size for k in keypoints], dtype=np.float32) * np.float32(ratio.mean()),
+        angle=np.array([k.angle for k in keypoints], dtype=np.float32) % np.float32(360.0),
+        response=np.array([k.response for k in keypoints], dtype=np.float32),
+        descriptors=descriptors,
+        width=shape[1],
+        height=shape[0],
+        fingerprint=options.fingerprint,
+    )
