@@ -197,6 +197,9 @@ class FeatureMap:
         epsg: UTM zone of the points, 326zz or 327zz.
         height_datum: vertical datum of all heights, see featuredb.geo.datum.
         frame: the local east-north-up frame of poses and covariances.
+        cameras: intrinsics; images name them by index.
+        camera_keys: for each camera the EXIF key (make, model, size, focal) that a query may share, ""
+            where the camera belongs to one image only; same length as cameras, or empty.
         extractor_fingerprint: of all descriptors.
         generation: 0 for maps placed by GPS, LiDAR or control points; parents' maximum + 1 otherwise.
         parents: map ids that placed this one.
@@ -214,6 +217,7 @@ class FeatureMap:
     observations: MapObservations
     placement: Placement
     extractor_fingerprint: str
+    camera_keys: tuple[str, ...] = ()
     status: MapStatus = "active"
     generation: int = 0
     parents: tuple[str, ...] = ()
@@ -225,6 +229,11 @@ class FeatureMap:
         where = f"FeatureMap {self.map_id}"
         if self.status not in MAP_STATUSES:
             raise InvalidValueError(f"{where}: expected a status of {MAP_STATUSES}, found {self.status!r}")
+        if self.camera_keys and len(self.camera_keys) != len(self.cameras):
+            raise InvalidValueError(
+                f"{where}: expected as many camera keys as cameras ({len(self.cameras)}) or none, "
+                f"found {len(self.camera_keys)}"
+            )
         ids = [image.image_id for image in self.images]
         if len(set(ids)) != len(ids):
             raise InvalidValueError(f"{where}: image ids repeat")
