@@ -18,7 +18,15 @@ class GeodesyError(FeatureDbError):
 
 
 class ImageError(FeatureDbError):
-    """An image cannot be read: not an image, truncated, too large, too small."""
+    """An image cannot be used; `code` is one of `featuredb.features.image_header.IMAGE_ERROR_CODES`."""
+
+    def __init__(self, message: str, code: str = "not_an_image") -> None:
+        super().__init__(message, code)
+        self.message = message
+        self.code = code
+
+    def __str__(self) -> str:
+        return self.message
 
 
 class IncompatibleExtractorError(FeatureDbError):

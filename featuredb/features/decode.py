@@ -1,0 +1,163 @@
+"""Image files to pixels, by one rule for ingest and queries alike.
+
+Pixels come as stored: EXIF orientation is not applied, so that features, cameras and poses of a photo
+belong to the same pixels whichever program reads it. Grey is OpenCV's own: the luma of a JPEG as
+coded, 0.299 R + 0.587 G + 0.114 B for the others. Transparency is dropped, 16 bits keep their upper 8.
+
+A file is checked before anything is allocated for its pixels: kind, size, limits and completeness.
+"""
+
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError
+from featuredb.features.image_header import ImageHeader, read_header
+
+# libjpeg fills what a scan does not cover with coefficients 0, which is this grey.
+_JPEG_FILL = 128
+# Bytes that decode to something else than the fill; no 0xFF among them, so they add no marker.
+_JPEG_PROBE = bytes((37 * i + 11) % 251 for i in range(512))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DecodeLimits:
+    """What is refused before decoding.
+
+    Attributes:
+        max_bytes: file size; the largest JPEGs of today's drones and phones have some 50 MB.
+        max_pixels: width times height; medium-format cameras have 102 million, and 120 million are
+            360 MB as colour.
+        max_side_px: a JPEG's own limit; longer sides are panoramas, which no single camera model fits.
+        min_side_px: below this SIFT finds too few keypoints to place anything, and icons are meant.
+    """
+
+    max_bytes: int = 64 << 20
+    max_pixels: int = 120_000_000
+    max_side_px: int = 65_500
+    min_side_px: int = 64
+
+
+DEFAULT_LIMITS = DecodeLimits()
+
+
+def probe(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> ImageHeader:
+    """Format and size of an image file, after checking that it is complete and within the limits.
+
+    Raises:
+        ImageError: with a `code` of IMAGE_ERROR_CODES.
+    """
+    return _check(read_image_bytes(data, limits), limits)
+
+
+def decode_gray(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> NDArray[np.uint8]:
+    """Grey pixels (h, w) uint8 of an image file, as stored.
+
+    Raises:
+        ImageError: with a `code` of IMAGE_ERROR_CODES.
+    """
+    return _decode(data, limits, cv2.IMREAD_GRAYSCALE)
+
+
+def decode_rgb(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> NDArray[np.uint8]:
+    """Colours (h, w, 3) uint8, red first, of an image file, as stored.
+
+    Raises:
+        ImageError: with a `code` of IMAGE_ERROR_CODES.
+    """
+    return _decode(data, limits, cv2.IMREAD_COLOR_RGB)
+
+
+def read_image_bytes(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> bytes:
+    """The bytes of the file, read only if it is a regular file of allowed size.
+
+    Raises:
+        ImageError: unreadable, too_large.
+    """
+    if isinstance(data, Path):
+        data = _read_file(data, limits)
+    if len(data) > limits.max_bytes:
+        raise _too_many_bytes(len(data), limits)
+    return bytes(data)
+
+
+def _read_file(path: Path, limits: DecodeLimits) -> bytes:
+    try:
+        info = path.stat()
+        if not stat.S_ISREG(info.st_mode):
+            raise ImageError(f"{path.name} is not a regular file", "unreadable")
+        if info.st_size > limits.max_bytes:
+            raise _too_many_bytes(info.st_size, limits)
+        with path.open("rb") as file:
+            return file.read(limits.max_bytes + 1)
+    except OSError as error:
+        raise ImageError(f"{path.name} cannot be read: {error.strerror or error}", "unreadable") from error
+
+
+def _too_many_bytes(size: int, limits: DecodeLimits) -> ImageError:
+    return ImageError(f"the file has {size} bytes, the limit is {limits.max_bytes}", "too_large")
+
+
+def _check(data: bytes, limits: DecodeLimits) -> ImageHeader:
+    header = read_header(data)
+    size = f"{header.width}x{header.height}"
+    if min(header.width, header.height) < limits.min_side_px:
+        raise ImageError(
+            f"the image has {size} pixels, both sides must have at least {limits.min_side_px}", "too_small"
+        )
+    if header.width * header.height > limits.max_pixels:
+        raise ImageError(
+            f"the image has {size} pixels, the limit is {limits.max_pixels / 1e6:g} million", "too_large"
+        )
+    if max(header.width, header.height) > limits.max_side_px:
+        raise ImageError(
+            f"the image has {size} pixels, the limit of a side is {limits.max_side_px}", "too_large"
+        )
+    return header
+
+
+def _decode(data: bytes | Path, limits: DecodeLimits, flags: int) -> NDArray[np.uint8]:
+    content = read_image_bytes(data, limits)
+    header = _check(content, limits)
+    pixels = _imdecode(content, flags)
+    if pixels is None:
+        raise ImageError(f"the {header.format} of {header.width}x{header.height} cannot be decoded", "broken")
+    if pixels.shape[:2] != (header.height, header.width):
+        raise ImageError(
+            f"the {header.format} claims {header.width}x{header.height} pixels but holds "
+            f"{pixels.shape[1]}x{pixels.shape[0]}",
+            "broken",
+        )
+    if header.format == "JPEG" and _ends_early(content, header, pixels, flags):
+        raise ImageError(
+            "the JPEG's end marker comes before its last pixels; copy the file again", "truncated"
+        )
+    return pixels
+
+
+def _imdecode(content: bytes, flags: int) -> NDArray[np.uint8] | None:
+    try:
+        pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
+    except (cv2.error, MemoryError):
+        return None
+    return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
+
+
+def _ends_early(content: bytes, header: ImageHeader, pixels: NDArray[np.uint8], flags: int) -> bool:
+    """Whether an end marker was put behind half a picture (repair tools and some downloaders do).
+
+    Only a picture whose last block is all fill is suspected, so others pay nothing. A complete picture
+    needs no byte before its end marker beyond its own: it stays the same when some are added there,
+    whereas a cut one takes them as its next pixels. A progressive JPEG that is cut after its first scan
+    is a complete picture of lower quality, and passes.
+    """
+    last_block = pixels[(header.height - 1) // 8 * 8 :, (header.width - 1) // 8 * 8 :]
+    if not bool((last_block == _JPEG_FILL).all()):
+        return False
+    cut = header.end - 2
+    other = _imdecode(content[:cut] + _JPEG_PROBE + content[cut : header.end], flags)
+    return other is None or not np.array_equal(pixels, other)

@@ -1,0 +1,286 @@
+"""What an image file is, how large, and whether it is complete: from its bytes, without decoding pixels.
+
+Own readers of the few headers instead of a library's, because they run on hostile input in threads: they
+allocate nothing, warn nobody and cost well under a millisecond.
+"""
+
+import re
+import struct
+import zlib
+from dataclasses import dataclass
+
+from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.tiff_ifd import Ifd, TiffReader
+
+IMAGE_ERROR_CODES = (
+    "unreadable",  # the file could not be opened or is not a regular file
+    "not_an_image",
+    "truncated",
+    "broken",  # complete by its length, but its contents contradict themselves
+    "too_large",
+    "too_small",
+    "unsupported",  # an image, but of a kind that is not taken
+)
+
+# Markers that may stand between the scans of a JPEG: DHT, DAC, EOI, SOS, DQT, DNL, DRI, APPn, COM.
+_JPEG_BETWEEN_SCANS = frozenset({0xC4, 0xCC, 0xD9, 0xDA, 0xDB, 0xDC, 0xDD, 0xFE, *range(0xE0, 0xF0)})
+_JPEG_SOF = frozenset(set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC})
+_JPEG_IN_SCAN = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Encoders write about ten scans; each scan costs a pass over the image, which makes a cheap bomb.
+_MAX_JPEG_SCANS = 100
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ImageHeader:
+    """Format and size of an image as stored.
+
+    Attributes:
+        format: JPEG, PNG, WEBP, TIFF or BMP.
+        width, height: pixels as stored, before EXIF orientation.
+        exif: (start, stop) of the TIFF stream with the EXIF in the file's bytes, or None.
+        xmp: (start, stop) of the XMP packet, or None.
+        end: offset after the last byte of the image; cameras append previews and videos behind it.
+    """
+
+    format: str
+    width: int
+    height: int
+    exif: tuple[int, int] | None = None
+    xmp: tuple[int, int] | None = None
+    end: int = 0
+
+
+def read_header(data: bytes) -> ImageHeader:
+    """Format, size and completeness of the image file in `data`.
+
+    Raises:
+        ImageError: codes not_an_image, truncated, broken, unsupported.
+    """
+    if not data:
+        raise ImageError("the file is empty", "not_an_image")
+    if data[:2] == b"\xff\xd8":
+        return _jpeg(data)
+    if data[:8] == _PNG_SIGNATURE:
+        return _png(data)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return _webp(data)
+    if data[:4] in (b"II*\0", b"MM\0*"):
+        return _tiff(data)
+    if data[:2] == b"BM" and len(data) > 26 and data[14:18] in (b"\x28\0\0\0", b"\x6c\0\0\0", b"\x7c\0\0\0"):
+        return _bmp(data)
+    raise _refusal(data)
+
+
+def _refusal(data: bytes) -> ImageError:
+    brand = data[8:12] if data[4:8] == b"ftyp" else b""
+    if brand in (b"heic", b"heix", b"hevc", b"hevx", b"heim", b"heis", b"mif1", b"msf1"):
+        return ImageError(
+            "HEIC is not supported; convert to JPEG first (for example `heif-convert`, or on an iPhone "
+            "Settings > Camera > Formats > Most Compatible)",
+            "unsupported",
+        )
+    if brand:
+        return ImageError(
+            f"an MP4/AVIF container of brand {brand!r} is not a photo that is taken; export a JPEG",
+            "unsupported",
+        )
+    known = {
+        b"GIF8": "GIF",
+        b"\0\0\0\x0c": "JPEG 2000",
+        b"\xffO\xffQ": "JPEG 2000",
+        b"8BPS": "Photoshop",
+        b"II+\0": "BigTIFF",
+        b"MM\0+": "BigTIFF",
+        b"FUJI": "a Fujifilm raw file",
+    }
+    if data[:4] in known:
+        return ImageError(
+            f"{known[data[:4]]} is not supported; convert to JPEG, PNG, WebP, TIFF or BMP", "unsupported"
+        )
+    if _PNG_SIGNATURE.startswith(data) or (len(data) < 12 and data[:4] == b"RIFF"):
+        return ImageError(f"the file ends after {len(data)} bytes, within its header", "truncated")
+    return ImageError(
+        f"expected a JPEG, PNG, WebP, TIFF or BMP file, found bytes that begin with {data[:8]!r}",
+        "not_an_image",
+    )
+
+
+def _truncated(name: str, data: bytes, what: str) -> ImageError:
+    return ImageError(f"the {name} ends after {len(data)} bytes, {what}; copy the file again", "truncated")
+
+
+def _jpeg(data: bytes) -> ImageHeader:
+    """Walk the segments to the frame header, then the scans to the end marker. ITU T.81, annex B."""
+    at, scans = 2, 0
+    frame: tuple[int, int] | None = None
+    exif: tuple[int, int] | None = None
+    xmp: tuple[int, int] | None = None
+    while True:
+        if scans:  # entropy-coded data: the next marker that is neither stuffing nor a restart
+            found = _JPEG_IN_SCAN.search(data, at)
+            if found is None:
+                raise _truncated("JPEG", data, "before its end marker")
+            at = found.start()
+        while data[at : at + 2] == b"\xff\xff":
+            at += 1
+        if at + 2 > len(data):
+            raise _truncated("JPEG", data, "before its end marker")
+        marker = data[at + 1]
+        if data[at] != 0xFF or (scans and marker not in _JPEG_BETWEEN_SCANS):
+            raise ImageError(
+                f"the JPEG has the wrong marker {data[at : at + 2].hex()} at byte {at}", "broken"
+            )
+        if marker == 0xD9:
+            if frame is None or not scans:
+                raise ImageError("the JPEG ends before any picture", "broken")
+            return ImageHeader(format="JPEG", width=frame[0], height=frame[1], exif=exif, xmp=xmp, end=at + 2)
+        body, stop = at + 4, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if max(body, stop) > len(data):
+            raise _truncated("JPEG", data, f"within the segment at byte {at}")
+        if stop < body:
+            raise ImageError(f"the JPEG has a segment without length at byte {at}", "broken")
+        if marker in _JPEG_SOF:
+            if frame is not None:
+                raise ImageError("the JPEG has two frame headers", "broken")
+            frame = _jpeg_frame(marker, data[body:stop])
+        elif marker == 0xE1 and exif is None and data[body : body + 6] == b"Exif\0\0":
+            exif = (body + 6, stop)
+        elif marker == 0xE1 and xmp is None and data[body : body + 29] == b"http://ns.adobe.com/xap/1.0/\0":
+            xmp = (body + 29, stop)
+        elif marker == 0xDA:
+            scans += 1
+            if frame is None:
+                raise ImageError("the JPEG has a scan before its frame header", "broken")
+            if scans > _MAX_JPEG_SCANS:
+                raise ImageError(f"the JPEG has over {_MAX_JPEG_SCANS} scans; save it again", "unsupported")
+        at = stop
+
+
+def _jpeg_frame(marker: int, body: bytes) -> tuple[int, int]:
+    if len(body) < 6:
+        raise ImageError("the JPEG's frame header is too short", "broken")
+    bits, height, width, components = struct.unpack_from(">BHHB", body)
+    if marker not in (0xC0, 0xC1, 0xC2):
+        kind = "arithmetic coding" if marker >= 0xC9 else "lossless or hierarchical coding"
+        raise ImageError(f"a JPEG with {kind} is not supported; save it as baseline JPEG", "unsupported")
+    if bits != 8 or components not in (1, 3, 4):
+        raise ImageError(
+            f"a JPEG with {components} components of {bits} bits is not supported; use 8 bits", "unsupported"
+        )
+    return width, height
+
+
+def _png(data: bytes) -> ImageHeader:
+    """Walk all chunks and check their sums, so that a flipped bit is found. PNG 3rd edition, section 5."""
+    at, size = 8, (0, 0)
+    exif: tuple[int, int] | None = None
+    xmp: tuple[int, int] | None = None
+    view = memoryview(data)
+    has_pixels = False
+    while True:
+        if at + 12 > len(data):
+            raise _truncated("PNG", data, "before its end chunk")
+        length, kind = struct.unpack_from(">I4s", data, at)
+        body, stop = at + 8, at + 8 + length
+        if stop + 4 > len(data):
+            raise _truncated("PNG", data, f"within the chunk {kind!r} at byte {at}")
+        if at == 8 and (kind != b"IHDR" or length != 13):
+            raise ImageError("the PNG does not begin with its header chunk", "broken")
+        critical = not kind[0] & 0x20
+        if critical and zlib.crc32(view[at + 4 : stop]) != int.from_bytes(data[stop : stop + 4], "big"):
+            raise ImageError(f"the PNG's chunk {kind!r} at byte {at} has a wrong check sum", "broken")
+        if kind == b"IHDR":
+            size = struct.unpack_from(">II", data, body)
+        elif kind == b"acTL":
+            raise ImageError("an animated PNG is not supported; export one frame", "unsupported")
+        elif kind == b"eXIf":
+            exif = (body, stop)
+        elif kind == b"iTXt" and data[body : body + 22] == b"XML:com.adobe.xmp\0\0\0\0\0":
+            xmp = (body + 22, stop)
+        elif kind == b"IDAT":
+            has_pixels = True
+        elif kind == b"IEND":
+            if not has_pixels:
+                raise ImageError("the PNG has no pixels", "broken")
+            return ImageHeader(format="PNG", width=size[0], height=size[1], exif=exif, xmp=xmp, end=stop + 4)
+        at = stop + 4
+
+
+def _webp(data: bytes) -> ImageHeader:
+    """RIFF chunks of a WebP. RFC 9649, section 2."""
+    end = 8 + int.from_bytes(data[4:8], "little")
+    if end > len(data):
+        raise _truncated("WebP", data, f"of {end}")
+    at, size = 12, None
+    exif: tuple[int, int] | None = None
+    xmp: tuple[int, int] | None = None
+    while at + 8 <= end:
+        kind, length = struct.unpack_from("<4sI", data, at)
+        body, stop = at + 8, at + 8 + length
+        if stop > end:
+            raise ImageError(f"the WebP's chunk {kind!r} reaches past its container", "broken")
+        if kind == b"VP8X" and length >= 10:
+            if data[body] & 0x02:
+                raise ImageError("an animated WebP is not supported; export one frame", "unsupported")
+            size = tuple(1 + int.from_bytes(data[body + i : body + i + 3], "little") for i in (4, 7))
+        elif kind == b"VP8 " and length >= 10 and size is None:
+            size = tuple(v & 0x3FFF for v in struct.unpack_from("<HH", data, body + 6))
+        elif kind == b"VP8L" and length >= 5 and size is None:
+            bits = int.from_bytes(data[body + 1 : body + 5], "little")
+            size = ((bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1)
+        elif kind == b"EXIF":
+            prefix = 6 if data[body : body + 6] == b"Exif\0\0" else 0
+            exif = (body + prefix, stop)
+        elif kind == b"XMP ":
+            xmp = (body, stop)
+        at = stop + (length & 1)
+    if size is None:
+        raise ImageError("the WebP has no picture", "broken")
+    return ImageHeader(format="WEBP", width=size[0], height=size[1], exif=exif, xmp=xmp, end=end)
+
+
+def _tiff(data: bytes) -> ImageHeader:
+    """First directory of a TIFF: kind, size, and whether its strips or tiles lie within the file."""
+    try:
+        reader = TiffReader(data)
+    except InvalidValueError as error:
+        raise _truncated("TIFF", data, "within its header") from error
+    ifd = reader.read(reader.first_offset)
+    width, height = ifd.number(256), ifd.number(257)
+    if not width or not height or width != width or height != height:
+        raise _truncated("TIFF", data, "without the size of its picture")
+    if 50706 in ifd.values or data[8:10] == b"CR" or int(_finite(ifd, 254, 0)) & 1:
+        raise ImageError("a camera's raw file is not supported; export a JPEG", "unsupported")
+    if _finite(ifd, 339, 1) != 1 or _finite(ifd, 258, 1) not in (1, 2, 4, 8, 16):
+        raise ImageError("a TIFF with other than unsigned 1..16 bit samples is not supported", "unsupported")
+    for offsets_tag, counts_tag in ((273, 279), (324, 325)):
+        offsets, counts = ifd.numbers(offsets_tag), ifd.numbers(counts_tag)
+        if offsets and counts:
+            last = max(o + c for o, c in zip(offsets, counts, strict=False))
+            if last > len(data):
+                raise _truncated("TIFF", data, f"its pixels reach to {last:.0f}")
+            break
+    else:
+        raise ImageError("the TIFF does not say where its pixels lie", "broken")
+    xmp = None
+    return ImageHeader(
+        format="TIFF", width=int(width), height=int(height), exif=(0, len(data)), xmp=xmp, end=len(data)
+    )
+
+
+def _finite(ifd: Ifd, tag: int, default: float) -> float:
+    value = ifd.number(tag)
+    return default if value is None or value != value or abs(value) > 2**32 else value
+
+
+def _bmp(data: bytes) -> ImageHeader:
+    pixels, _, width, height, _, bits, compression = struct.unpack_from(
+        "<IIiiHHI", data[:64].ljust(64, b"\0"), 10
+    )
+    height = abs(height)
+    if width <= 0 or height == 0 or bits not in (1, 4, 8, 16, 24, 32):
+        raise ImageError(f"the BMP has the impossible size {width}x{height} at {bits} bits", "broken")
+    if compression in (0, 3) and pixels + (width * bits + 31) // 32 * 4 * height > len(data):
+        raise _truncated("BMP", data, "within its pixels")
+    return ImageHeader(format="BMP", width=width, height=height, end=len(data))
