@@ -6,6 +6,7 @@ threads by itself but not a Proj, so all objects are kept per thread here and cr
 """
 
 import threading
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -84,6 +85,18 @@ def lat_lon_h_from_utm(utm: FloatArray, zone: int, south: bool) -> FloatArray:
     return _transform(_DEGREES_IN + _utm_definition(zone, south), utm, inverse=True)[:, [1, 0, 2]]
 
 
+def shift_heights(lat_lon_h: FloatArray, grid: Path, after: str = "") -> FloatArray:
+    """Heights (n,) in metres after adding a geoid grid's undulation; infinity outside the grid.
+
+    Args:
+        lat_lon_h: (n, 3) latitude, longitude (degrees), height (m) above the geoid.
+        grid: a grid file; given by its full path, PROJ looks for it nowhere else.
+        after: further steps of the pipeline, in radians.
+    """
+    pipeline = f'{_DEGREES_IN}+proj=vgridshift +grids="{grid}" +multiplier=1 {after}'
+    return _raw_transform(pipeline, lat_lon_h[:, [1, 0, 2]])[:, 2]
+
+
 def utm_factors(latitude_deg: float, longitude_deg: float, zone: int, south: bool) -> tuple[float, float]:
     """Meridian convergence in degrees and point scale of a UTM zone at one place, by PROJ's derivatives."""
     definition = _utm_definition(zone, south)
@@ -111,12 +124,7 @@ def _utm_definition(zone: int, south: bool) -> str:
 
 
 def _transform(pipeline: str, points: FloatArray, *, inverse: bool = False) -> FloatArray:
-    transformer = _per_thread.transformers.get(pipeline)
-    if transformer is None:
-        transformer = _per_thread.transformers[pipeline] = Transformer.from_pipeline(pipeline)
-    direction = TransformDirection.INVERSE if inverse else TransformDirection.FORWARD
-    x, y, z = np.ascontiguousarray(points.T)
-    result: FloatArray = np.stack(transformer.transform(x, y, z, direction=direction), axis=1)
+    result = _raw_transform(pipeline, points, inverse=inverse)
     bad = ~np.isfinite(result).all(axis=1)
     if bad.any():
         raise GeodesyError(
@@ -124,3 +132,13 @@ def _transform(pipeline: str, points: FloatArray, *, inverse: bool = False) -> F
             f"{points[bad][0].tolist()}; they lie outside the domain of '{pipeline}'"
         )
     return result
+
+
+def _raw_transform(pipeline: str, points: FloatArray, *, inverse: bool = False) -> FloatArray:
+    """Points (n, 3) through a pipeline, as PROJ answers: infinity for what it cannot convert."""
+    transformer = _per_thread.transformers.get(pipeline)
+    if transformer is None:
+        transformer = _per_thread.transformers[pipeline] = Transformer.from_pipeline(pipeline)
+    direction = TransformDirection.INVERSE if inverse else TransformDirection.FORWARD
+    x, y, z = np.ascontiguousarray(points.T)
+    return np.stack(transformer.transform(x, y, z, direction=direction), axis=1)

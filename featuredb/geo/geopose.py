@@ -1,0 +1,159 @@
+"""OGC GeoPose 1.0, Basic-Quaternion: a pose on Earth as a position and a rotation in the true ENU there.
+
+The body that turns is the camera with axes x forward, y left, z up; the camera itself has x right,
+y down, z forward. A level camera that looks true east has the identity rotation. The rotation belongs to the
+pose's own position, not to a map's origin: verticals differ by a degree in 111 km, and meridians converge.
+"""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+
+BODY_AXES = "x forward, y left, z up"
+
+BODY_FROM_CAM: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+BODY_FROM_CAM.setflags(write=False)
+
+# Three decimals are what the tersest clients send; a quaternion further off unit length is no rotation.
+UNIT_NORM_TOLERANCE = 2e-3
+# Closer to the vertical than this, the heading of the optical axis says less than that of the image's top.
+_VERTICAL_SINE = math.cos(math.radians(0.1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GeoPose:
+    """Position and orientation of a camera on Earth.
+
+    Attributes:
+        latitude_deg, longitude_deg: WGS84 degrees.
+        height_m: metres; above the ellipsoid as the standard wants it, if the datum was known.
+        quaternion_xyzw: Hamilton (x, y, z, w) of unit length; rotates body axes (x forward, y left, z up)
+            into true east, north, up at this very position. Kept at unit length and w >= 0.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    quaternion_xyzw: tuple[float, float, float, float]
+
+    def __post_init__(self) -> None:
+        for name in ("latitude_deg", "longitude_deg", "height_m"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        if not (abs(self.latitude_deg) <= 90.0 and abs(self.longitude_deg) <= 180.0):
+            raise InvalidValueError(
+                "GeoPose: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, found "
+                f"{self.latitude_deg}, {self.longitude_deg}"
+            )
+        if not math.isfinite(self.height_m):
+            raise InvalidValueError(f"GeoPose.height_m: expected a finite number, found {self.height_m}")
+        quaternion = np.array(self.quaternion_xyzw, dtype=np.float64)
+        norm = float(np.linalg.norm(quaternion)) if quaternion.shape == (4,) else math.nan
+        if not abs(norm - 1.0) <= UNIT_NORM_TOLERANCE:
+            raise InvalidValueError(
+                f"GeoPose.quaternion_xyzw: expected four numbers of unit length, found {self.quaternion_xyzw}"
+            )
+        quaternion *= (-1.0 if quaternion[3] < 0 else 1.0) / norm
+        object.__setattr__(self, "quaternion_xyzw", tuple(float(q) for q in quaternion))
+
+    @property
+    def true_enu_from_body(self) -> FloatArray:
+        """Rotation (3, 3) of body axes into true east, north, up at the position."""
+        return matrix_from_quaternion(self.quaternion_xyzw)
+
+    @property
+    def yaw_pitch_roll_deg(self) -> tuple[float, float, float]:
+        """Angles of GeoPose's Basic-YPR: turns about z, then the new y, then the new x, right-handed.
+
+        Yaw 0 looks east and grows towards north; with y to the left a positive pitch looks down.
+        """
+        m = self.true_enu_from_body
+        pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+        if abs(m[2, 0]) > _VERTICAL_SINE:  # yaw and roll turn about the same axis: give it all to yaw
+            yaw, roll = math.atan2(-m[0, 1], m[1, 1]), 0.0
+        else:
+            yaw, roll = math.atan2(m[1, 0], m[0, 0]), math.atan2(m[2, 1], m[2, 2])
+        return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
+
+    @property
+    def heading_pitch_roll_deg(self) -> tuple[float, float, float]:
+        """The angles that people use: heading clockwise from true north, pitch upwards, roll to the right.
+
+        Heading is in [0, 360). Within 0.1 degrees of straight down (or up) it is that of the image's top
+        (bottom) edge and roll is 0, as drones' gimbals tell it.
+        """
+        yaw, pitch, roll = self.yaw_pitch_roll_deg
+        return (90.0 - yaw) % 360.0, -pitch, roll
+
+    def to_json(self) -> dict[str, Any]:
+        """As a Basic-Quaternion object, ready for `json.dumps`."""
+        x, y, z, w = self.quaternion_xyzw
+        return {
+            "position": {"lat": self.latitude_deg, "lon": self.longitude_deg, "h": self.height_m},
+            "quaternion": {"x": x, "y": y, "z": z, "w": w},
+        }
+
+    @classmethod
+    def from_json(cls, document: Mapping[str, Any] | str | bytes) -> Self:
+        """From a Basic-Quaternion object or its text; further members are allowed and ignored.
+
+        Raises:
+            InvalidValueError: not JSON, a missing member, not numbers, out of range, or not of unit length.
+        """
+        if isinstance(document, (str, bytes)):
+            try:
+                document = json.loads(document)
+            except (ValueError, RecursionError) as error:
+                raise InvalidValueError(f"GeoPose: expected JSON, found {document!r:.80}") from error
+        lat, lon, h = _numbers(document, "position", ("lat", "lon", "h"))
+        x, y, z, w = _numbers(document, "quaternion", ("x", "y", "z", "w"))
+        return cls(latitude_deg=lat, longitude_deg=lon, height_m=h, quaternion_xyzw=(x, y, z, w))
+
+
+def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
+    """The GeoPose of a camera whose pose is known in a local frame.
+
+    Args:
+        cam_from_local: local ENU (metres) to camera axes (x right, y down, z forward).
+        frame: that local frame.
+    """
+    latitude, longitude, height = frame.geodetic_from_enu(cam_from_local.center)
+    true_enu_from_local = frame.true_enu_from_enu(cam_from_local.center)
+    true_enu_from_body = true_enu_from_local @ cam_from_local.rotation.T @ BODY_FROM_CAM.T
+    x, y, z, w = quaternion_from_matrix(true_enu_from_body)
+    return GeoPose(
+        latitude_deg=float(latitude),
+        longitude_deg=float(longitude),
+        height_m=float(height),
+        quaternion_xyzw=(float(x), float(y), float(z), float(w)),
+    )
+
+
+def camera_from_geopose(geopose: GeoPose, frame: LocalFrame) -> Rigid3:
+    """The pose cam_from_local, in a local frame, of a GeoPose; the inverse of `geopose_from_camera`."""
+    center = frame.enu_from_geodetic((geopose.latitude_deg, geopose.longitude_deg, geopose.height_m))
+    rotation = BODY_FROM_CAM.T @ geopose.true_enu_from_body.T @ frame.true_enu_from_enu(center)
+    return Rigid3(rotation=rotation, translation=-rotation @ center)
+
+
+def _numbers(document: Any, member: str, names: tuple[str, ...]) -> list[float]:
+    """The numbers of an object within an object, in the order of `names`."""
+    inner = document.get(member) if isinstance(document, Mapping) else None
+    values = [inner.get(name) for name in names] if isinstance(inner, Mapping) else [None]
+    if any(isinstance(value, bool) or not isinstance(value, (int, float)) for value in values):
+        raise InvalidValueError(
+            f"GeoPose: expected member {member!r} with numbers {', '.join(names)}, found {inner!r:.200}"
+        )
+    try:
+        return [float(value) for value in values if value is not None]
+    except OverflowError as error:
+        raise InvalidValueError(f"GeoPose.{member}: a number is out of range") from error
