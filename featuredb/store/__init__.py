@@ -1,0 +1,6 @@
+"""The database: Delta tables, snapshots, commits, checks, SQL. The home of deltalake and DuckDB."""
+
+from featuredb.store.database import CommitResult, Database, HistoryEntry
+from featuredb.store.snapshot import MapSummary, Snapshot, UtmBox
+
+__all__ = ["CommitResult", "Database", "HistoryEntry", "MapSummary", "Snapshot", "UtmBox"]

@@ -1,0 +1,323 @@
+"""A database at a URL: create, open, commit maps, retire, roll back, look at the past."""
+
+import logging
+import threading
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.changes import Change, add_maps, live_row, retire_map
+from featuredb.store.delta import Commit, Table, retry_stale
+from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
+from featuredb.store.snapshot import Snapshot
+from featuredb.store.tables import CHILD_TABLES, MAPS, SPECS
+
+logger = logging.getLogger(__name__)
+
+# A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
+# orphans; it is well below the vacuum's shortest default grace of a day.
+LONGEST_COMMIT = timedelta(hours=6)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommitResult:
+    """What became of one map.
+
+    Attributes:
+        created: False if the map was visible already and nothing had to be done.
+        version: snapshot in which the map is visible.
+        write_id: of its child rows.
+    """
+
+    map_id: str
+    created: bool
+    version: int
+    write_id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryEntry:
+    """One version of the database: number, UTC time, operation (commit, retire, ...), maps and reason."""
+
+    version: int
+    timestamp: datetime
+    operation: str
+    maps: tuple[str, ...]
+    reason: str
+
+
+class Database:
+    """Handle of one database; cheap, keeps no data. Threads may share it.
+
+    `url` is a local path or what deltalake takes (`s3://bucket/prefix`, ...); `storage_options` are
+    deltalake's, beside which it reads the usual variables of the environment.
+    """
+
+    def __init__(self, url: str, storage_options: Mapping[str, str] | None = None) -> None:
+        self.url = normal_url(url)
+        self._storage_options = dict(storage_options) if storage_options else None
+        self._poll_lock = threading.Lock()
+        self._poll_table: Table | None = None
+
+    @classmethod
+    def create(
+        cls, url: str | Path, *, exist_ok: bool = True, storage_options: Mapping[str, str] | None = None
+    ) -> "Database":
+        """Make the tables at a URL, `maps` last, and open the database.
+
+        Raises:
+            StoreError: a database is there and `exist_ok` is false, or the place cannot be written.
+        """
+        database = cls(str(url), storage_options)
+        if not exist_ok and Table.exists(database._table_url(MAPS), database._storage_options):
+            raise StoreError(f"there is a database at {database.url} already")
+        for name in (*CHILD_TABLES, MAPS):
+            Table.create(database._table_url(name), SPECS[name], database._storage_options)
+        database.table(MAPS)
+        return database
+
+    @classmethod
+    def open(cls, url: str | Path, *, storage_options: Mapping[str, str] | None = None) -> "Database":
+        """Open an existing database.
+
+        Raises:
+            DatabaseNotFoundError: there is none.
+            StoreError: it cannot be read, or has another format.
+        """
+        database = cls(str(url), storage_options)
+        database.table(MAPS)
+        return database
+
+    @property
+    def name(self) -> str:
+        """Last part of the URL, which names the database on the network."""
+        return self.url.rstrip("/").rsplit("/", 1)[-1]
+
+    def table(self, name: str, version: int | None = None) -> Table:
+        """A table at its newest or the given version; for maintenance and tests."""
+        return Table.load(self._table_url(name), SPECS[name], self._storage_options, version)
+
+    def snapshot(self, as_of: int | datetime | None = None) -> Snapshot:
+        """The newest version, that of a number, or the one that was newest at a time (aware datetime).
+
+        Raises:
+            SnapshotNotFoundError: no such version, before the first one, or removed by vacuum.
+        """
+        maps = self.table(MAPS)
+        commits = {commit.version: commit for commit in maps.commits()}
+        version = maps.version if as_of is None else _version_as_of(as_of, commits)
+        if version != maps.version:
+            maps = self.table(MAPS, version)
+        return Snapshot(
+            version=version,
+            timestamp=commits[version].timestamp,
+            rows=_read_rows(maps),
+            children={name: self.table(name) for name in CHILD_TABLES},
+        )
+
+    def poll_version(self) -> int:
+        """Number of the newest snapshot: one look at the log, no data read."""
+        with self._poll_lock:
+            if self._poll_table is None:
+                self._poll_table = self.table(MAPS)
+            else:
+                self._poll_table.refresh()
+            return self._poll_table.version
+
+    def commit_map(self, feature_map: FeatureMap, *, replaces: str | None = None) -> CommitResult:
+        """Make one map visible; see `commit_maps`."""
+        return self.commit_maps([feature_map], replaces=() if replaces is None else (replaces,))[0]
+
+    def commit_maps(
+        self, feature_maps: Sequence[FeatureMap], *, replaces: Sequence[str] = ()
+    ) -> list[CommitResult]:
+        """Make maps visible, all in one commit.
+
+        A map whose id is visible and not retired is left alone, so committing twice, from one process or two,
+        gives one row. With `replaces`, those maps give way in the same commit: a new map of the same id takes
+        the old one's place (a re-placement), a replaced map of another id becomes retired. Snapshots before
+        it still show the old ones.
+
+        Raises:
+            ConflictError: other writers were faster too many times; nothing is visible.
+            MapNotFoundError: a map to be replaced is not there.
+            StoreError: the store failed, or map ids repeat.
+        """
+        ids = [feature_map.map_id for feature_map in feature_maps]
+        if len(set(ids)) != len(ids):
+            raise StoreError(f"commit_maps: expected different map ids, found {ids}")
+        started = datetime.now(UTC)
+        encoded: dict[str, EncodedMap] = {}
+        digests = {m.map_id: content_digest(m) for m in feature_maps if m.map_id in replaces}
+
+        def attempt() -> list[CommitResult]:
+            maps = self.table(MAPS)
+            rows = _read_rows(maps)
+            visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
+            pending = [m for m in feature_maps if m.map_id not in visible]
+            for feature_map in pending:
+                if feature_map.map_id not in encoded:
+                    encoded[feature_map.map_id] = self._write_children(feature_map)
+            if datetime.now(UTC) - started > LONGEST_COMMIT:
+                raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
+            version = maps.version
+            if pending:
+                change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces)
+                version = _apply(maps, change, operation="commit", maps_changed=[m.map_id for m in pending])
+            written = {m.map_id: encoded[m.map_id].row["write_id"] for m in pending}
+            return [
+                CommitResult(
+                    map_id=m,
+                    created=m in written,
+                    version=version,
+                    write_id=written[m] if m in written else visible[m]["write_id"],
+                )
+                for m in ids
+            ]
+
+        results = retry_stale(f"commit of {', '.join(ids)}", attempt)
+        logger.info("committed %s", [(r.map_id, r.created, r.version) for r in results])
+        return results
+
+    def retire(self, map_id: str, reason: str) -> tuple[str, ...]:
+        """Take a map out of service with all that hangs on it alone, by `parents`; returns the ids retired.
+
+        Raises:
+            MapNotFoundError, ConflictError, StoreError
+        """
+        retired: list[str] = []
+
+        def attempt() -> int:
+            maps = self.table(MAPS)
+            change, retired[:] = retire_map(_read_rows(maps), map_id, reason)
+            return _apply(maps, change, operation="retire", maps_changed=retired, reason=reason)
+
+        retry_stale(f"retire {map_id}", attempt)
+        return tuple(retired)
+
+    def rollback(self, as_of: int | datetime) -> int:
+        """Make a new version that shows what an earlier one showed; returns its number.
+
+        Raises:
+            SnapshotNotFoundError, ConflictError, StoreError
+        """
+
+        def attempt() -> int:
+            maps = self.table(MAPS)
+            old = self.snapshot(as_of)
+            change = Change(rows=old.rows(), added=[], only_adds=False)
+            return _apply(
+                maps, change, operation="rollback", maps_changed=[], reason=f"to version {old.version}"
+            )
+
+        return retry_stale(f"rollback to {as_of}", attempt)
+
+    def history(self) -> list[HistoryEntry]:
+        """All versions, newest first."""
+        return [
+            HistoryEntry(
+                version=commit.version,
+                timestamp=commit.timestamp,
+                operation=commit.metadata.get("featuredb.operation", _OPERATIONS.get(commit.operation, "")),
+                maps=tuple(filter(None, commit.metadata.get("featuredb.maps", "").split("\n"))),
+                reason=commit.metadata.get("featuredb.reason", ""),
+            )
+            for commit in self.table(MAPS).commits()
+        ]
+
+    def _write_children(self, feature_map: FeatureMap) -> EncodedMap:
+        """Write the rows that stay invisible until a row of `maps` names them."""
+        now = datetime.now(UTC)
+        encoded = encode_map(feature_map, new_write_id(now), now)
+        for name, rows in encoded.children.items():
+            if len(rows):
+                self.table(name).append(rows)
+        return encoded
+
+    def _table_url(self, name: str) -> str:
+        return f"{self.url}/{name}"
+
+
+_OPERATIONS = {
+    "CREATE TABLE": "init",
+    "OPTIMIZE": "compact",
+    "VACUUM START": "vacuum",
+    "VACUUM END": "vacuum",
+}
+
+
+def normal_url(url: str) -> str:
+    """An absolute path for local places, the URL without trailing slash for others."""
+    if url.startswith("file://"):
+        url = url.removeprefix("file://")
+    if "://" in url:
+        return url.rstrip("/")
+    return str(Path(url).expanduser().absolute())
+
+
+def new_write_id(now: datetime) -> str:
+    """32 hex digits that begin with the time in milliseconds, so that an orphan tells its age."""
+    return f"{int(now.timestamp() * 1000):012x}{uuid.uuid4().hex[:20]}"
+
+
+def write_time(write_id: str) -> datetime:
+    """When the rows of a write id were begun, UTC."""
+    return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
+
+
+def _already_there(
+    rows: Sequence[Row], map_id: str, replaces: Sequence[str], digests: Mapping[str, str]
+) -> Row | None:
+    """The visible row that makes a commit needless; a re-placement needs equal content, too."""
+    row = live_row(rows, map_id)
+    if row is None or (map_id in replaces and row["content_digest"] != digests[map_id]):
+        return None
+    return row
+
+
+def _read_rows(maps: Table) -> list[Row]:
+    try:
+        rows: list[Row] = maps.dataset().to_table().to_pylist()
+    except FileNotFoundError as error:
+        raise SnapshotNotFoundError(
+            f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise StoreError(f"cannot read the table maps ({error}); run `featuredb verify`") from error
+    return rows
+
+
+def _version_as_of(as_of: int | datetime, commits: Mapping[int, Commit]) -> int:
+    if isinstance(as_of, datetime):
+        if as_of.tzinfo is None:
+            raise SnapshotNotFoundError(f"expected a time with a time zone, found {as_of.isoformat()}")
+        earlier = [version for version, commit in commits.items() if commit.timestamp <= as_of]
+        if not earlier:
+            raise SnapshotNotFoundError(f"the database has no version as old as {as_of.isoformat()}")
+        return max(earlier)
+    if as_of not in commits:
+        raise SnapshotNotFoundError(
+            f"expected a version from {min(commits)} to {max(commits)}, found {as_of}; "
+            "`featuredb history` lists them"
+        )
+    return as_of
+
+
+def _apply(
+    maps: Table, change: Change, *, operation: str, maps_changed: Sequence[str], reason: str = ""
+) -> int:
+    """Commit a change as the very next version, or raise StaleVersionError."""
+    metadata = {
+        "featuredb.operation": operation,
+        "featuredb.maps": "\n".join(maps_changed),
+        "featuredb.reason": reason,
+    }
+    if change.only_adds and not change.added:
+        return maps.version
+    if change.only_adds:
+        return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
+    return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)

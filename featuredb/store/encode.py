@@ -1,0 +1,226 @@
+"""A FeatureMap as rows of the tables, without loss: float64 stays float64, order stays order."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.geo.tiles import tile_of
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations
+from featuredb.store.tables import BOUNDS, IMAGES, MAPS, OBSERVATIONS, POINT_COVARIANCE, POINTS, SPECS
+
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EncodedMap:
+    """A map as rows: one of `maps`, and an Arrow table for each child table."""
+
+    row: Row
+    children: dict[str, pa.Table]
+
+
+def encode_map(feature_map: FeatureMap, write_id: str, created_at: datetime) -> EncodedMap:
+    """The rows of a map under the given write id.
+
+    Raises:
+        InvalidValueError: provenance or evidence that JSON cannot hold.
+    """
+    ids = {"write_id": write_id, "map_id": feature_map.map_id}
+    point_tiles = np.asarray(tile_of(feature_map.points.utm), dtype=object)
+    children = {
+        IMAGES: _image_rows(feature_map, ids),
+        POINTS: _point_rows(feature_map, ids, point_tiles),
+        OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
+    }
+    tiles = sorted({tile for table in children.values() for tile in table["tile"].unique().to_pylist()})
+    return EncodedMap(row=_map_row(feature_map, write_id, created_at, tiles), children=children)
+
+
+def content_digest(feature_map: FeatureMap) -> str:
+    """SHA-256 over everything in the map but its status: equal digests are equal maps."""
+    digest = hashlib.sha256()
+    row = _map_row(feature_map, "", datetime.fromtimestamp(0, tz=UTC), [], digest="")
+    for name in ("status", "status_reason"):
+        row.pop(name)
+    row["created_at"] = ""
+    digest.update(json.dumps(row, sort_keys=True).encode())
+    digest.update(json.dumps([_image_row(image) for image in feature_map.images]).encode())
+    points, seen = feature_map.points, feature_map.observations
+    for array in (
+        points.utm, points.rgb, points.track_length, points.error_px, points.covariance,
+        seen.point_index, seen.image_id, seen.xy, seen.scale, seen.angle, seen.has_descriptor,
+        _masked_descriptors(seen),
+    ):  # fmt: skip
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _map_row(
+    feature_map: FeatureMap, write_id: str, created_at: datetime, tiles: list[str], digest: str | None = None
+) -> Row:
+    utm, placement, frame = feature_map.points.utm, feature_map.placement, feature_map.frame
+    bounds = [*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()] if len(utm) else [None] * 6
+    return {
+        "map_id": feature_map.map_id,
+        "write_id": write_id,
+        "content_digest": content_digest(feature_map) if digest is None else digest,
+        "name": feature_map.name,
+        "status": feature_map.status,
+        "status_reason": "",
+        "created_at": created_at,
+        "epsg": feature_map.epsg,
+        "height_datum": feature_map.height_datum,
+        **dict(zip(BOUNDS, bounds, strict=True)),
+        "tiles": tiles,
+        "images": len(feature_map.images),
+        "points": len(feature_map.points),
+        "observations": len(feature_map.observations),
+        "descriptors": int(feature_map.observations.has_descriptor.sum()),
+        "method": placement.method,
+        "generation": feature_map.generation,
+        "parents": list(feature_map.parents),
+        "residual_rms_m": float(placement.residual_rms_m),
+        "origin_latitude_deg": frame.latitude_deg,
+        "origin_longitude_deg": frame.longitude_deg,
+        "origin_height_m": frame.height_m,
+        "local_from_sfm_scale": placement.local_from_sfm.scale,
+        "local_from_sfm_rotation": placement.local_from_sfm.rotation.ravel().tolist(),
+        "local_from_sfm_translation": placement.local_from_sfm.translation.tolist(),
+        "placement_covariance": placement.covariance.ravel().tolist(),
+        "placement_evidence": _json(feature_map, "placement.evidence", placement.evidence),
+        "camera_keys": list(feature_map.camera_keys),
+        "cameras": [
+            {"model": c.model, "width": c.width, "height": c.height, "params": list(c.params)}
+            for c in feature_map.cameras
+        ],
+        "extractor_fingerprint": feature_map.extractor_fingerprint,
+        "source": feature_map.source,
+        "licence": feature_map.licence,
+        "provenance": _json(feature_map, "provenance", feature_map.provenance),
+    }
+
+
+def _json(feature_map: FeatureMap, field: str, value: dict[str, Any]) -> str:
+    try:
+        return json.dumps(value, sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(
+            f"FeatureMap {feature_map.map_id}.{field}: expected values that JSON can hold: {error}"
+        ) from error
+
+
+def _image_row(image: MapImage) -> Row:
+    gps = image.gps
+    return {
+        "image_id": image.image_id,
+        "name": image.name,
+        "sha256": image.sha256,
+        "camera_id": image.camera_id,
+        "cam_from_local_rotation": image.cam_from_local.rotation.ravel().tolist(),
+        "cam_from_local_translation": image.cam_from_local.translation.tolist(),
+        "covariance": None if image.covariance is None else image.covariance.ravel().tolist(),
+        "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
+        "gps_latitude_deg": gps and gps.latitude_deg,
+        "gps_longitude_deg": gps and gps.longitude_deg,
+        "gps_height_m": gps and gps.height_m,
+        "gps_sigma_horizontal_m": gps and gps.sigma_horizontal_m,
+        "gps_sigma_vertical_m": gps and gps.sigma_vertical_m,
+        "owner": image.owner,
+        "licence": image.licence,
+    }
+
+
+def _image_rows(feature_map: FeatureMap, ids: Row) -> pa.Table:
+    centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
+    utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
+    rows = [
+        {
+            **ids,
+            **_image_row(image),
+            "image_index": index,
+            "easting": easting,
+            "northing": northing,
+            "height": height,
+            "zone": feature_map.epsg,
+            "tile": tile,
+        }
+        for index, (image, (easting, northing, height), tile) in enumerate(
+            zip(feature_map.images, utm.tolist(), tile_of(utm), strict=True)
+        )
+    ]
+    return pa.Table.from_pylist(rows, schema=SPECS[IMAGES].schema)
+
+
+def _point_rows(feature_map: FeatureMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
+    points = feature_map.points
+    columns: dict[str, Any] = {
+        "point_index": np.arange(len(points), dtype=np.int64),
+        "easting": points.utm[:, 0],
+        "northing": points.utm[:, 1],
+        "height": points.utm[:, 2],
+        "track_length": points.track_length,
+        "error_px": points.error_px,
+        "tile": tiles,
+    }
+    for axis, name in enumerate(("red", "green", "blue")):
+        columns[name] = points.rgb[:, axis].astype(np.int16)
+    for axis, name in enumerate(POINT_COVARIANCE):
+        columns[name] = points.covariance[:, axis]
+    return _table(POINTS, feature_map.epsg, ids, columns, len(points))
+
+
+def _observation_rows(feature_map: FeatureMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
+    seen = feature_map.observations
+    columns = {
+        "observation_index": np.arange(len(seen), dtype=np.int64),
+        "point_index": seen.point_index,
+        "image_id": seen.image_id,
+        "x": seen.xy[:, 0],
+        "y": seen.xy[:, 1],
+        "scale": seen.scale,
+        "angle": seen.angle,
+        "descriptor": _descriptor_column(seen),
+        # An observation lies with its point, so that a tile's points come with all their descriptors.
+        "tile": point_tiles[seen.point_index],
+    }
+    return _table(OBSERVATIONS, feature_map.epsg, ids, columns, len(seen))
+
+
+def _table(name: str, epsg: int, ids: Row, columns: dict[str, Any], count: int) -> pa.Table:
+    """Columns in the order and types of the table's schema; constants are repeated."""
+    constants = {**ids, "zone": epsg}
+    arrays = []
+    for field in SPECS[name].schema:
+        if field.name in constants:
+            arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), count))
+        else:
+            arrays.append(pa.array(columns[field.name], type=field.type))
+    return pa.Table.from_arrays(arrays, schema=SPECS[name].schema)
+
+
+def _masked_descriptors(seen: MapObservations) -> NDArray[np.uint8]:
+    return np.where(seen.has_descriptor[:, None], seen.descriptors, np.uint8(0))
+
+
+def _descriptor_column(seen: MapObservations) -> pa.Array:
+    """Binary column; null where there is no descriptor."""
+    packed = np.ascontiguousarray(seen.descriptors)
+    mask = pa.array(~seen.has_descriptor)
+    fixed = pa.FixedSizeBinaryArray.from_buffers(
+        pa.binary(DESCRIPTOR_SIZE), len(seen), [None, pa.py_buffer(packed)]
+    )
+    return pc.if_else(mask, pa.scalar(None, type=fixed.type), fixed).cast(pa.binary())
+
+
+def map_rows_table(rows: list[Row]) -> pa.Table:
+    """Rows of `maps` as an Arrow table."""
+    return pa.Table.from_pylist(rows, schema=SPECS[MAPS].schema)

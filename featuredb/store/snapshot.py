@@ -1,0 +1,183 @@
+"""One version of a database, for reading. Nothing that is committed later shows in it."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from featuredb.errors import FeatureDbError, MapNotFoundError, StoreError
+from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
+from featuredb.store.changes import RETIRED
+from featuredb.store.decode import decode_map
+from featuredb.store.delta import Table
+from featuredb.store.encode import Row
+from featuredb.store.tables import BOUNDS, CHILD_TABLES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UtmBox:
+    """A box in one UTM zone, metres, closed on all sides."""
+
+    min_easting: float
+    min_northing: float
+    min_height: float
+    max_easting: float
+    max_northing: float
+    max_height: float
+
+    def touches(self, e0: float, n0: float, e1: float, n1: float) -> bool:
+        """Whether the box has a point in e0 <= e <= e1, n0 <= n <= n1, at any height."""
+        return (
+            self.min_easting <= e1
+            and e0 <= self.max_easting
+            and self.min_northing <= n1
+            and n0 <= self.max_northing
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapSummary:
+    """A map as its row in `maps` describes it, without its points.
+
+    Attributes:
+        write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
+        content_digest: SHA-256 of everything but the status.
+        status_reason: why it was retired or quarantined, "" otherwise.
+        created_at: UTC.
+        box: of the points; None for a map without points.
+        tiles: names of all tiles that hold rows of the map.
+        images, points, observations, descriptors: counts.
+        residual_rms_m: of the placement, metres.
+    """
+
+    map_id: str
+    write_id: str
+    content_digest: str
+    name: str
+    status: MapStatus
+    status_reason: str
+    created_at: datetime
+    epsg: int
+    height_datum: str
+    box: UtmBox | None
+    tiles: tuple[str, ...]
+    images: int
+    points: int
+    observations: int
+    descriptors: int
+    method: MapMethod
+    generation: int
+    parents: tuple[str, ...]
+    residual_rms_m: float
+    extractor_fingerprint: str
+    source: str
+    licence: str
+
+
+class Snapshot:
+    """Maps as of one version of the table `maps`.
+
+    Attributes:
+        version: number of that version; what an answer names as its snapshot.
+        timestamp: when it was committed, UTC.
+    """
+
+    def __init__(
+        self, *, version: int, timestamp: datetime, rows: list[Row], children: Mapping[str, Table]
+    ) -> None:
+        self.version = version
+        self.timestamp = timestamp
+        self._rows = {row["map_id"]: row for row in rows}
+        self._children = children
+
+    def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
+        """The maps of the snapshot, oldest first."""
+        rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
+        return [_summary(row) for row in sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))]
+
+    def get(self, map_id: str) -> MapSummary:
+        """The summary of one map, retired or not.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map.
+        """
+        return _summary(self._row(map_id))
+
+    def maps_in(self, epsg: int, e0: float, n0: float, e1: float, n1: float) -> list[MapSummary]:
+        """Maps of one UTM zone, not retired, whose box touches e0 <= e <= e1, n0 <= n <= n1 (metres)."""
+        return [m for m in self.maps() if m.epsg == epsg and m.box and m.box.touches(e0, n0, e1, n1)]
+
+    def load_map(self, map_id: str) -> FeatureMap:
+        """The map exactly as it was committed; only its status may differ.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map.
+            StoreError: rows are missing or unreadable.
+        """
+        row = self._row(map_id)
+        return decode_map(row, {name: self._batches(name, row) for name in CHILD_TABLES})
+
+    def dataset(self, table: str) -> ds.Dataset:
+        """The child rows that this snapshot sees, retired maps included; read lazily."""
+        write_ids = [row["write_id"] for row in self._rows.values()]
+        return (
+            self._children[table]
+            .dataset()
+            .filter(ds.field("write_id").isin(pa.array(write_ids, pa.string())))
+        )
+
+    def rows(self) -> list[Row]:
+        """All rows of `maps`, as dictionaries."""
+        return list(self._rows.values())
+
+    def _row(self, map_id: str) -> Row:
+        if map_id not in self._rows:
+            raise MapNotFoundError(
+                f"snapshot {self.version} has no map {map_id}; `featuredb maps` lists what there is"
+            )
+        return self._rows[map_id]
+
+    def _batches(self, table: str, row: Row) -> Iterable[pa.RecordBatch]:
+        """The map's rows of one child table, from the few files that can hold them."""
+        pruning: list[tuple[str, str, Any]] = [("write_id", "=", row["write_id"])]
+        try:
+            dataset = self._children[table].dataset(pruning)
+            wanted = ds.field("write_id") == row["write_id"]
+            yield from dataset.to_batches(filter=wanted, use_threads=False)
+        except (OSError, ValueError) as error:
+            if isinstance(error, FeatureDbError):
+                raise
+            raise StoreError(
+                f"map {row['map_id']}: cannot read its {table} ({error}); run `featuredb verify`"
+            ) from error
+
+
+def _summary(row: Row) -> MapSummary:
+    box = None if row[BOUNDS[0]] is None else UtmBox(**{name: row[name] for name in BOUNDS})
+    return MapSummary(
+        map_id=row["map_id"],
+        write_id=row["write_id"],
+        content_digest=row["content_digest"],
+        name=row["name"],
+        status=row["status"],
+        status_reason=row["status_reason"],
+        created_at=row["created_at"],
+        epsg=row["epsg"],
+        height_datum=row["height_datum"],
+        box=box,
+        tiles=tuple(row["tiles"]),
+        images=row["images"],
+        points=row["points"],
+        observations=row["observations"],
+        descriptors=row["descriptors"],
+        method=row["method"],
+        generation=row["generation"],
+        parents=tuple(row["parents"]),
+        residual_rms_m=row["residual_rms_m"],
+        extractor_fingerprint=row["extractor_fingerprint"],
+        source=row["source"],
+        licence=row["licence"],
+    )

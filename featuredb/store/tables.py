@@ -1,0 +1,172 @@
+"""The Delta tables of a database: names, columns, partitions.
+
+`maps` has one row per map and decides what is visible. The child tables hold the rows of images, points and
+observations; each row names the `write_id` of the commit attempt that wrote it, and counts only when a row of
+`maps` names that `write_id`. See docs/store.md.
+"""
+
+from dataclasses import dataclass
+
+import pyarrow as pa
+
+FORMAT_VERSION = 1
+
+MAPS = "maps"
+IMAGES = "images"
+POINTS = "points"
+OBSERVATIONS = "observations"
+CHILD_TABLES = (IMAGES, POINTS, OBSERVATIONS)
+TABLES = (MAPS, *CHILD_TABLES)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableSpec:
+    """One Delta table.
+
+    Attributes:
+        name: folder below the database's URL.
+        schema: Arrow schema of the rows, in Delta's types (signed integers, no fixed-size lists).
+        partition_by: partition columns, () for none.
+        statistics: columns whose minimum and maximum go into the log; the others would only bloat it.
+        plain_bytes: columns of bytes without repetition, for which a dictionary is a waste.
+    """
+
+    name: str
+    schema: pa.Schema
+    partition_by: tuple[str, ...] = ()
+    statistics: tuple[str, ...] = ()
+    plain_bytes: tuple[str, ...] = ()
+
+
+def _required(name: str, kind: pa.DataType) -> pa.Field:
+    return pa.field(name, kind, nullable=False)
+
+
+_DOUBLES = pa.list_(pa.field("element", pa.float64(), nullable=False))
+_STRINGS = pa.list_(pa.field("element", pa.string(), nullable=False))
+_CAMERA = pa.struct(
+    [
+        _required("model", pa.string()),
+        _required("width", pa.int32()),
+        _required("height", pa.int32()),
+        _required("params", _DOUBLES),
+    ]
+)
+_UTM = [_required(name, pa.float64()) for name in ("easting", "northing", "height")]
+_PARTITION = [_required("zone", pa.int32()), _required("tile", pa.string())]
+
+BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
+POINT_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
+
+_MAPS_SCHEMA = pa.schema(
+    [
+        _required("map_id", pa.string()),
+        _required("write_id", pa.string()),
+        _required("content_digest", pa.string()),
+        _required("name", pa.string()),
+        _required("status", pa.string()),
+        _required("status_reason", pa.string()),
+        _required("created_at", pa.timestamp("us", tz="UTC")),
+        _required("epsg", pa.int32()),
+        _required("height_datum", pa.string()),
+        *(pa.field(name, pa.float64()) for name in BOUNDS),
+        _required("tiles", _STRINGS),
+        _required("images", pa.int64()),
+        _required("points", pa.int64()),
+        _required("observations", pa.int64()),
+        _required("descriptors", pa.int64()),
+        _required("method", pa.string()),
+        _required("generation", pa.int32()),
+        _required("parents", _STRINGS),
+        _required("residual_rms_m", pa.float64()),
+        _required("origin_latitude_deg", pa.float64()),
+        _required("origin_longitude_deg", pa.float64()),
+        _required("origin_height_m", pa.float64()),
+        _required("local_from_sfm_scale", pa.float64()),
+        _required("local_from_sfm_rotation", _DOUBLES),
+        _required("local_from_sfm_translation", _DOUBLES),
+        _required("placement_covariance", _DOUBLES),
+        _required("placement_evidence", pa.string()),
+        _required("camera_keys", _STRINGS),
+        _required("cameras", pa.list_(pa.field("element", _CAMERA, nullable=False))),
+        _required("extractor_fingerprint", pa.string()),
+        _required("source", pa.string()),
+        _required("licence", pa.string()),
+        _required("provenance", pa.string()),
+    ]
+)
+
+_IMAGES_SCHEMA = pa.schema(
+    [
+        _required("write_id", pa.string()),
+        _required("map_id", pa.string()),
+        _required("image_id", pa.int32()),
+        _required("image_index", pa.int64()),
+        _required("name", pa.string()),
+        _required("sha256", pa.string()),
+        _required("camera_id", pa.int32()),
+        _required("cam_from_local_rotation", _DOUBLES),
+        _required("cam_from_local_translation", _DOUBLES),
+        pa.field("covariance", _DOUBLES),
+        *_UTM,
+        pa.field("capture_time", pa.string()),
+        pa.field("gps_latitude_deg", pa.float64()),
+        pa.field("gps_longitude_deg", pa.float64()),
+        pa.field("gps_height_m", pa.float64()),
+        pa.field("gps_sigma_horizontal_m", pa.float64()),
+        pa.field("gps_sigma_vertical_m", pa.float64()),
+        _required("owner", pa.string()),
+        _required("licence", pa.string()),
+        *_PARTITION,
+    ]
+)
+
+_POINTS_SCHEMA = pa.schema(
+    [
+        _required("write_id", pa.string()),
+        _required("map_id", pa.string()),
+        _required("point_index", pa.int64()),
+        *_UTM,
+        *(_required(name, pa.int16()) for name in ("red", "green", "blue")),
+        _required("track_length", pa.int32()),
+        _required("error_px", pa.float32()),
+        *(_required(name, pa.float32()) for name in POINT_COVARIANCE),
+        *_PARTITION,
+    ]
+)
+
+_OBSERVATIONS_SCHEMA = pa.schema(
+    [
+        _required("write_id", pa.string()),
+        _required("map_id", pa.string()),
+        _required("observation_index", pa.int64()),
+        _required("point_index", pa.int64()),
+        _required("image_id", pa.int32()),
+        *(_required(name, pa.float32()) for name in ("x", "y", "scale", "angle")),
+        pa.field("descriptor", pa.binary()),
+        *_PARTITION,
+    ]
+)
+
+SPECS: dict[str, TableSpec] = {
+    MAPS: TableSpec(name=MAPS, schema=_MAPS_SCHEMA, statistics=("map_id", "write_id")),
+    IMAGES: TableSpec(
+        name=IMAGES,
+        schema=_IMAGES_SCHEMA,
+        partition_by=("zone", "tile"),
+        statistics=("write_id", "image_index"),
+    ),
+    POINTS: TableSpec(
+        name=POINTS,
+        schema=_POINTS_SCHEMA,
+        partition_by=("zone", "tile"),
+        statistics=("write_id", "point_index"),
+    ),
+    OBSERVATIONS: TableSpec(
+        name=OBSERVATIONS,
+        schema=_OBSERVATIONS_SCHEMA,
+        partition_by=("zone", "tile"),
+        statistics=("write_id", "observation_index"),
+        plain_bytes=("descriptor",),
+    ),
+}
