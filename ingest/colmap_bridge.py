@@ -1,0 +1,251 @@
+"""The only place that knows pycolmap's database and reconstruction.
+
+In come photos as values, out go reconstructions as plain arrays.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TwoView:
+    """The verified geometry of a pair of photos.
+
+    Attributes:
+        inliers: (m, 2) uint32, rows of the keypoints of both photos.
+        config: COLMAP's kind of geometry (calibrated, uncalibrated, planar ...).
+        essential, fundamental, homography: (3, 3), zeros where COLMAP estimated none.
+        candidates: number of matches before verification.
+    """
+
+    inliers: NDArray[np.uint32]
+    config: NDArray[np.int64]
+    essential: FloatArray
+    fundamental: FloatArray
+    homography: FloatArray
+    candidates: NDArray[np.int64]
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """By field name, to be written to a file."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmPhoto:
+    """A photo for structure from motion.
+
+    Attributes:
+        name: unique.
+        camera_row: row of the cameras.
+        keypoints: (n, 2) float32 pixels.
+        prior_position: (3,) camera centre in a local metric frame, or None.
+        prior_covariance: (3, 3) square metres.
+    """
+
+    name: str
+    camera_row: int
+    keypoints: NDArray[np.float32]
+    prior_position: FloatArray | None = None
+    prior_covariance: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """A reconstruction as arrays, in the frame and scale of the reconstruction ("sfm").
+
+    Attributes:
+        cameras: the rows of the input that registered photos use, refined.
+        rows: (k,) registered photos, rising, rows of the input.
+        camera_of: (k,) index into cameras.
+        cam_from_sfm: k poses.
+        xyz: (n, 3) points.
+        point_of, photo_of, keypoint_of: (m,) int64: observations as index into xyz, index into rows, and row of the
+            photo's keypoints; sorted by point, then photo.
+    """
+
+    cameras: tuple[Camera, ...]
+    rows: NDArray[np.int64]
+    camera_of: NDArray[np.int64]
+    cam_from_sfm: tuple[Rigid3, ...]
+    xyz: FloatArray
+    point_of: NDArray[np.int64]
+    photo_of: NDArray[np.int64]
+    keypoint_of: NDArray[np.int64]
+
+    def centers(self) -> FloatArray:
+        """Camera centres (k, 3)."""
+        return np.array([pose.center for pose in self.cam_from_sfm]).reshape(-1, 3)
+
+    def track_lengths(self) -> NDArray[np.int64]:
+        """Number of observations (n,) of each point."""
+        return np.bincount(self.point_of, minlength=len(self.xyz))
+
+
+def verify_pair(
+    camera_a: Camera,
+    xy_a: NDArray[np.float32],
+    camera_b: Camera,
+    xy_b: NDArray[np.float32],
+    matches: NDArray[np.uint32],
+    *,
+    focal_known: bool,
+    max_error_px: float,
+    seed: int,
+) -> TwoView:
+    """Two-view geometry of putative matches (m, 2) by COLMAP's LO-RANSAC, with a fixed seed.
+
+    Args:
+        focal_known: both cameras have a focal length to be trusted, so an essential matrix is tried.
+    """
+    geometry = pycolmap.TwoViewGeometry()
+    if len(matches) >= 8:  # the fundamental matrix needs eight
+        options = pycolmap.TwoViewGeometryOptions()
+        options.ransac.max_error = max_error_px
+        options.ransac.random_seed = seed
+        a, b = camera_a.to_pycolmap(1), camera_b.to_pycolmap(2)
+        a.has_prior_focal_length = b.has_prior_focal_length = focal_known
+        geometry = pycolmap.estimate_two_view_geometry(
+            a, xy_a.astype(np.float64), b, xy_b.astype(np.float64), matches, options
+        )
+    return TwoView(
+        inliers=np.asarray(geometry.inlier_matches, dtype=np.uint32).reshape(-1, 2),
+        config=np.array(int(geometry.config), dtype=np.int64),
+        essential=_matrix(geometry.E),
+        fundamental=_matrix(geometry.F),
+        homography=_matrix(geometry.H),
+        candidates=np.array(len(matches), dtype=np.int64),
+    )
+
+
+def write_database(
+    path: Path,
+    cameras: Sequence[tuple[Camera, bool]],
+    photos: Sequence[SfmPhoto],
+    geometries: Mapping[tuple[int, int], TwoView],
+) -> None:
+    """A COLMAP database of photos (ids are rows + 1), each a frame of its camera's trivial rig.
+
+    Args:
+        cameras: with whether the focal length is known beforehand.
+        geometries: of pairs of rows.
+    """
+    database = pycolmap.Database.open(str(path))
+    try:
+        with pycolmap.DatabaseTransaction(database):
+            for row, (camera, focal_known) in enumerate(cameras):
+                _write_camera(database, row + 1, camera, focal_known)
+            for row, photo in enumerate(photos):
+                _write_photo(database, row + 1, photo)
+            for (i, j), view in sorted(geometries.items()):
+                database.write_matches(i + 1, j + 1, view.inliers)
+                database.write_two_view_geometry(i + 1, j + 1, _geometry(view))
+    finally:
+        database.close()
+
+
+def _write_camera(database: Any, camera_id: int, camera: Camera, focal_known: bool) -> None:
+    stored = camera.to_pycolmap(camera_id)
+    stored.has_prior_focal_length = focal_known
+    database.write_camera(stored, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera_id)
+    rig.add_ref_sensor(stored.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def _write_photo(database: Any, image_id: int, photo: SfmPhoto) -> None:
+    image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=image_id)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id, rig_id=photo.camera_row + 1)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    database.write_keypoints(image_id, photo.keypoints)
+    if photo.prior_position is not None and photo.prior_covariance is not None:
+        prior = pycolmap.PosePrior(
+            pose_prior_id=image_id,
+            corr_data_id=image.data_id,
+            position=photo.prior_position,
+            position_covariance=photo.prior_covariance,
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        database.write_pose_prior(prior, use_pose_prior_id=True)
+
+
+def run_incremental(
+    database: Path, images: Path, output: Path, settings: Mapping[str, Any], on_image: Callable[[], None]
+) -> None:
+    """COLMAP's incremental mapping; models land in numbered folders of `output`.
+
+    Args:
+        settings: of pycolmap.IncrementalPipelineOptions, nested by dots ("mapper.filter_max_reproj_error").
+        on_image: called after each registered photo.
+    """
+    options = pycolmap.IncrementalPipelineOptions()
+    for name, value in settings.items():
+        *parents, last = name.split(".")
+        target = options
+        for parent in parents:
+            target = getattr(target, parent)
+        setattr(target, last, value)
+    pycolmap.incremental_mapping(
+        str(database), str(images), str(output), options, next_image_callback=on_image
+    )
+
+
+def read_models(output: Path) -> list[Model]:
+    """The models of a finished mapping, largest first, ties by first photo."""
+    models = [read_model(folder) for folder in sorted(output.iterdir()) if folder.is_dir()]
+    return sorted(models, key=lambda m: (-len(m.rows), m.rows.tolist()))
+
+
+def read_model(folder: Path) -> Model:
+    """One model folder in COLMAP's binary format."""
+    reconstruction = pycolmap.Reconstruction(str(folder))
+    image_ids = sorted(reconstruction.reg_image_ids())
+    camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
+    index_of_image = {image_id: k for k, image_id in enumerate(image_ids)}
+    xyz, point_of, photo_of, keypoint_of = [], [], [], []
+    for point_id in sorted(reconstruction.point3D_ids()):
+        point = reconstruction.point3D(point_id)
+        elements = sorted((index_of_image[e.image_id], e.point2D_idx) for e in point.track.elements)
+        point_of.extend([len(xyz)] * len(elements))
+        photo_of.extend(e[0] for e in elements)
+        keypoint_of.extend(e[1] for e in elements)
+        xyz.append(point.xyz)
+    return Model(
+        cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c)) for c in camera_ids),
+        rows=np.array(image_ids, dtype=np.int64) - 1,
+        camera_of=np.array([camera_ids.index(reconstruction.image(i).camera_id) for i in image_ids]),
+        cam_from_sfm=tuple(_pose(reconstruction.image(i).cam_from_world()) for i in image_ids),
+        xyz=np.array(xyz, dtype=np.float64).reshape(-1, 3),
+        point_of=np.array(point_of, dtype=np.int64),
+        photo_of=np.array(photo_of, dtype=np.int64),
+        keypoint_of=np.array(keypoint_of, dtype=np.int64),
+    )
+
+
+def _pose(rigid: Any) -> Rigid3:
+    return Rigid3.from_matrix(np.asarray(rigid.matrix()))
+
+
+def _matrix(value: Any) -> FloatArray:
+    return np.zeros((3, 3)) if value is None else np.asarray(value, dtype=np.float64)
+
+
+def _geometry(view: TwoView) -> Any:
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = int(view.config)
+    geometry.inlier_matches = view.inliers
+    for name, value in (("E", view.essential), ("F", view.fundamental), ("H", view.homography)):
+        if value.any():
+            setattr(geometry, name, value)
+    return geometry

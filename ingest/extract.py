@@ -1,0 +1,115 @@
+"""Stage: the features of each photo, on a pool of processes, one file each."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError
+from featuredb.features.decode import decode_gray
+from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
+from ingest.executor import Executor, Progress, no_progress
+from ingest.fingerprint import options_fingerprint
+from ingest.photo import Photo
+from ingest.workspace import Workspace, read_arrays, write_arrays
+
+_COLOUR_SHRINK = 4  # colours of points need no full resolution; JPEG decodes a quarter size much faster
+_ARRAYS = ("xy", "scale", "angle", "response", "descriptors")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtractTask:
+    """One photo to extract; travels to a worker.
+
+    Attributes:
+        photo: the photo's file.
+        target: the npz file to write.
+    """
+
+    photo: Path
+    target: Path
+    options: ExtractorOptions
+
+    def __str__(self) -> str:
+        return self.photo.name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoFeatures:
+    """Features of a photo with the colour under each keypoint, (n, 3) uint8 RGB."""
+
+    features: Features
+    rgb: NDArray[np.uint8]
+
+
+def extract_photos(
+    photos: list[Photo],
+    workspace: Workspace,
+    options: ExtractorOptions,
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> dict[str, str]:
+    """Write the features of every photo that has none yet.
+
+    Returns:
+        Photos by name whose pixels could not be read after all, with the reason.
+    """
+    fingerprint = options_fingerprint(options)
+    tasks: dict[str, ExtractTask] = {}
+    for photo in photos:
+        target = workspace.features(fingerprint, photo.sha256)
+        if not target.exists():
+            tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
+    outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
+    return {name: reason for name, reason in zip(tasks, outcomes, strict=True) if reason}
+
+
+def load_features(workspace: Workspace, options: ExtractorOptions, photo: Photo) -> PhotoFeatures:
+    """What `extract_photos` wrote for a photo."""
+    return read_features(workspace.features(options_fingerprint(options), photo.sha256))
+
+
+def read_features(path: Path) -> PhotoFeatures:
+    """Features and colours of one npz file of this stage."""
+    arrays = read_arrays(path)
+    width, height = (int(v) for v in arrays["size"])
+    features = Features(
+        **{name: arrays[name] for name in _ARRAYS},
+        width=width,
+        height=height,
+        fingerprint=str(arrays["fingerprint"]),
+    )
+    return PhotoFeatures(features=features, rgb=arrays["rgb"])
+
+
+def _extract_one(task: ExtractTask) -> str:
+    """Extract one photo; the reason for people if its pixels cannot be used, else ""."""
+    try:
+        data = task.photo.read_bytes()
+        features = extract(decode_gray(data), task.options)
+    except (ImageError, OSError) as error:
+        return str(error)
+    write_arrays(
+        task.target,
+        {name: getattr(features, name) for name in _ARRAYS}
+        | {
+            "size": np.array([features.width, features.height]),
+            "fingerprint": np.array(features.fingerprint),
+            "rgb": _colours(data, features),
+        },
+    )
+    return ""
+
+
+def _colours(data: bytes, features: Features) -> NDArray[np.uint8]:
+    """RGB (n, 3) under the keypoints, from the photo at a quarter of its size."""
+    flags = cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if bgr is None:
+        return np.full((len(features), 3), 128, np.uint8)  # colour is for display only
+    columns = np.clip((features.xy[:, 0] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[1] - 1)
+    rows = np.clip((features.xy[:, 1] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[0] - 1)
+    return np.asarray(bgr[rows, columns, ::-1], dtype=np.uint8)

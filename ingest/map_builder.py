@@ -1,0 +1,192 @@
+"""Stage: a placed reconstruction and the photos' features become a FeatureMap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IngestError
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
+from ingest.colmap_bridge import Model
+from ingest.extract import PhotoFeatures
+from ingest.photo import Photo
+from ingest.precision import (
+    Linearised,
+    linearise,
+    point_covariances,
+    pose_covariances,
+    residual_variance,
+    upper_triangle,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOptions:
+    """What goes into the map.
+
+    Attributes:
+        min_track_length: points seen by at least that many photos carry descriptors.
+        max_sigma_over_distance: points whose standard deviation exceeds this share of the distance
+            to their nearest camera are dropped; they say nothing about where a camera is.
+        height_datum: of the photos' heights, see featuredb.geo.datum; EXIF rarely tells.
+    """
+
+    min_track_length: int = 3
+    max_sigma_over_distance: float = 0.25
+    height_datum: str = "unknown"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapIdentity:
+    """What names a map."""
+
+    map_id: str
+    name: str
+    source: str
+    licence: str
+    provenance: dict[str, Any]
+
+
+def build_map(
+    model: Model,
+    placement: Placement,
+    frame: LocalFrame,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapOptions,
+) -> FeatureMap:
+    """The map of one placed model.
+
+    Args:
+        photos, features: of the model's registered photos, in the order of `model.rows`.
+    """
+    poses = [placement.local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
+    enu = placement.local_from_sfm.act(model.xyz)
+    xy = _gather(features, model, "xy").astype(np.float64)
+    linear = linearise(
+        model.cameras, model.camera_of, poses, enu, model.point_of, model.photo_of, xy
+    )
+    variance = residual_variance(linear, len(poses), len(enu))
+    covariances = point_covariances(linear, len(enu), variance)
+    pose_spread = pose_covariances(linear, len(poses), covariances, variance)
+    kept = _well_placed(enu, poses, covariances, model, options)
+    if not kept.any():
+        raise IngestError(f"map {identity.name}: none of {len(enu)} points is placed well enough to be used")
+    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    fingerprints = {f.features.fingerprint for f in features}
+    return FeatureMap(
+        map_id=identity.map_id,
+        name=identity.name,
+        epsg=epsg,
+        height_datum=options.height_datum,
+        frame=frame,
+        cameras=model.cameras,
+        images=tuple(_images(photos, model, poses, pose_spread)),
+        points=_points(model, features, frame.utm_from_enu(enu, epsg), linear, covariances, kept),
+        observations=_observations(model, features, xy, kept, options),
+        placement=placement,
+        extractor_fingerprint=fingerprints.pop(),
+        source=identity.source,
+        licence=identity.licence,
+        provenance=identity.provenance | {"residual_sigma_px": variance**0.5},
+    )
+
+
+def _images(
+    photos: Sequence[Photo], model: Model, poses: Sequence[Rigid3], spread: FloatArray
+) -> list[MapImage]:
+    return [
+        MapImage(
+            image_id=k,
+            name=photo.name,
+            sha256=photo.sha256,
+            camera_id=int(model.camera_of[k]),
+            cam_from_local=poses[k],
+            covariance=spread[k],
+            capture_time=photo.capture_time,
+            gps=photo.gps,
+            owner=photo.owner,
+            licence=photo.licence,
+        )
+        for k, photo in enumerate(photos)
+    ]
+
+
+def _points(
+    model: Model,
+    features: Sequence[PhotoFeatures],
+    utm: FloatArray,
+    linear: Linearised,
+    covariances: FloatArray,
+    kept: NDArray[np.bool_],
+) -> MapPoints:
+    lengths = model.track_lengths()
+    colours = _gather(features, model, "rgb").astype(np.float64)
+    errors = np.linalg.norm(linear.residual, axis=1)
+    mean_rgb = np.stack([_mean(c, model.point_of, lengths) for c in colours.T], axis=1)
+    return MapPoints(
+        utm=utm[kept],
+        rgb=np.rint(mean_rgb[kept]).astype(np.uint8),
+        track_length=lengths[kept].astype(np.int32),
+        error_px=_mean(errors, model.point_of, lengths)[kept].astype(np.float32),
+        covariance=upper_triangle(covariances[kept]),
+    )
+
+
+def _observations(
+    model: Model,
+    features: Sequence[PhotoFeatures],
+    xy: FloatArray,
+    kept: NDArray[np.bool_],
+    options: MapOptions,
+) -> MapObservations:
+    rows = np.flatnonzero(kept[model.point_of])
+    row_of_point = np.cumsum(kept) - 1
+    long_enough = (model.track_lengths() >= options.min_track_length)[model.point_of[rows]]
+    descriptors = np.zeros((len(rows), DESCRIPTOR_SIZE), np.uint8)
+    descriptors[long_enough] = _gather(features, model, "descriptors")[rows[long_enough]]
+    return MapObservations(
+        point_index=row_of_point[model.point_of[rows]],
+        image_id=model.photo_of[rows].astype(np.int32),
+        xy=xy[rows].astype(np.float32),
+        scale=_gather(features, model, "scale")[rows],
+        angle=_gather(features, model, "angle")[rows],
+        has_descriptor=long_enough,
+        descriptors=descriptors,
+    )
+
+
+def _well_placed(
+    enu: FloatArray,
+    poses: Sequence[Rigid3],
+    covariances: FloatArray,
+    model: Model,
+    options: MapOptions,
+) -> NDArray[np.bool_]:
+    """Points (n,) whose standard deviation is small against their distance."""
+    centers = np.array([pose.center for pose in poses])
+    distances = np.linalg.norm(enu[model.point_of] - centers[model.photo_of], axis=1)
+    nearest = np.full(len(enu), np.inf)
+    np.minimum.at(nearest, model.point_of, distances)
+    sigma = np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])
+    return np.asarray(sigma <= options.max_sigma_over_distance * nearest)
+
+
+def _gather(features: Sequence[PhotoFeatures], model: Model, name: str) -> NDArray[Any]:
+    """The named array's rows of all observations, (m, ...)."""
+    arrays = [f.rgb if name == "rgb" else getattr(f.features, name) for f in features]
+    starts = np.cumsum([0, *(len(a) for a in arrays)])
+    return np.concatenate(arrays)[starts[model.photo_of] + model.keypoint_of]
+
+
+def _mean(values: FloatArray, group: NDArray[np.int64], counts: NDArray[np.int64]) -> FloatArray:
+    """Mean of values (m,) in each group."""
+    return np.bincount(group, weights=values, minlength=len(counts)) / np.maximum(counts, 1)

@@ -1,0 +1,146 @@
+"""Stage: matches of each pair of photos, verified by two-view geometry, one file a pair."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.camera import Camera
+from featuredb.index.exact import largest_inner_products, use_threads
+from ingest.colmap_bridge import TwoView, verify_pair
+from ingest.executor import Executor, Progress, no_progress
+from ingest.extract import read_features
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.pairs import Pair
+from ingest.workspace import Workspace, read_arrays, write_arrays
+
+_DESCRIPTOR_LENGTH = 512.0  # of 8-bit RootSIFT
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchOptions:
+    """How pairs are matched and verified.
+
+    Attributes:
+        max_ratio: angle to the nearest descriptor over angle to the second nearest (Lowe's 0.8).
+        max_angle_rad: no match between descriptors further apart (COLMAP's 0.7).
+        max_error_px: of the two-view geometry, at `error_reference_side_px`, growing with the image.
+        error_reference_side_px: keypoints are located on images of about this size.
+        min_inliers: pairs with fewer verified matches do not count; chosen on data, see docs.
+        seed: of RANSAC.
+    """
+
+    max_ratio: float = 0.8
+    max_angle_rad: float = 0.7
+    max_error_px: float = 2.0
+    error_reference_side_px: int = 1600
+    min_inliers: int = 20
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchTask:
+    """One pair; travels to a worker."""
+
+    features_a: Path
+    features_b: Path
+    camera_a: Camera
+    camera_b: Camera
+    focal_known: bool
+    target: Path
+    options: MatchOptions
+
+    def __str__(self) -> str:
+        return self.target.stem
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoView:
+    """What matching needs of a photo: its digest, features file and camera as EXIF has it."""
+
+    sha256: str
+    features: Path
+    camera: Camera
+    focal_known: bool
+
+
+def match_pairs(
+    views: list[PhotoView],
+    pairs: list[Pair],
+    workspace: Workspace,
+    options: MatchOptions,
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> dict[Pair, TwoView]:
+    """Match and verify every pair that is not done yet; the two-view geometries with enough inliers."""
+    files = {pair: _match_file(views[pair[0]], views[pair[1]], workspace, options) for pair in pairs}
+    tasks = [
+        MatchTask(
+            features_a=views[i].features,
+            features_b=views[j].features,
+            camera_a=views[i].camera,
+            camera_b=views[j].camera,
+            focal_known=views[i].focal_known and views[j].focal_known,
+            target=target,
+            options=options,
+        )
+        for (i, j), target in files.items()
+        if not target.exists()
+    ]
+    executor.map("match", _match_one, tasks, progress)
+    loaded = {pair: TwoView(**read_arrays(path)) for pair, path in files.items()}
+    return {pair: view for pair, view in loaded.items() if len(view.inliers) >= options.min_inliers}
+
+
+def mutual_matches(
+    descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8], options: MatchOptions
+) -> NDArray[np.uint32]:
+    """Mutual nearest neighbours that pass the ratio test in both directions: rows (m, 2) of a and b."""
+    if len(descriptors_a) < 2 or len(descriptors_b) < 2:
+        return np.zeros((0, 2), np.uint32)
+    nearest_b = _distinct_nearest(descriptors_a, descriptors_b, options)
+    rows = np.flatnonzero(nearest_b >= 0)
+    candidates, place = np.unique(nearest_b[rows], return_inverse=True)
+    nearest_a = _distinct_nearest(descriptors_b[candidates], descriptors_a, options)
+    mutual = nearest_a[place] == rows
+    return np.stack([rows[mutual], nearest_b[rows[mutual]]], axis=1).astype(np.uint32)
+
+
+def _distinct_nearest(
+    queries: NDArray[np.uint8], base: NDArray[np.uint8], options: MatchOptions
+) -> NDArray[np.int64]:
+    """Row of base (n,) nearest to each query, -1 where it is too far or the second nearest is as near."""
+    if not len(queries):
+        return np.zeros(0, np.int64)
+    products, rows = largest_inner_products(queries, base, 2)
+    angles = np.arccos(np.clip(products / _DESCRIPTOR_LENGTH**2, -1.0, 1.0))
+    good = (angles[:, 0] <= options.max_ratio * angles[:, 1]) & (angles[:, 0] <= options.max_angle_rad)
+    return np.where(good, rows[:, 0], -1)
+
+
+def _match_one(task: MatchTask) -> int:
+    """Match one pair and write its file; the number of verified matches."""
+    use_threads(1)
+    a = read_features(task.features_a).features
+    b = read_features(task.features_b).features
+    matches = mutual_matches(a.descriptors, b.descriptors, task.options)
+    side = max(a.width, a.height, b.width, b.height)
+    view = verify_pair(
+        task.camera_a,
+        a.xy,
+        task.camera_b,
+        b.xy,
+        matches,
+        focal_known=task.focal_known,
+        max_error_px=task.options.max_error_px * max(1.0, side / task.options.error_reference_side_px),
+        seed=task.options.seed,
+    )
+    write_arrays(task.target, view.arrays())
+    return len(view.inliers)
+
+
+def _match_file(a: PhotoView, b: PhotoView, workspace: Workspace, options: MatchOptions) -> Path:
+    """The pair's file: keyed by the photos, how features were made, the cameras and the options."""
+    key = digest(options_fingerprint(options), a.features.parent.name, repr(a.camera), repr(b.camera))[:16]
+    return workspace.matches(key, a.sha256, b.sha256)

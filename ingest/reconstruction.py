@@ -1,0 +1,314 @@
+"""From usable photos to placed feature maps: extract, pair, match, reconstruct, place, build.
+
+Each step leaves its result in the work folder, under a key of what it was made of; a step that finds
+its result there does nothing.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import FeatureMap, Placement
+from ingest.colmap_bridge import Model, SfmPhoto, TwoView
+from ingest.executor import Executor, Progress, no_progress
+from ingest.extract import PhotoFeatures, extract_photos, load_features
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.map_builder import MapIdentity, MapOptions, build_map
+from ingest.matching import MatchOptions, PhotoView, match_pairs
+from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions
+from ingest.photo import Photo
+from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.sfm import SfmOptions, reconstruct
+from ingest.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+CameraSharing = Literal["shared", "per-image"]
+Stage = Literal["scan", "extract", "match", "reconstruct", "build", "commit"]
+STAGES: tuple[Stage, ...] = ("scan", "extract", "match", "reconstruct", "build", "commit")
+
+# 1.2 times the longer side is a field of view of 45 degrees, COLMAP's guess without EXIF.
+_DEFAULT_FOCAL_OVER_SIDE = 1.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapMakingOptions:
+    """Options of every step between photos and maps.
+
+    Attributes:
+        cameras: photos of one make, model and size share intrinsics, or each has its own.
+    """
+
+    extractor: ExtractorOptions = field(default_factory=ExtractorOptions)
+    pairs: PairOptions = field(default_factory=PairOptions)
+    matching: MatchOptions = field(default_factory=MatchOptions)
+    sfm: SfmOptions = field(default_factory=SfmOptions)
+    gps: GpsOptions = field(default_factory=GpsOptions)
+    maps: MapOptions = field(default_factory=MapOptions)
+    cameras: CameraSharing = "shared"
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of everything that a map depends on besides the photos."""
+        return options_fingerprint(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Component:
+    """One connected component of the photos and what became of it.
+
+    Attributes:
+        model: the reconstruction.
+        photos: its registered photos, in the order of model.rows.
+        with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
+        placement: accepted or refused with a reason.
+        feature_map: None where the placement was refused.
+    """
+
+    model: Model
+    photos: tuple[Photo, ...]
+    with_gps: tuple[int, ...]
+    placement: GpsPlacement
+    feature_map: FeatureMap | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Reconstructed:
+    """What came of the photos.
+
+    Attributes:
+        components: largest first.
+        unreadable: photos by name whose pixels could not be read, with the reason.
+        features_per_photo: number of features by photo name.
+        pairs, verified_pairs: pairs tried, and those with enough verified matches.
+        matches_per_photo: verified matches by photo name, summed over its pairs.
+        stopped_after: the stage after which the caller wanted to stop, or None.
+    """
+
+    components: tuple[Component, ...] = ()
+    unreadable: dict[str, str] = field(default_factory=dict)
+    features_per_photo: dict[str, int] = field(default_factory=dict)
+    pairs: int = 0
+    verified_pairs: int = 0
+    matches_per_photo: dict[str, int] = field(default_factory=dict)
+    stopped_after: Stage | None = None
+
+
+def make_maps(
+    photos: Sequence[Photo],
+    workspace: Workspace,
+    options: MapMakingOptions,
+    executor: Executor,
+    *,
+    identity: Callable[[int], MapIdentity],
+    progress: Progress = no_progress,
+    stop_after: Stage | None = None,
+) -> Reconstructed:
+    """Reconstruct and place photos.
+
+    Args:
+        photos: usable ones, in a fixed order.
+        identity: of the map of the component with that number.
+        stop_after: end there; what is done is kept for the next run.
+    """
+    unreadable = extract_photos(list(photos), workspace, options.extractor, executor, progress)
+    usable = [p for p in photos if p.name not in unreadable]
+    if stop_after == "extract":
+        return Reconstructed(unreadable=unreadable, stopped_after="extract")
+
+    features = [load_features(workspace, options.extractor, p) for p in usable]
+    cameras, camera_rows = photo_cameras(usable, options)
+    pairs = choose_pairs(usable, [f.features.descriptors for f in features], options.pairs)
+    geometries = _match(usable, cameras, camera_rows, pairs, workspace, options, executor, progress)
+    done = Reconstructed(
+        unreadable=unreadable,
+        features_per_photo={p.name: len(f.features) for p, f in zip(usable, features, strict=True)},
+        pairs=len(pairs),
+        verified_pairs=len(geometries),
+        matches_per_photo=_matches_per_photo(usable, geometries),
+    )
+    if stop_after == "match":
+        return replace(done, stopped_after="match")
+
+    frame = local_frame_of(usable)
+    models = _reconstruct(
+        usable, features, cameras, camera_rows, geometries, frame, workspace, options, progress
+    )
+    if stop_after == "reconstruct":
+        return replace(done, stopped_after="reconstruct")
+    components = [
+        _component(model, frame, usable, features, identity(number), options)
+        for number, model in enumerate(models)
+    ]
+    progress("build", len(components), len(components))
+    return replace(done, components=tuple(components))
+
+
+def photo_cameras(
+    photos: Sequence[Photo], options: MapMakingOptions
+) -> tuple[list[tuple[Camera, bool]], list[int]]:
+    """Cameras (with whether EXIF gives the focal length) and the camera's row of each photo."""
+    rows: dict[str, int] = {}
+    cameras: list[tuple[Camera, bool]] = []
+    of_photo: list[int] = []
+    for photo in photos:
+        key = photo.name if options.cameras == "per-image" or not photo.camera_key else photo.camera_key
+        if key not in rows:
+            rows[key] = len(cameras)
+            known = photo.focal_px is not None
+            focal = photo.focal_px or _DEFAULT_FOCAL_OVER_SIDE * max(photo.width, photo.height)
+            camera = Camera.from_focal(photo.width, photo.height, focal, options.sfm.camera_model)
+            cameras.append((camera, known))
+        of_photo.append(rows[key])
+    return cameras, of_photo
+
+
+def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
+    """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
+    gps = np.array(
+        [[p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0] for p in photos if p.gps is not None]
+    )
+    if not len(gps):
+        return None
+    latitude, longitude, height = np.median(gps, axis=0)
+    return LocalFrame(
+        latitude_deg=round(float(latitude), 5),
+        longitude_deg=round(float(longitude), 5),
+        height_m=round(float(height)),
+    )
+
+
+def _match(
+    photos: Sequence[Photo],
+    cameras: Sequence[tuple[Camera, bool]],
+    camera_rows: Sequence[int],
+    pairs: list[Pair],
+    workspace: Workspace,
+    options: MapMakingOptions,
+    executor: Executor,
+    progress: Progress,
+) -> dict[Pair, TwoView]:
+    fingerprint = options_fingerprint(options.extractor)
+    views = [
+        PhotoView(
+            sha256=photo.sha256,
+            features=workspace.features(fingerprint, photo.sha256),
+            camera=cameras[row][0],
+            focal_known=cameras[row][1],
+        )
+        for photo, row in zip(photos, camera_rows, strict=True)
+    ]
+    return match_pairs(views, pairs, workspace, options.matching, executor, progress)
+
+
+def _reconstruct(
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    cameras: Sequence[tuple[Camera, bool]],
+    camera_rows: Sequence[int],
+    geometries: dict[Pair, TwoView],
+    frame: LocalFrame | None,
+    workspace: Workspace,
+    options: MapMakingOptions,
+    progress: Progress,
+) -> list[Model]:
+    positions, sigmas = _priors(photos, frame)
+    sfm_photos = [
+        SfmPhoto(
+            name=photo.name,
+            camera_row=camera_rows[i],
+            keypoints=features[i].features.xy,
+            prior_position=positions[i] if np.isfinite(sigmas[i]).all() else None,
+            prior_covariance=np.diag(sigmas[i] ** 2),
+        )
+        for i, photo in enumerate(photos)
+    ]
+    registered = 2  # COLMAP tells of each photo after the first pair
+
+    def on_photo() -> None:
+        nonlocal registered
+        registered = min(registered + 1, len(photos))
+        progress("reconstruct", registered, len(photos))
+
+    folder = workspace.job / "models"
+    models = reconstruct(cameras, sfm_photos, geometries, folder, options.sfm, on_photo)
+    progress("reconstruct", len(photos), len(photos))
+    return models
+
+
+def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 3) in the frame and sigmas (n, 3), NaN for photos without GPS or height."""
+    positions = np.full((len(photos), 3), np.nan)
+    sigmas = np.full((len(photos), 3), np.nan)
+    rows = [i for i, p in enumerate(photos) if p.gps is not None and p.gps.height_m is not None]
+    if frame is not None and rows:
+        positions[rows] = gps_positions([photos[i] for i in rows], frame)
+        for i in rows:
+            gps = photos[i].gps
+            assert gps is not None
+            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
+    return positions, sigmas
+
+
+def _component(
+    model: Model,
+    frame: LocalFrame | None,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapMakingOptions,
+) -> Component:
+    """Place one model and build its map where the placement is accepted."""
+    chosen = [photos[r] for r in model.rows]
+    positions, sigmas = _priors(chosen, frame)
+    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
+    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
+    feature_map = None
+    if placed.reason is None:
+        assert frame is not None and placed.local_from_sfm is not None and placed.covariance is not None
+        placement = Placement(
+            method="gps",
+            local_from_sfm=placed.local_from_sfm,
+            covariance=placed.covariance,
+            residual_rms_m=placed.residual_rms_m,
+            evidence=_evidence(placed, [chosen[i] for i in with_gps]),
+        )
+        feature_map = build_map(
+            model, placement, frame, chosen, [features[r] for r in model.rows], identity, options.maps
+        )
+    return Component(
+        model=model,
+        photos=tuple(chosen),
+        with_gps=tuple(int(i) for i in with_gps),
+        placement=placed,
+        feature_map=feature_map,
+    )
+
+
+def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
+    residuals = {
+        photo.name: [round(float(v), 4) for v in row]
+        for photo, row in zip(photos, placed.residuals_m, strict=True)
+    }
+    outliers = [photo.name for photo, inner in zip(photos, placed.inliers, strict=True) if not inner]
+    return placed.figures | {"residuals_enu_m": residuals, "outlier_photos": outliers}
+
+
+def _matches_per_photo(photos: Sequence[Photo], geometries: dict[Pair, TwoView]) -> dict[str, int]:
+    totals = dict.fromkeys((p.name for p in photos), 0)
+    for (i, j), view in geometries.items():
+        totals[photos[i].name] += len(view.inliers)
+        totals[photos[j].name] += len(view.inliers)
+    return totals
+
+
+def job_digest(photos: Sequence[Photo], fingerprint: str) -> str:
+    """Names the job: equal photos under equal options are the same job."""
+    return digest(fingerprint, *sorted(p.sha256 for p in photos))

@@ -1,0 +1,1 @@
+"""Placing a reconstruction on Earth: by the photos' GPS."""

@@ -1,0 +1,302 @@
+"""Placement by GPS: the similarity that carries camera centres to the photos' positions.
+
+Equation: gps_i = S center_i + bias + noise_i, with S = local_from_sfm, noise_i ~ N(0, diag(sh, sh, sv)^2) independent for
+each photo, and one bias that all photos of a flight share (atmosphere, ephemeris, barometer). The
+residuals tell of the noise, never of the bias: its covariance is added by assumption.
+"""
+
+import itertools
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import nearest_rotation
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+
+GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GpsOptions:
+    """How the similarity is estimated and when it is refused.
+
+    Attributes:
+        min_photos: three positions are the least that fix a similarity.
+        outlier_sigmas: a photo whose residual is further out, in sigmas of its own prior, is left out.
+            3.5 keeps 99.3 % of honest positions (three axes).
+        max_outlier_share: with more outliers than that the priors or the reconstruction are wrong.
+        min_rotation_sigma_ratio: the spread of the centres across their main line, over the sigma of
+            GPS across it; below, the rotation about the line is not observed to better than ~30 deg.
+        max_variance_factor: of weighted residuals over their expectation; 9 means that GPS is three
+            times worse than it says.
+        max_scale_sigma: relative standard deviation of the scale; beyond, a map is no measure.
+        bias_horizontal_m, bias_vertical_m: one sigma of the error that all positions share, where the
+            priors are ordinary GPS.
+        bias_over_sigma: the shared error is no larger than this times the priors' own sigma, so that
+            exact priors stay exact.
+        max_ransac_samples: of three positions; fewer photos are tried exhaustively.
+        seed: of the samples.
+    """
+
+    min_photos: int = 3
+    outlier_sigmas: float = 3.5
+    max_outlier_share: float = 0.4
+    min_rotation_sigma_ratio: float = 2.0
+    max_variance_factor: float = 9.0
+    max_scale_sigma: float = 0.1
+    bias_horizontal_m: float = 2.0
+    bias_vertical_m: float = 5.0
+    bias_over_sigma: float = 0.6
+    max_ransac_samples: int = 500
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GpsPlacement:
+    """Outcome of a placement: accepted when `reason` is None.
+
+    Attributes:
+        reason: gate that refused it, or None; `message` says it for people.
+        local_from_sfm: the similarity, None where none could be estimated.
+        covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
+        residuals_m: (n, 3) GPS minus placed centre, east, north, up; NaN without a similarity.
+        inliers: (n,) bool.
+        variance_factor: weighted residuals' variance over the priors' own.
+        figures: what the decision rests on, JSON-able.
+    """
+
+    reason: GpsReason | None
+    message: str
+    local_from_sfm: Sim3 | None
+    covariance: FloatArray | None
+    residuals_m: FloatArray
+    inliers: NDArray[np.bool_]
+    variance_factor: float
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def residual_rms_m(self) -> float:
+        """Root mean square length of the inliers' residuals, metres."""
+        inner = self.residuals_m[self.inliers]
+        return float(np.sqrt((inner**2).sum(axis=1).mean())) if len(inner) else float("nan")
+
+
+def place_by_gps(
+    centers_sfm: FloatArray, positions_local: FloatArray, sigmas_m: FloatArray, options: GpsOptions
+) -> GpsPlacement:
+    """Robust similarity from camera centres to GPS positions.
+
+    Args:
+        centers_sfm: (n, 3) camera centres in the reconstruction's frame.
+        positions_local: (n, 3) GPS in the local frame, metres.
+        sigmas_m: (n, 3) standard deviations of the positions along the local axes.
+    """
+    count = len(centers_sfm)
+    if count < options.min_photos:
+        return _refused(
+            "TOO_FEW",
+            f"{count} registered photos have GPS, at least {options.min_photos} are needed",
+            count,
+            {"photos_with_gps": count},
+        )
+    start = _ransac(centers_sfm, positions_local, sigmas_m, options)
+    if start is None:
+        return _refused(
+            "DEGENERATE_LINE", "the camera centres or positions coincide", count, {"photos_with_gps": count}
+        )
+    sim, inliers = start
+    for _ in range(10):  # inliers settle in two or three rounds
+        sim = _refine(sim, centers_sfm[inliers], positions_local[inliers], sigmas_m[inliers])
+        again = _distances(sim, centers_sfm, positions_local, sigmas_m) <= options.outlier_sigmas
+        if (again == inliers).all() or again.sum() < options.min_photos:
+            break
+        inliers = again
+    return _judge(sim, centers_sfm, positions_local, sigmas_m, inliers, options)
+
+
+def _judge(
+    sim: Sim3,
+    centers: FloatArray,
+    positions: FloatArray,
+    sigmas: FloatArray,
+    inliers: NDArray[np.bool_],
+    options: GpsOptions,
+) -> GpsPlacement:
+    """Covariance, figures and gates of an estimated similarity."""
+    residuals = positions - sim.act(centers)
+    used = int(inliers.sum())
+    freedom = 3 * used - 7
+    weighted = float(((residuals[inliers] / sigmas[inliers]) ** 2).sum())
+    factor = weighted / freedom
+    spread_ratio = _spread_over_sigma(positions[inliers], sigmas[inliers])
+    figures: dict[str, Any] = {
+        "photos_with_gps": len(centers),
+        "inliers": used,
+        "variance_factor": factor,
+        "chi_square": weighted,
+        "degrees_of_freedom": freedom,
+        "chi_square_probability": float(chi2.sf(weighted, freedom)),
+        "across_line_over_sigma": spread_ratio,
+        "rms_horizontal_m": float(np.sqrt((residuals[inliers, :2] ** 2).sum(axis=1).mean())),
+        "rms_vertical_m": float(np.sqrt((residuals[inliers, 2] ** 2).mean())),
+        "options": asdict(options),
+    }
+
+    def outcome(reason: GpsReason | None, message: str, covariance: FloatArray | None) -> GpsPlacement:
+        return GpsPlacement(
+            reason=reason,
+            message=message,
+            local_from_sfm=sim,
+            covariance=covariance,
+            residuals_m=residuals,
+            inliers=inliers,
+            variance_factor=factor,
+            figures=figures,
+        )
+
+    if spread_ratio < options.min_rotation_sigma_ratio:
+        return outcome(
+            "DEGENERATE_LINE",
+            f"the photos lie along a line: {spread_ratio:.1f} sigmas of GPS across it, at least "
+            f"{options.min_rotation_sigma_ratio:g} are needed to tell which way is up",
+            None,
+        )
+    share = 1.0 - used / len(centers)
+    if share > options.max_outlier_share or factor > options.max_variance_factor:
+        return outcome(
+            "RESIDUALS",
+            f"the photos' GPS does not fit the reconstruction: {share:.0%} outliers, the rest {factor**0.5:.1f} "
+            f"times their sigma (limits {options.max_outlier_share:.0%} and {options.max_variance_factor**0.5:g})",
+            None,
+        )
+    covariance = _covariance(sim, centers[inliers], sigmas[inliers], factor, options)
+    figures["scale_sigma"] = float(np.sqrt(covariance[0, 0]))
+    if figures["scale_sigma"] > options.max_scale_sigma:
+        return outcome(
+            "SCALE",
+            f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} is needed: "
+            "the photos are too close together for their GPS",
+            None,
+        )
+    return outcome(None, "placed by GPS", covariance)
+
+
+def _covariance(
+    sim: Sim3, centers: FloatArray, sigmas: FloatArray, factor: float, options: GpsOptions
+) -> FloatArray:
+    """(7, 7): noise by the normal equations, scaled up by the residuals, plus the shared bias.
+
+    The factor is never taken below 1: with few photos small residuals are luck.
+    """
+    jacobian = point_jacobian(sim.act(centers)) / sigmas[:, :, None]
+    normal = np.einsum("nij,nik->jk", jacobian, jacobian)
+    covariance = np.linalg.inv(normal) * max(factor, 1.0)
+    typical = np.median(sigmas, axis=0) * options.bias_over_sigma
+    limits = np.array([options.bias_horizontal_m, options.bias_horizontal_m, options.bias_vertical_m])
+    covariance[4:, 4:] += np.diag(np.minimum(typical, limits) ** 2)
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def _ransac(
+    centers: FloatArray, positions: FloatArray, sigmas: FloatArray, options: GpsOptions
+) -> tuple[Sim3, NDArray[np.bool_]] | None:
+    """The similarity of three photos, or of all, with the smallest truncated sum of squared distances."""
+    samples = _samples(len(centers), options)
+    best: tuple[float, Sim3] | None = None
+    for rows in [np.arange(len(centers)), *samples]:
+        sim = similarity_closed_form(centers[rows], positions[rows])
+        if sim is None:
+            continue
+        distances = _distances(sim, centers, positions, sigmas)
+        cost = float(np.minimum(distances, options.outlier_sigmas).__pow__(2).sum())
+        if best is None or cost < best[0]:
+            best = (cost, sim)
+    if best is None:
+        return None
+    inliers = _distances(best[1], centers, positions, sigmas) <= options.outlier_sigmas
+    if inliers.sum() < options.min_photos:  # nothing fits: let the gates see all residuals
+        inliers = np.ones(len(centers), dtype=bool)
+    return best[1], inliers
+
+
+def _samples(count: int, options: GpsOptions) -> list[NDArray[np.int64]]:
+    if count * (count - 1) * (count - 2) // 6 <= options.max_ransac_samples:
+        return [np.array(c) for c in itertools.combinations(range(count), 3)]
+    generator = np.random.default_rng(options.seed)
+    return [generator.choice(count, 3, replace=False) for _ in range(options.max_ransac_samples)]
+
+
+def similarity_closed_form(source: FloatArray, target: FloatArray) -> Sim3 | None:
+    """Least-squares similarity target = S source, both (n, 3) (Umeyama 1991); None if points coincide."""
+    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
+    a, b = source - source_mean, target - target_mean
+    variance = float((a**2).sum())
+    cross = b.T @ a
+    if variance < 1e-18 or float((b**2).sum()) < 1e-12:
+        return None
+    rotation = nearest_rotation(cross)
+    scale = float(np.trace(rotation.T @ cross)) / variance
+    if scale <= 0:
+        return None
+    return Sim3(scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean)
+
+
+def _refine(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> Sim3:
+    """Levenberg-Marquardt on the tangent, weighted by the sigmas."""
+    damping, cost = 1e-3, _cost(sim, centers, positions, sigmas)
+    for _ in range(50):
+        placed = sim.act(centers)
+        jacobian = (point_jacobian(placed) / sigmas[:, :, None]).reshape(-1, 7)
+        residual = ((positions - placed) / sigmas).ravel()
+        normal = jacobian.T @ jacobian
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
+        candidate = Sim3.exp(step) @ sim
+        new_cost = _cost(candidate, centers, positions, sigmas)
+        if new_cost <= cost:
+            converged = cost - new_cost <= 1e-12 * max(cost, 1e-12)
+            sim, cost, damping = candidate, new_cost, damping / 10.0
+            if converged:
+                break
+        else:
+            damping *= 10.0
+            if damping > 1e8:
+                break
+    return sim
+
+
+def _cost(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> float:
+    return float((((positions - sim.act(centers)) / sigmas) ** 2).sum())
+
+
+def _distances(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> FloatArray:
+    """Mahalanobis distance (n,) of each position from its placed centre."""
+    return np.asarray(np.sqrt((((positions - sim.act(centers)) / sigmas) ** 2).sum(axis=1)))
+
+
+def _spread_over_sigma(positions: FloatArray, sigmas: FloatArray) -> float:
+    """Root sum of squares of the positions across their main line, over the sigma of GPS in that direction.
+
+    The inverse is about the standard deviation, in radians, of the rotation about the line. A single
+    direction across counts: it fixes the rotation, the other does not add to the question.
+    """
+    centred = positions - positions.mean(axis=0)
+    _, values, axes = np.linalg.svd(centred, full_matrices=False)
+    sigma_across = float(np.sqrt(((axes[1] * np.median(sigmas, axis=0)) ** 2).sum()))
+    return float(values[1]) / sigma_across
+
+
+def _refused(reason: GpsReason, message: str, count: int, figures: dict[str, Any]) -> GpsPlacement:
+    return GpsPlacement(
+        reason=reason,
+        message=message,
+        local_from_sfm=None,
+        covariance=None,
+        residuals_m=np.full((count, 3), np.nan),
+        inliers=np.zeros(count, dtype=bool),
+        variance_factor=float("nan"),
+        figures=figures,
+    )

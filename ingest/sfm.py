@@ -1,0 +1,119 @@
+"""Stage: structure from motion of matched photos; each connected component becomes a model."""
+
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from featuredb.geometry.camera import Camera
+from ingest.colmap_bridge import Model, SfmPhoto, TwoView, read_models, run_incremental, write_database
+from ingest.workspace import atomic_folder
+
+PriorUse = Literal["none", "bundle"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmOptions:
+    """How photos are reconstructed.
+
+    Attributes:
+        camera_model: COLMAP's model of every camera whose EXIF gives no better one.
+        position_priors: "bundle" puts GPS positions into the bundle adjustment, "none" keeps them for
+            the placement afterwards.
+        min_model_photos: smaller models are dropped; three photos are the least that a placement by
+            positions needs.
+        min_inliers: verified matches of a pair that mapping may use.
+        filter_max_error_px: observations with a larger reprojection error are dropped, at
+            `error_reference_side_px`, growing with the image.
+        error_reference_side_px: keypoints are located on images of about this size.
+        keep_two_view_tracks: points seen by two photos only are triangulated too.
+        seed: of all random choices.
+        threads: of bundle adjustment; one gives the same numbers in every run.
+    """
+
+    camera_model: str = "SIMPLE_RADIAL"
+    position_priors: PriorUse = "none"
+    min_model_photos: int = 3
+    min_inliers: int = 20
+    filter_max_error_px: float = 4.0
+    error_reference_side_px: int = 1600
+    keep_two_view_tracks: bool = True
+    seed: int = 0
+    threads: int = 1
+
+
+def reconstruct(
+    cameras: Sequence[tuple[Camera, bool]],
+    photos: Sequence[SfmPhoto],
+    geometries: Mapping[tuple[int, int], TwoView],
+    folder: Path,
+    options: SfmOptions,
+    on_photo: Callable[[], None] = lambda: None,
+) -> list[Model]:
+    """Reconstruct, or read what an earlier run left in `folder`.
+
+    Args:
+        cameras: with whether the focal length is known from EXIF.
+        geometries: of pairs of rows of `photos`.
+
+    Returns:
+        Models with at least `min_model_photos` photos, largest first. A photo is in one model only.
+    """
+    if not folder.is_dir():
+        with atomic_folder(folder) as temporary:
+            _map(cameras, photos, geometries, temporary, options, on_photo)
+    return _disjoint(read_models(folder), options.min_model_photos)
+
+
+def _map(
+    cameras: Sequence[tuple[Camera, bool]],
+    photos: Sequence[SfmPhoto],
+    geometries: Mapping[tuple[int, int], TwoView],
+    folder: Path,
+    options: SfmOptions,
+    on_photo: Callable[[], None],
+) -> None:
+    if not geometries:
+        return
+    side = max(max(camera.width, camera.height) for camera, _ in cameras)
+    with tempfile.TemporaryDirectory(prefix="featuredb-sfm-") as scratch:
+        database = Path(scratch) / "colmap.db"
+        write_database(database, cameras, photos, geometries)
+        run_incremental(database, Path(scratch), folder, _settings(options, side), on_photo)
+
+
+def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
+    """COLMAP's settings; thresholds in pixels grow with the image, since keypoints' errors do."""
+    zoom = max(1.0, side_px / options.error_reference_side_px)
+    return {
+        "random_seed": options.seed,
+        "num_threads": options.threads,
+        "extract_colors": False,
+        "min_num_matches": options.min_inliers,
+        "min_model_size": options.min_model_photos,
+        "use_prior_position": options.position_priors == "bundle",
+        "use_robust_loss_on_prior_position": options.position_priors == "bundle",
+        "mapper.filter_max_reproj_error": options.filter_max_error_px * zoom,
+        "mapper.init_max_error": 4.0 * zoom,
+        "mapper.abs_pose_max_error": 8.0 * zoom,
+        "triangulation.merge_max_reproj_error": options.filter_max_error_px * zoom,
+        "triangulation.complete_max_reproj_error": options.filter_max_error_px * zoom,
+        "triangulation.ignore_two_view_tracks": not options.keep_two_view_tracks,
+    }
+
+
+def _disjoint(models: Sequence[Model], min_photos: int) -> list[Model]:
+    """Large models first; a later model keeps out if it shares photos with an earlier one.
+
+    COLMAP may grow a second model into photos of the first. Two maps with the same photos would agree
+    with themselves; the smaller one says nothing that the larger does not.
+    """
+    chosen: list[Model] = []
+    taken: set[int] = set()
+    for model in models:
+        rows = set(model.rows.tolist())
+        if len(rows) >= min_photos and not rows & taken:
+            chosen.append(model)
+            taken |= rows
+    return chosen

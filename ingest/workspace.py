@@ -1,0 +1,163 @@
+"""The work folder of an ingest: where stages leave their results, so that a killed job goes on.
+
+Every file is keyed by what it was made of (digests of the photos' bytes, fingerprints of the options),
+written under a temporary name, flushed to the disk and then renamed: a file that is there is complete.
+Per-photo and per-pair results are shared by all jobs of a database; what depends on the whole photo set
+lies in the job's own folder.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IngestError
+
+_TEMPORARY = ".tmp-"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Workspace:
+    """Folders of one job.
+
+    Attributes:
+        root: shared by all jobs of a database.
+        job_id: digest of the photos and options.
+    """
+
+    root: Path
+    job_id: str
+
+    @property
+    def job(self) -> Path:
+        """Results that depend on the whole set of photos."""
+        return self.root / "jobs" / self.job_id
+
+    def features(self, fingerprint: str, sha256: str) -> Path:
+        """The features of one photo under the given extractor options."""
+        return self.root / "features" / fingerprint / f"{sha256}.npz"
+
+    def matches(self, fingerprint: str, sha256_a: str, sha256_b: str) -> Path:
+        """The verified matches of one pair under the given options."""
+        return self.root / "matches" / fingerprint / sha256_a[:2] / f"{sha256_a}_{sha256_b}.npz"
+
+
+def default_root(database_url: str) -> Path:
+    """Where a database's work folder lies unless the caller says otherwise.
+
+    Inside a local database folder; for an object store in the user's cache folder, under a digest of
+    the address.
+    """
+    if "://" in database_url and not database_url.startswith("file://"):
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        return cache / "featuredb" / "work" / hashlib.sha256(database_url.encode()).hexdigest()[:16]
+    return Path(database_url.removeprefix("file://")) / "_work"
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yields a temporary path in the same folder; on success it is flushed and takes the name `path`."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex}-{path.name}")
+    try:
+        yield temporary
+        _flush(temporary)
+        os.replace(temporary, path)  # noqa: PTH105 (the name says what it does)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _flush(path.parent)
+
+
+@contextmanager
+def atomic_folder(path: Path) -> Iterator[Path]:
+    """Yields a temporary folder; on success its files are flushed and it takes the name `path`.
+
+    Another process that finishes the same folder first wins: both made it of the same inputs.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f"{_TEMPORARY}{uuid.uuid4().hex}-{path.name}")
+    temporary.mkdir()
+    try:
+        yield temporary
+        for file in sorted(temporary.rglob("*")):
+            _flush(file)
+        try:
+            temporary.rename(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+    _flush(path.parent)
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    """Write atomically."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1, sort_keys=True), encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read what `write_json` wrote."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise IngestError(f"{path}: expected a stage's JSON record, {error}; delete it and run again") from error
+    if not isinstance(value, dict):
+        raise IngestError(f"{path}: expected a JSON object, found {type(value).__name__}; delete it, run again")
+    return value
+
+
+def write_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays as an uncompressed npz file, atomically."""
+    buffer = BytesIO()
+    np.savez(buffer, **arrays)  # type: ignore[arg-type]
+    with atomic_file(path) as temporary:
+        temporary.write_bytes(buffer.getvalue())
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read what `write_arrays` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError) as error:
+        raise IngestError(f"{path}: expected a stage's npz file, {error}; delete it and run again") from error
+
+
+def remove_leftovers(root: Path) -> int:
+    """Delete temporary files of killed jobs under `root` that are older than a day; how many there were."""
+    count = 0
+    for path in root.rglob(f"{_TEMPORARY}*"):
+        if path.exists() and _age_s(path) > 86_400.0:  # a day: no stage of one photo or pair takes that long
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+            count += 1
+    return count
+
+
+def _age_s(path: Path) -> float:
+    import time
+
+    return time.time() - path.stat().st_mtime
+
+
+def _flush(path: Path) -> None:
+    """Force a file's or folder's content to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError:  # some file systems cannot flush a folder; the rename is still atomic
+        if not path.is_dir():
+            raise
+    finally:
+        os.close(handle)
