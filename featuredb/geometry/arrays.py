@@ -15,15 +15,25 @@ def frozen_array(
 ) -> NDArray[Any]:
     """Return a read-only copy of `value` with the given dtype, after checking its shape.
 
-    `None` in `shape` accepts any length on that axis. Floating arrays must be finite.
+    `None` in `shape` accepts any length on that axis. Floating arrays must be finite; a conversion to
+    integers or booleans must keep every value, so that 0.7 does not become row 0 and 300 not the byte 44.
 
     Raises:
-        InvalidValueError: wrong shape, not convertible, or not finite.
+        InvalidValueError: wrong shape, not convertible without changing values, or not finite.
     """
+    target = np.dtype(dtype)
     try:
-        array = np.array(value, dtype=dtype)
-    except (TypeError, ValueError) as error:
-        raise InvalidValueError(f"{name}: expected an array of {np.dtype(dtype)}, found {value!r}") from error
+        given = np.asarray(value)
+    except ValueError as error:
+        raise InvalidValueError(f"{name}: expected an array of {target}, found {value!r:.200}") from error
+    if given.size and given.dtype.kind not in "biuf":
+        raise InvalidValueError(f"{name}: expected numbers, found an array of {given.dtype}")
+    with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused below
+        array = np.array(given, dtype=target)
+    if target.kind in "biu" and given.dtype != target and not np.array_equal(array, given):
+        raise InvalidValueError(
+            f"{name}: expected values that {target} can hold, found others in an array of {given.dtype}"
+        )
     wanted = "(" + ", ".join("n" if s is None else str(s) for s in shape) + ")"
     if array.ndim != len(shape) or any(
         s is not None and s != a for s, a in zip(shape, array.shape, strict=True)

@@ -1,14 +1,16 @@
 """Camera intrinsics by COLMAP's models; projection is pycolmap's own code."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
 import pycolmap
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.arrays import FloatArray, frozen_array
 
 SUPPORTED_MODELS = (
     "SIMPLE_PINHOLE",
@@ -21,6 +23,9 @@ SUPPORTED_MODELS = (
     "RADIAL_FISHEYE",
     "OPENCV_FISHEYE",
 )
+
+_MAX_SIZE_PX = 1_000_000
+_MAX_FOCAL_PX = 1e7  # longer than any lens; larger numbers are mistaken units
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,27 +50,27 @@ class Camera:
             raise InvalidValueError(
                 f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {self.model!r}"
             )
-        if not (0 < self.width <= 1_000_000 and 0 < self.height <= 1_000_000):
+        for name in ("width", "height"):
+            object.__setattr__(self, name, _pixel_count(f"Camera.{name}", getattr(self, name)))
+        template = _template(self.model)
+        wanted = len(template.params)
+        params = frozen_array(
+            f"Camera.params of {self.model} ({template.params_info})", self.params, (wanted,)
+        )
+        object.__setattr__(self, "params", tuple(float(p) for p in params))
+        focals = [self.params[i] for i in template.focal_length_idxs()]
+        if not all(0 < focal < _MAX_FOCAL_PX for focal in focals):
             raise InvalidValueError(
-                f"Camera: expected width and height in 1..1000000 px, found {self.width}x{self.height}"
+                f"Camera: expected every focal length in (0, {_MAX_FOCAL_PX:g}) px, found {focals}"
             )
-        params = tuple(float(p) for p in self.params)
-        wanted = len(_template(self.model).params)
-        if len(params) != wanted or not np.isfinite(params).all():
-            raise InvalidValueError(
-                f"Camera.params: {self.model} takes {wanted} finite numbers "
-                f"({_template(self.model).params_info}), found {self.params!r}"
-            )
-        object.__setattr__(self, "params", params)
-        if not 0 < self.focal_px < 1e7:
-            raise InvalidValueError(f"Camera: expected a focal length > 0 px, found {self.focal_px}")
 
     @classmethod
     def from_focal(cls, width: int, height: int, focal_px: float, model: str = "SIMPLE_RADIAL") -> Self:
         """A camera of the given model with this focal length, centred, without distortion."""
         if model not in SUPPORTED_MODELS:
             raise InvalidValueError(f"Camera.model: unknown model {model!r}")
-        camera = pycolmap.Camera.create_from_model_name(1, model, float(focal_px), int(width), int(height))
+        width, height = _pixel_count("Camera.width", width), _pixel_count("Camera.height", height)
+        camera = pycolmap.Camera.create_from_model_name(1, model, float(focal_px), width, height)
         return cls(model=model, width=width, height=height, params=tuple(camera.params))
 
     @classmethod
@@ -103,6 +108,7 @@ class Camera:
         Raises:
             InvalidValueError: the aspect ratio differs by more than 1 %, so it is not the same picture.
         """
+        width, height = _pixel_count("Camera.width", width), _pixel_count("Camera.height", height)
         sx, sy = width / self.width, height / self.height
         if abs(sx / sy - 1.0) > 0.01:
             raise InvalidValueError(
@@ -110,18 +116,78 @@ class Camera:
                 "a cropped image needs a camera of its own"
             )
         camera = self.to_pycolmap()
-        camera.rescale(int(width), int(height))
+        camera.rescale(width, height)
         return Camera.from_pycolmap(camera)
 
     def project(self, points_cam: ArrayLike) -> FloatArray:
-        """Pixels (n, 2) of points (n, 3) in the camera frame; NaN for points behind the camera."""
-        points = np.ascontiguousarray(np.asarray(points_cam, dtype=np.float64).reshape(-1, 3))
-        return np.asarray(self.to_pycolmap().img_from_cam(points), dtype=np.float64)
+        """Pixels (n, 2) of points (n, 3), or of one point (3,), in the camera frame.
+
+        NaN for points behind the camera, and for those so far off the axis that the distortion polynomial
+        has turned back: there it would draw into the picture what the lens cannot see.
+        """
+        points = _rows("Camera.project", points_cam, 3)
+        pixels = np.asarray(self.to_pycolmap().img_from_cam(points), dtype=np.float64)
+        limit = _tan_of_fold(self.model, self.params)
+        if np.isfinite(limit):
+            pixels[np.hypot(points[:, 0], points[:, 1]) >= limit * points[:, 2]] = np.nan
+        return pixels
 
     def unproject(self, pixels: ArrayLike) -> FloatArray:
-        """Normalised image coordinates (n, 2), the ray being (x, y, 1), of pixels (n, 2)."""
-        xy = np.ascontiguousarray(np.asarray(pixels, dtype=np.float64).reshape(-1, 2))
+        """Normalised image coordinates (n, 2), the ray being (x, y, 1), of pixels (n, 2) or (2,).
+
+        NaN for pixels that the distortion model reaches from no ray.
+        """
+        xy = _rows("Camera.unproject", pixels, 2)
         return np.asarray(self.to_pycolmap().cam_from_img(xy), dtype=np.float64)
+
+
+def _pixel_count(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 < value <= _MAX_SIZE_PX:
+        raise InvalidValueError(f"{name}: expected a whole number in 1..{_MAX_SIZE_PX} px, found {value!r}")
+    return int(value)
+
+
+def _rows(name: str, value: ArrayLike, columns: int) -> FloatArray:
+    """A contiguous (n, columns) float64 array of an (n, columns) or (columns,) one."""
+    array: FloatArray = np.atleast_2d(np.asarray(value, dtype=np.float64))
+    if array.size == 0:
+        array = array.reshape(0, columns)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise InvalidValueError(f"{name}: expected shape (n, {columns}), found {array.shape}")
+    return np.ascontiguousarray(array)
+
+
+@lru_cache(maxsize=256)
+def _tan_of_fold(model: str, params: tuple[float, ...]) -> float:
+    """Tangent of the angle off the axis where the radial distortion stops growing, or infinity.
+
+    The distorted radius is r (1 + k1 r^2 + k2 r^4 + ...) (a quotient of two such polynomials in FULL_OPENCV),
+    r being the tangent of the angle, or the angle itself in a fisheye. Tangential terms are small beside it.
+    """
+    numerator, denominator = _radial_polynomials(model, params)
+    derivative = numerator.deriv() * denominator - numerator * denominator.deriv()
+    roots = derivative.roots()
+    real = roots[np.abs(roots.imag) < 1e-9 * np.abs(roots)].real
+    fold = float(min(real[real > 0], default=np.inf))
+    if "FISHEYE" not in model:
+        return fold
+    return float(np.tan(fold)) if fold < np.pi / 2 else np.inf
+
+
+def _radial_polynomials(model: str, params: tuple[float, ...]) -> tuple[Polynomial, Polynomial]:
+    """Numerator and denominator, in r, of the distorted radius."""
+    first = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
+    first |= {"SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 3, "OPENCV_FISHEYE": 4}
+    k = params[first[model] :] if model in first else ()
+    above: tuple[float, ...] = k
+    below: tuple[float, ...] = ()
+    if model == "OPENCV":
+        above = k[:2]
+    elif model == "FULL_OPENCV":
+        above, below = (k[0], k[1], k[4]), k[5:8]
+    numerator = [0.0, 1.0, *(c for term in above for c in (0.0, term))]
+    denominator = [1.0, *(c for term in below for c in (0.0, term))]
+    return Polynomial(numerator), Polynomial(denominator)
 
 
 _TEMPLATES: dict[str, Any] = {}

@@ -59,8 +59,18 @@ class Rigid3:
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Self:
-        """From a (3, 4) or (4, 4) matrix [R | t]."""
+        """From a (3, 4) or (4, 4) matrix [R | t].
+
+        Raises:
+            InvalidValueError: another shape, a last row other than 0 0 0 1, or no rotation in it.
+        """
         m = np.asarray(matrix, dtype=np.float64)
+        if m.shape not in ((3, 4), (4, 4)) or (
+            len(m) == 4 and not np.array_equal(m[3], (0.0, 0.0, 0.0, 1.0))
+        ):
+            raise InvalidValueError(
+                f"Rigid3.from_matrix: expected (3, 4), or (4, 4) with last row 0 0 0 1, found {m.tolist()}"
+            )
         return cls(rotation=m[:3, :3], translation=m[:3, 3])
 
     @classmethod
@@ -96,14 +106,15 @@ class Rigid3:
         return ad
 
     def inverse_covariance(self, covariance: ArrayLike) -> FloatArray:
-        """Covariance (6, 6) of `self.inverse()`, given that of `self`: moved by the adjoint of the inverse."""
+        """Covariance (6, 6) of `self.inverse()`, given that of `self`."""
         ad = self.inverse().adjoint()
         return ad @ np.asarray(covariance, dtype=np.float64) @ ad.T
 
     def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
         """Covariance (6, 6) of `self @ other` for independent errors of both, to first order."""
         ad = self.adjoint()
-        return np.asarray(covariance, dtype=np.float64) + ad @ np.asarray(other_covariance) @ ad.T
+        other = np.asarray(other_covariance, dtype=np.float64)
+        return np.asarray(covariance, dtype=np.float64) + ad @ other @ ad.T
 
     @property
     def quaternion_xyzw(self) -> FloatArray:
@@ -132,6 +143,6 @@ def _left_jacobian(omega: FloatArray) -> FloatArray:
     k = skew(omega)
     if theta < _SMALL_ANGLE:
         return np.eye(3) + 0.5 * k + k @ k / 6.0
-    a = (1.0 - np.cos(theta)) / theta**2
+    a = 0.5 * (np.sin(0.5 * theta) / (0.5 * theta)) ** 2  # (1 - cos) / theta^2 without its cancellation
     b = (theta - np.sin(theta)) / theta**3
     return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)

@@ -4,7 +4,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from featuredb.geometry.arrays import FloatArray
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+
+_SHORTEST_QUATERNION = 1e-6  # a shorter one is an unset field, not a rotation
 
 
 def skew(vector: ArrayLike) -> FloatArray:
@@ -15,7 +18,7 @@ def skew(vector: ArrayLike) -> FloatArray:
 
 def so3_exp(omega: ArrayLike) -> FloatArray:
     """Rotation matrix (3, 3) of the axis-angle vector omega (3,), radians."""
-    matrix: FloatArray = Rotation.from_rotvec(np.asarray(omega, dtype=np.float64)).as_matrix()
+    matrix: FloatArray = Rotation.from_rotvec(np.array(omega, dtype=np.float64)).as_matrix()
     return matrix
 
 
@@ -26,8 +29,15 @@ def so3_log(rotation: ArrayLike) -> FloatArray:
 
 
 def matrix_from_quaternion(xyzw: ArrayLike) -> FloatArray:
-    """Rotation matrix (3, 3) of a Hamilton quaternion (x, y, z, w); the norm is taken out."""
-    matrix: FloatArray = Rotation.from_quat(np.asarray(xyzw, dtype=np.float64)).as_matrix()
+    """Rotation matrix (3, 3) of a Hamilton quaternion (x, y, z, w); the norm is taken out.
+
+    Raises:
+        InvalidValueError: not four finite numbers, or all of them zero.
+    """
+    quaternion = frozen_array("quaternion", xyzw, (4,))
+    if np.linalg.norm(quaternion) < _SHORTEST_QUATERNION:
+        raise InvalidValueError(f"quaternion: expected a length > 0, found {quaternion.tolist()}")
+    matrix: FloatArray = Rotation.from_quat(quaternion).as_matrix()
     return matrix
 
 
@@ -45,6 +55,10 @@ def rotation_angle(rotation: ArrayLike) -> float:
 
 
 def nearest_rotation(matrix: ArrayLike) -> FloatArray:
-    """The rotation (3, 3) nearest to a 3x3 matrix in the Frobenius norm (orthogonal Procrustes)."""
-    u, _, vt = np.linalg.svd(np.asarray(matrix, dtype=np.float64))
+    """The rotation (3, 3) nearest to a 3x3 matrix in the Frobenius norm (orthogonal Procrustes).
+
+    Raises:
+        InvalidValueError: wrong shape or not finite.
+    """
+    u, _, vt = np.linalg.svd(frozen_array("nearest_rotation", matrix, (3, 3)))
     return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt, dtype=np.float64)

@@ -11,6 +11,8 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew, so3_exp, so3_log
 
+_SMALL_ANGLE = 1e-8  # below this the square of the angle is under float64's resolution
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sim3:
@@ -116,7 +118,8 @@ class Sim3:
     def compose_covariance(self, covariance: ArrayLike, other_covariance: ArrayLike) -> FloatArray:
         """Covariance (7, 7) of `self @ other` for independent errors of both, to first order."""
         ad = self.adjoint()
-        return np.asarray(covariance, dtype=np.float64) + ad @ np.asarray(other_covariance) @ ad.T
+        other = np.asarray(other_covariance, dtype=np.float64)
+        return np.asarray(covariance, dtype=np.float64) + ad @ other @ ad.T
 
     def matrix(self) -> FloatArray:
         """(4, 4) homogeneous matrix [sR t; 0 1]."""
@@ -139,25 +142,25 @@ def point_jacobian(points_target: ArrayLike) -> FloatArray:
 
 
 def _translation_factor(sigma: float, omega: FloatArray) -> FloatArray:
-    """W = integral over t in [0, 1] of exp(t sigma) exp(t [omega]x), so that exp's translation is W nu."""
+    """W = integral over t in [0, 1] of exp(t sigma) exp(t [omega]x), so that exp's translation is W nu.
+
+    [omega]x has the eigenvalues 0 and +-i theta, so W is a polynomial in it whose coefficients come from
+    phi(z) = (e^z - 1) / z, the integral of e^(tz), at sigma and at sigma + i theta. Only phi has to be
+    computed without cancellation, which complex expm1 does.
+    """
     theta = float(np.linalg.norm(omega))
     k = skew(omega)
-    if abs(sigma) < 1e-5 and theta < 1e-5:
-        # Third-order series; the next term is of order 1e-20.
-        return np.asarray(
-            (1 + sigma / 2 + sigma**2 / 6) * np.eye(3) + (0.5 + sigma / 3) * k + k @ k / 6, dtype=np.float64
-        )
-    scale = np.exp(sigma)
-    c0 = np.expm1(sigma) / sigma if abs(sigma) > 1e-12 else 1.0 + sigma / 2
-    if theta < 1e-5:
-        # Limits theta -> 0 of the coefficients below.
-        c1 = (scale * (sigma - 1) + 1) / sigma**2
-        c2 = (scale * (sigma**2 / 2 - sigma + 1) - 1) / sigma**3
-    else:
-        # integrals of e^(st) sin(theta t) and e^(st) cos(theta t)
-        norm = sigma**2 + theta**2
-        sine = (scale * (sigma * np.sin(theta) - theta * np.cos(theta)) + theta) / norm
-        cosine = (scale * (sigma * np.cos(theta) + theta * np.sin(theta)) - sigma) / norm
-        c1 = sine / theta
-        c2 = (c0 - cosine) / theta**2
-    return np.asarray(c0 * np.eye(3) + c1 * k + c2 * (k @ k), dtype=np.float64)
+    real = _phi(complex(sigma, 0.0)).real
+    if theta < _SMALL_ANGLE:
+        # The term of first order: integral of t e^(t sigma), by its series where the closed form cancels.
+        first = 0.5 + sigma / 3 if abs(sigma) < 1e-4 else (np.exp(sigma) * (sigma - 1) + 1) / sigma**2
+        return np.asarray(real * np.eye(3) + first * k, dtype=np.float64)
+    phi = _phi(complex(sigma, theta))
+    return np.asarray(
+        real * np.eye(3) + phi.imag / theta * k + (real - phi.real) / theta**2 * (k @ k), dtype=np.float64
+    )
+
+
+def _phi(z: complex) -> complex:
+    """(e^z - 1) / z, 1 at z = 0."""
+    return complex(np.expm1(z)) / z if z != 0 else 1.0 + 0.0j
