@@ -5,6 +5,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
+from featuredb.features.exif_gps import AltitudeReference
 from featuredb.maps.feature_map import GeoPrior
 
 PhotoStatus = Literal["ok", "skipped"]
@@ -23,11 +24,16 @@ class Photo:
         orientation: EXIF orientation 1..8; features and cameras are in the pixels as stored, the
             orientation is kept for display only.
         make, model: camera maker and model from EXIF, "" where absent.
-        camera_key: photos with equal keys share one set of intrinsics.
+        camera_key: photos with equal keys share one set of intrinsics (see featuredb.features.exif); ""
+            where the photo names no camera, so that it shares with none.
         focal_px: focal length from EXIF in pixels of the stored image, or None.
         capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.
         gps: position prior from EXIF, or None.
+        altitude_reference: what gps.height_m is counted from: sea_level, ellipsoid or unknown.
+        relative_altitude_m: height above take-off by a drone's barometer, or None.
         owner, licence: attribution from EXIF (Artist, Copyright) or the ingest's options.
+        duplicate_of: name of the photo that was kept instead, "" where this is no duplicate.
+        warnings: what was wrong in the photo's metadata without making it unusable.
     """
 
     name: str
@@ -45,5 +51,9 @@ class Photo:
     focal_px: float | None = None
     capture_time: datetime | None = None
     gps: GeoPrior | None = None
+    altitude_reference: AltitudeReference = "unknown"
+    relative_altitude_m: float | None = None
     owner: str = ""
     licence: str = ""
+    duplicate_of: str = ""
+    warnings: tuple[str, ...] = ()

@@ -51,25 +51,43 @@ class ImageHeader:
     end: int = 0
 
 
+def check_signature(head: bytes) -> None:
+    """Refuse by its first 32 bytes what cannot be an image, so that nothing else of it need be read.
+
+    Raises:
+        ImageError: codes not_an_image, unsupported, truncated.
+    """
+    if not head:
+        raise ImageError("the file is empty", "not_an_image")
+    if not (
+        head[:2] == b"\xff\xd8"
+        or head[:8] == _PNG_SIGNATURE
+        or (head[:4] == b"RIFF" and head[8:12] == b"WEBP")
+        or head[:4] in (b"II*\0", b"MM\0*")
+        or _is_bmp(head)
+    ):
+        raise _refusal(head)
+
+
 def read_header(data: bytes) -> ImageHeader:
     """Format, size and completeness of the image file in `data`.
 
     Raises:
         ImageError: codes not_an_image, truncated, broken, unsupported.
     """
-    if not data:
-        raise ImageError("the file is empty", "not_an_image")
+    check_signature(data[:32])
     if data[:2] == b"\xff\xd8":
         return _jpeg(data)
     if data[:8] == _PNG_SIGNATURE:
         return _png(data)
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+    if data[:4] == b"RIFF":
         return _webp(data)
-    if data[:4] in (b"II*\0", b"MM\0*"):
-        return _tiff(data)
-    if data[:2] == b"BM" and len(data) > 26 and data[14:18] in (b"\x28\0\0\0", b"\x6c\0\0\0", b"\x7c\0\0\0"):
-        return _bmp(data)
-    raise _refusal(data)
+    return _bmp(data) if _is_bmp(data) else _tiff(data)
+
+
+def _is_bmp(head: bytes) -> bool:
+    """The signature and one of the sizes of a header; two letters alone would be too weak."""
+    return head[:2] == b"BM" and head[14:18] in (b"\x28\0\0\0", b"\x6c\0\0\0", b"\x7c\0\0\0")
 
 
 def _refusal(data: bytes) -> ImageError:

@@ -1,0 +1,258 @@
+"""A folder of files to photos: what each one is, what it says of itself, and why it is not used.
+
+Nothing that a file contains is fatal. Every file is read, hashed and decoded once; a cache in the work
+folder, keyed by name, size and modification time, spares that the next time.
+"""
+
+import hashlib
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from featuredb.errors import ImageError, IngestError
+from featuredb.features.decode import DecodeLimits, decode_gray, probe, read_image_bytes
+from featuredb.features.exif import read_exif
+from featuredb.features.image_header import check_signature
+from featuredb.maps.exif_prior import prior_from_exif
+from ingest.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
+from ingest.fingerprint import options_fingerprint
+from ingest.photo import Photo
+from ingest.scan_cache import Examined, read_cache, write_cache
+from ingest.walk import FoundFile, walk
+
+Progress = Callable[[int, int], None]
+
+# Raised when the same file would be judged differently, so that old caches are not used.
+_VERSION = 1
+# The cache is written this often, so that a kill costs at most so many files.
+_SAVE_EVERY = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanOptions:
+    """What is taken from a folder.
+
+    Attributes:
+        limits: sizes that are refused. Ingest takes larger files than a server does, and asks for 240
+            pixels at least: smaller pictures are thumbnails, with too few features to hold in a map.
+        duplicates: when two photos are copies.
+        recursive: folders in the folder are entered.
+        workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
+        owner, licence: attribution of photos that do not name their own.
+    """
+
+    limits: DecodeLimits = field(
+        default_factory=lambda: DecodeLimits(max_bytes=256 << 20, max_pixels=200_000_000, min_side_px=240)
+    )
+    duplicates: DuplicateOptions = field(default_factory=DuplicateOptions)
+    recursive: bool = True
+    workers: int = 0
+    owner: str = ""
+    licence: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanResult:
+    """Every file of a folder.
+
+    Attributes:
+        photos: all files, used or not, sorted by name.
+        read: files that were opened; the others were in the cache or refused by their name.
+    """
+
+    photos: tuple[Photo, ...]
+    read: int = 0
+
+    @property
+    def usable(self) -> tuple[Photo, ...]:
+        """Photos to be ingested."""
+        return tuple(photo for photo in self.photos if photo.status == "ok")
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Number of skipped files by reason code."""
+        counts: dict[str, int] = {}
+        for photo in self.photos:
+            if photo.status == "skipped":
+                counts[photo.reason_code] = counts.get(photo.reason_code, 0) + 1
+        return counts
+
+
+def scan_folder(
+    folder: Path,
+    options: ScanOptions | None = None,
+    progress: Progress | None = None,
+    cache_file: Path | None = None,
+) -> ScanResult:
+    """Look at every file of a folder.
+
+    Args:
+        folder: the photos.
+        options: default ScanOptions().
+        progress: called with the number of files done and of all files, from the calling thread.
+        cache_file: where results are kept for the next run; None: nowhere.
+
+    Raises:
+        IngestError: the folder cannot be listed.
+    """
+    options = options or ScanOptions()
+    files = walk(folder, options.recursive)
+    key = f"{_VERSION}:{options_fingerprint(options.limits)}"
+    known = read_cache(cache_file, key) if cache_file else {}
+    examined, read = _examine_all(files, known, options, progress, cache_file, key)
+    photos = [_as_photo(file, examined.get(file.name), options) for file in files]
+    photos = _mark_exact(photos)
+    photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()}, options.duplicates)
+    return ScanResult(photos=tuple(photos), read=read)
+
+
+def _examine_all(
+    files: Sequence[FoundFile],
+    known: dict[str, Examined],
+    options: ScanOptions,
+    progress: Progress | None,
+    cache_file: Path | None,
+    key: str,
+) -> tuple[dict[str, Examined], int]:
+    """The examined regular files by name, and how many were not in the cache."""
+    results: dict[str, Examined] = {}
+    todo: list[FoundFile] = []
+    for file in files:
+        if file.reason_code:
+            continue
+        old = known.get(file.name)
+        if old and (old.size, old.mtime_ns) == (file.size, file.mtime_ns):
+            results[file.name] = old
+        else:
+            todo.append(file)
+    done = len(files) - len(todo)
+    if progress:
+        progress(done, len(files))
+    workers = options.workers or min(8, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers, thread_name_prefix="scan") as pool:
+        futures = {pool.submit(examine, file, options.limits): file for file in todo}
+        for count, future in enumerate(as_completed(futures), start=1):
+            results[futures[future].name] = future.result()
+            if progress:
+                progress(done + count, len(files))
+            if cache_file and count % _SAVE_EVERY == 0:
+                write_cache(cache_file, key, results)
+    if cache_file and (todo or results.keys() != known.keys()):
+        write_cache(cache_file, key, results)
+    return results, len(todo)
+
+
+def examine(file: FoundFile, limits: DecodeLimits) -> Examined:
+    """Read one file once: its digest, its picture and its metadata, or why it is none."""
+    sha256 = ""
+    try:
+        _check_head(file.path)
+        data = read_image_bytes(file.path, limits)
+        sha256 = hashlib.sha256(data).hexdigest()
+        header = probe(data, limits)
+        gray = decode_gray(data, limits)
+    except ImageError as error:
+        return Examined(
+            size=file.size,
+            mtime_ns=file.mtime_ns,
+            sha256=sha256,
+            reason_code=error.code,
+            reason=str(error),
+        )
+    return Examined(
+        size=file.size,
+        mtime_ns=file.mtime_ns,
+        sha256=sha256,
+        picture_hash=picture_hash(gray),
+        exif=read_exif(data, header),
+    )
+
+
+def _check_head(path: Path) -> None:
+    """Refuse films and documents by their first bytes, before gigabytes are read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise ImageError(f"{path.name} cannot be read: {error.strerror or error}", "unreadable") from error
+    check_signature(head)
+
+
+def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) -> Photo:
+    if examined is None or examined.exif is None:
+        source = examined or file
+        return Photo(
+            name=file.name,
+            path=file.path,
+            sha256=examined.sha256 if examined else "",
+            status="skipped",
+            reason_code=source.reason_code,
+            reason=source.reason,
+        )
+    exif = examined.exif
+    return Photo(
+        name=file.name,
+        path=file.path,
+        sha256=examined.sha256,
+        width=exif.width,
+        height=exif.height,
+        orientation=exif.orientation,
+        make=exif.make,
+        model=exif.model,
+        camera_key=exif.camera_key,
+        focal_px=exif.focal_px,
+        capture_time=exif.capture_time,
+        gps=prior_from_exif(exif),
+        altitude_reference=exif.altitude_reference,
+        relative_altitude_m=exif.relative_altitude_m,
+        owner=exif.artist or options.owner,
+        licence=exif.copyright or options.licence,
+        warnings=exif.warnings,
+    )
+
+
+def _mark_exact(photos: list[Photo]) -> list[Photo]:
+    copies = exact_duplicates(photos)
+    return [
+        _skipped(photo, "duplicate", f"the same bytes as {copies[photo.name]}", copies[photo.name])
+        if photo.name in copies
+        else photo
+        for photo in photos
+    ]
+
+
+def _mark_near(photos: list[Photo], hashes: dict[str, str], options: DuplicateOptions) -> list[Photo]:
+    usable = [photo for photo in photos if photo.status == "ok"]
+    copies = near_duplicates(usable, [hashes[photo.name] for photo in usable], options)
+    marked = []
+    for photo in photos:
+        if photo.name in copies:
+            kept, bits = copies[photo.name]
+            reason = (
+                f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {options.max_bits})"
+            )
+            photo = _skipped(photo, "near_duplicate", reason, kept)
+        marked.append(photo)
+    return marked
+
+
+def _skipped(photo: Photo, code: str, reason: str, duplicate_of: str) -> Photo:
+    return replace(photo, status="skipped", reason_code=code, reason=reason, duplicate_of=duplicate_of)
+
+
+def require_usable(result: ScanResult, folder: Path, least: int = 1) -> tuple[Photo, ...]:
+    """The usable photos.
+
+    Raises:
+        IngestError: fewer than `least`; the message counts the reasons.
+    """
+    usable = result.usable
+    if len(usable) < least:
+        reasons = ", ".join(f"{count} {code}" for code, count in sorted(result.skipped.items())) or "no files"
+        raise IngestError(
+            f"{folder}: expected at least {least} usable photos, found {len(usable)} of "
+            f"{len(result.photos)} files (skipped: {reasons})"
+        )
+    return usable

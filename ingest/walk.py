@@ -1,0 +1,99 @@
+"""The files of a folder, in an order that depends on their names only."""
+
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from featuredb.errors import IngestError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoundFile:
+    """One entry of the folder.
+
+    Attributes:
+        name: path within the folder, with forward slashes.
+        path: where it lies.
+        size, mtime_ns: of a regular file.
+        reason_code, reason: why it is not looked into; "" for a regular file.
+    """
+
+    name: str
+    path: Path
+    size: int = 0
+    mtime_ns: int = 0
+    reason_code: str = ""
+    reason: str = ""
+
+
+def walk(folder: Path, recursive: bool = True) -> tuple[FoundFile, ...]:
+    """All entries of the folder and of the folders in it, sorted by name; nothing is opened.
+
+    Links are followed, each folder is entered once. Hidden entries, special files, unreadable folders and
+    names that are not text come with a reason.
+
+    Raises:
+        IngestError: `folder` is not a folder that can be listed.
+    """
+    try:
+        info = folder.stat()
+        names = os.listdir(folder)  # noqa: PTH208 (raises here, before anything is done)
+    except OSError as error:
+        raise IngestError(
+            f"{folder}: expected a folder of photos that can be listed, found: {error.strerror or error}"
+        ) from error
+    seen = {(info.st_dev, info.st_ino)}
+    found = list(_entries(folder, sorted(names), "", recursive, seen))
+    return tuple(sorted(found, key=lambda file: file.name))
+
+
+def _entries(
+    folder: Path, names: list[str], prefix: str, recursive: bool, seen: set[tuple[int, int]]
+) -> Iterator[FoundFile]:
+    for raw in names:
+        path = folder / raw
+        text = os.fsencode(raw).decode("utf-8", "backslashreplace")
+        name = prefix + text
+        if text != raw:
+            yield _refused(name, path, "bad_name", "the name is not valid UTF-8; rename the file")
+            continue
+        if raw.startswith("."):
+            yield _refused(name, path, "hidden", "hidden: the name begins with a dot")
+            continue
+        try:
+            info = path.stat()
+        except OSError as error:
+            yield _refused(name, path, "unreadable", f"cannot be read: {error.strerror or error}")
+            continue
+        if stat.S_ISDIR(info.st_mode):
+            if recursive:
+                yield from _subfolder(path, name, (info.st_dev, info.st_ino), seen)
+            else:
+                yield _refused(
+                    name, path, "folder", "a folder, and folders are not entered (recursive is off)"
+                )
+        elif stat.S_ISREG(info.st_mode):
+            yield FoundFile(name=name, path=path, size=info.st_size, mtime_ns=info.st_mtime_ns)
+        else:
+            yield _refused(name, path, "unreadable", "not a regular file (a pipe, socket or device)")
+
+
+def _subfolder(
+    path: Path, name: str, identity: tuple[int, int], seen: set[tuple[int, int]]
+) -> Iterator[FoundFile]:
+    if identity in seen:
+        yield _refused(name, path, "folder_again", "a link to a folder that was entered already")
+        return
+    seen.add(identity)
+    try:
+        names = sorted(os.listdir(path))  # noqa: PTH208
+    except OSError as error:
+        yield _refused(name, path, "unreadable", f"the folder cannot be listed: {error.strerror or error}")
+        return
+    yield from _entries(path, names, name + "/", True, seen)
+
+
+def _refused(name: str, path: Path, code: str, reason: str) -> FoundFile:
+    return FoundFile(name=name, path=path, reason_code=code, reason=reason)
