@@ -1,0 +1,292 @@
+"""Ask a relocalisation server over Zenoh. Needs nothing but eclipse-zenoh and the image's bytes."""
+
+import json
+import queue
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
+
+import zenoh
+from pydantic import BaseModel, ValidationError
+
+from featuredb.errors import InvalidValueError, ServiceError
+from reloc.wire import (
+    CameraRequest,
+    ErrorReply,
+    Event,
+    LocaliseReply,
+    LocaliseWireRequest,
+    MapsReply,
+    PriorRequest,
+    RequestOptions,
+    StatusReply,
+    encode,
+)
+
+_Message = TypeVar("_Message", bound=BaseModel)
+
+DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
+# Codes that no server sends; the client raises them itself.
+NO_SERVER = "NO_SERVER"
+TIMEOUT = "TIMEOUT"
+BAD_REPLY = "BAD_REPLY"
+
+_TIMEOUT_S = 10.0  # Zenoh's own default
+# The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
+_DEADLINE_MARGIN_S = 0.2
+
+
+class Client:
+    """Connection to a relocalisation server; a context manager.
+
+    `database=None` takes the only database that is served at the endpoint.
+
+        with Client("tcp/127.0.0.1:7447") as client:
+            reply = client.localise("photo.jpg")
+            if reply.utm is not None:
+                print(reply.utm.easting, reply.utm.northing, reply.accuracy)
+            else:
+                print(reply.reason, reply.detail)
+
+    Methods raise ServiceError; its `code` is one of reloc.wire.ErrorCode, or NO_SERVER (nobody answers),
+    TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
+    """
+
+    def __init__(
+        self,
+        connect: str = DEFAULT_CONNECT,
+        database: str | None = None,
+        *,
+        config_path: Path | None = None,
+        connect_timeout_s: float = 5.0,
+    ) -> None:
+        self._connect = connect
+        self._database = database
+        self._config_path = config_path
+        self._connect_timeout_s = connect_timeout_s
+        self._open_session: zenoh.Session | None = None
+
+    def __enter__(self) -> Self:
+        self.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def open(self) -> None:
+        """Connect and wait until a server of the database is there.
+
+        Raises:
+            ServiceError: NO_SERVER, nobody at the endpoint, or no (or not exactly one) database.
+        """
+        session = self._connected_session()
+        try:
+            self._database = _wait_for_database(
+                session, self._database, self._connect, self._connect_timeout_s
+            )
+        except ServiceError:
+            session.close()  # type: ignore[no-untyped-call]
+            raise
+        self._open_session = session
+
+    def close(self) -> None:
+        """Disconnect; the second call does nothing."""
+        if self._open_session is not None:
+            self._open_session.close()  # type: ignore[no-untyped-call]
+            self._open_session = None
+
+    @property
+    def database(self) -> str:
+        """Name of the database on the wire."""
+        self._session()
+        return str(self._database)
+
+    def localise(
+        self,
+        image: bytes | str | Path,
+        prior: PriorRequest | None = None,
+        camera: CameraRequest | None = None,
+        *,
+        timeout_s: float = _TIMEOUT_S,
+        request_id: str | None = None,
+        inliers: bool = False,
+        exif_prior: bool = False,
+        maps: tuple[str, ...] | None = None,
+    ) -> LocaliseReply:
+        """Where was this photo taken?
+
+        Args:
+            image: the image file's bytes, or its path.
+            prior: where it may have been taken (degrees, metres).
+            camera: intrinsics; without them EXIF, the maps' cameras or an estimate serve.
+            timeout_s: the longest wait; the server is told, and gives up in time.
+            request_id: appears in the reply and in the server's log.
+            inliers: the reply carries pixels and UTM points of the matches that agree.
+            exif_prior: the photo's own GPS serves as prior where `prior` is None.
+            maps: ask only these maps.
+
+        Raises:
+            ServiceError: see the class.
+        """
+        data = image if isinstance(image, bytes) else Path(image).read_bytes()
+        deadline_s = max(timeout_s - _DEADLINE_MARGIN_S, 0.5 * timeout_s)
+        try:
+            request = LocaliseWireRequest(
+                request_id=request_id,
+                prior=prior,
+                camera=camera,
+                options=RequestOptions(
+                    inliers=inliers, exif_prior=exif_prior, maps=maps, deadline_ms=deadline_s * 1e3
+                ),
+            )
+        except ValidationError as error:
+            raise InvalidValueError(f"localise: {error}") from error
+        return self._ask("localise", LocaliseReply, timeout_s, payload=data, attachment=encode(request))
+
+    def status(self, timeout_s: float = _TIMEOUT_S) -> StatusReply:
+        """Counts, latencies, snapshot and limits of the server."""
+        return self._ask("status", StatusReply, timeout_s)
+
+    def maps(self, timeout_s: float = _TIMEOUT_S) -> MapsReply:
+        """The maps that the server answers from."""
+        return self._ask("maps", MapsReply, timeout_s)
+
+    @contextmanager
+    def watch_events(self) -> Iterator["EventStream"]:
+        """Within the block, what the server publishes: maps that come and go, reloads, its end."""
+        stream = EventStream()
+        with self._session().declare_subscriber(self._key("events"), stream.receive):
+            yield stream
+
+    def _session(self) -> zenoh.Session:
+        if self._open_session is None:
+            raise ServiceError(
+                NO_SERVER, "the client is not connected; use it in a `with` block or call open()"
+            )
+        return self._open_session
+
+    def _key(self, leaf: str) -> str:
+        return f"featuredb/{self._database}/{leaf}"
+
+    def _connected_session(self) -> zenoh.Session:
+        try:
+            if self._config_path is not None:
+                config = zenoh.Config.from_file(str(self._config_path))
+            else:
+                config = zenoh.Config()
+                config.insert_json5("mode", '"client"')
+                config.insert_json5("connect/endpoints", json.dumps([self._connect]))
+                config.insert_json5("connect/timeout_ms", json.dumps(int(self._connect_timeout_s * 1e3)))
+                config.insert_json5("scouting/multicast/enabled", "false")
+                config.insert_json5("transport/shared_memory/enabled", "false")
+            return zenoh.open(config)
+        except zenoh.ZError as error:
+            where = self._config_path or self._connect
+            raise ServiceError(
+                NO_SERVER,
+                f"nobody answers at {where} ({str(error).split(' at /')[0]}); is `featuredb serve` running, "
+                "and is this its --listen endpoint?",
+            ) from error
+
+    def _ask(
+        self,
+        leaf: str,
+        model: type[_Message],
+        timeout_s: float,
+        payload: bytes | None = None,
+        attachment: bytes | None = None,
+    ) -> _Message:
+        replies = self._session().get(
+            self._key(leaf),
+            payload=payload,
+            attachment=attachment,
+            timeout=timeout_s,
+            # A photo is many fragments; dropping one of them under load would lose the query silently.
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+        )
+        start = time.perf_counter()
+        for reply in replies:
+            if reply.ok is not None:
+                return _parse(reply.ok.payload.to_bytes(), model)
+            if reply.err is not None:
+                raise _service_error(reply.err.payload.to_bytes(), timeout_s)
+        waited_s = time.perf_counter() - start
+        if waited_s >= 0.9 * timeout_s:
+            raise ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s from {self._key(leaf)}")
+        raise ServiceError(
+            NO_SERVER, f"no server of database {self._database!r} answers any more at {self._connect}"
+        )
+
+
+class EventStream:
+    """Events in the order in which they arrived."""
+
+    def __init__(self) -> None:
+        self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
+
+    def receive(self, sample: zenoh.Sample) -> None:
+        """Take one publication; what is no event is left out."""
+        try:
+            self._events.put(Event.model_validate_json(sample.payload.to_bytes()))
+        except ValidationError:
+            return
+
+    def next(self, timeout_s: float | None = None) -> Event | None:
+        """The next event; None when none came within the time."""
+        try:
+            return self._events.get(timeout=timeout_s)
+        except queue.Empty:
+            return None
+
+
+def _wait_for_database(session: zenoh.Session, database: str | None, where: str, timeout_s: float) -> str:
+    """The database's name, once the liveliness token of one of its servers is there."""
+    tokens: queue.SimpleQueue[str] = queue.SimpleQueue()
+    pattern = f"featuredb/{database or '*'}/servers/*"
+    with session.liveliness().declare_subscriber(
+        pattern, lambda sample: tokens.put(str(sample.key_expr)), history=True
+    ):
+        try:
+            found = {tokens.get(timeout=timeout_s).split("/")[1]}
+        except queue.Empty:
+            named = "" if database is None else f" of database {database!r}"
+            raise ServiceError(
+                NO_SERVER, f"no server{named} answers at {where} within {timeout_s:g} s"
+            ) from None
+    if database is not None:
+        return database
+    # One is there; those that are there too answer at once.
+    for reply in session.liveliness().get(pattern, timeout=timeout_s):
+        if reply.ok is not None:
+            found.add(str(reply.ok.key_expr).split("/")[1])
+    if len(found) > 1:
+        raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
+    return found.pop()
+
+
+def _parse(payload: bytes, model: type[_Message]) -> _Message:
+    try:
+        return model.model_validate_json(payload)
+    except ValidationError as error:
+        raise ServiceError(
+            BAD_REPLY, f"expected a {model.__name__}, found {payload[:200]!r}: {error}"
+        ) from error
+
+
+def _service_error(payload: bytes, timeout_s: float) -> ServiceError:
+    try:
+        error = ErrorReply.model_validate_json(payload)
+    except ValidationError:  # not of the server: Zenoh itself gave up
+        if payload == b"Timeout":
+            return ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s")
+        return ServiceError(BAD_REPLY, f"expected an error as JSON, found {payload[:200]!r}")
+    return ServiceError(error.code, error.message, error.request_id)

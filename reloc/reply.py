@@ -1,0 +1,117 @@
+"""The wire's reply out of a localisation result."""
+
+from typing import Any
+
+import numpy as np
+
+from featuredb.geo.geopose import BODY_AXES
+from reloc.result import Inliers, LocalisedPose, LocaliseResult
+from reloc.wire import (
+    Accuracy,
+    CameraUsed,
+    InlierPoints,
+    Lineage,
+    LocaliseReply,
+    Position,
+    Quaternion,
+    RunnerUpPose,
+    UtmPose,
+)
+
+
+def reply_from_result(
+    result: LocaliseResult, *, request_id: str, timings_ms: dict[str, float]
+) -> LocaliseReply:
+    """Word a result as the wire does; `timings_ms` replaces the result's own."""
+    runner_up = result.runner_up
+    fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
+    return LocaliseReply(
+        status=result.status,
+        reason=result.reason,
+        detail=result.detail,
+        confidence=result.confidence,
+        features=result.features,
+        matches=result.matches,
+        inliers=result.inliers,
+        runner_up=None
+        if runner_up is None
+        else RunnerUpPose(
+            inliers=runner_up.inliers,
+            distance_m=runner_up.distance_m,
+            angle_deg=runner_up.angle_deg,
+            lat=runner_up.latitude_deg,
+            lon=runner_up.longitude_deg,
+        ),
+        snapshot=result.snapshot,
+        timings_ms=timings_ms,
+        request_id=request_id,
+        body_axes=BODY_AXES,
+        **fields,
+    )
+
+
+_NO_POSE: dict[str, Any] = {
+    "position": None,
+    "quaternion": None,
+    "height_datum": None,
+    "utm": None,
+    "covariance": None,
+    "accuracy": None,
+    "camera": None,
+    "residual_rms_px": None,
+    "maps": (),
+    "lineage": (),
+    "inlier_points": None,
+}
+
+
+def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
+    x, y, z, w = (float(q) for q in pose.geopose.quaternion_xyzw)
+    easting, northing, height = (float(v) for v in pose.utm)
+    return {
+        "position": Position(
+            lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
+        ),
+        "quaternion": Quaternion(x=x, y=y, z=z, w=w),
+        "height_datum": pose.height_datum,
+        "utm": UtmPose(
+            epsg=pose.epsg,
+            easting=easting,
+            northing=northing,
+            height=height,
+            cam_from_utm_xyzw=tuple(float(q) for q in pose.cam_from_utm_xyzw),
+        ),
+        "covariance": tuple(tuple(float(v) for v in row) for row in pose.covariance),
+        "accuracy": Accuracy(
+            horizontal_68_m=pose.horizontal_68_m,
+            vertical_68_m=pose.vertical_68_m,
+            orientation_68_deg=pose.orientation_68_deg,
+        ),
+        "camera": CameraUsed(
+            model=pose.camera.model,
+            width=pose.camera.width,
+            height=pose.camera.height,
+            params=pose.camera.params,
+            source=pose.camera_source,
+        ),
+        "residual_rms_px": pose.residual_rms_px,
+        "maps": pose.map_ids,
+        "lineage": tuple(
+            Lineage(
+                map_id=map_id,
+                method=str(entry["method"]),
+                generation=int(entry["generation"]),
+                parents=tuple(entry["parents"]),
+            )
+            for map_id, entry in zip(pose.map_ids, pose.lineage, strict=True)
+        ),
+        "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
+    }
+
+
+def _inlier_points(inliers: Inliers) -> InlierPoints:
+    return InlierPoints(
+        pixels=tuple((float(x), float(y)) for x, y in np.round(inliers.pixels, 2)),
+        utm=tuple((float(e), float(n), float(h)) for e, n, h in np.round(inliers.points_utm, 4)),
+        map_rows=tuple(int(row) for row in inliers.map_rows),
+    )

@@ -1,0 +1,1 @@
+"""Zenoh server: queries in, poses out."""

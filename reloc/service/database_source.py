@@ -1,0 +1,66 @@
+"""Areas of a database: the maps of its newest snapshot and a localiser over them."""
+
+import numpy as np
+
+from featuredb.geo.utm import geodetic_from_utm
+from featuredb.store import Database, MapSummary
+from reloc.localiser import Localiser
+from reloc.options import LocaliseOptions
+from reloc.service.source import ServedArea
+from reloc.wire import BoundingBox, MapInfo
+
+
+class DatabaseSource:
+    """Loads what a database offers now; see `reloc.service.source.AreaSource`."""
+
+    def __init__(self, database: Database, options: LocaliseOptions | None = None) -> None:
+        self._database = database
+        self._options = options or LocaliseOptions()
+
+    def version(self) -> int:
+        """Number of the newest snapshot: one look at the table's log."""
+        return self._database.poll_version()
+
+    def load(self) -> ServedArea:
+        """Localiser and maps of one and the same snapshot.
+
+        Raises:
+            FeatureDbError: the store cannot be read, or maps do not fit together.
+        """
+        localiser = Localiser.open(self._database, self._options)
+        snapshot = self._database.snapshot(localiser.snapshot)
+        active = [summary for summary in snapshot.maps() if summary.status == "active"]
+        return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))
+
+
+def map_info(summary: MapSummary) -> MapInfo:
+    """A map's summary as the wire says it."""
+    return MapInfo(
+        map_id=summary.map_id,
+        content_digest=summary.content_digest,
+        name=summary.name,
+        epsg=summary.epsg,
+        height_datum=summary.height_datum,
+        method=summary.method,
+        generation=summary.generation,
+        images=summary.images,
+        points=summary.points,
+        bounds=_bounds(summary),
+        tiles=tuple(f"{summary.epsg}-{tile}" for tile in summary.tiles),
+    )
+
+
+def _bounds(summary: MapSummary) -> BoundingBox | None:
+    """Degrees around the map's box: those of its corners, which grid lines curve off by centimetres."""
+    box = summary.box
+    if box is None:
+        return None
+    corners = [
+        (easting, northing, 0.0)
+        for easting in (box.min_easting, box.max_easting)
+        for northing in (box.min_northing, box.max_northing)
+    ]
+    lat_lon_h = geodetic_from_utm(np.array(corners), summary.epsg)
+    south, west = (float(v) for v in lat_lon_h[:, :2].min(axis=0))
+    north, east = (float(v) for v in lat_lon_h[:, :2].max(axis=0))
+    return BoundingBox(west=west, south=south, east=east, north=north)

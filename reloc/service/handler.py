@@ -1,0 +1,178 @@
+"""One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import (
+    FeatureDbError,
+    ImageError,
+    IncompatibleExtractorError,
+    InvalidValueError,
+)
+from featuredb.features.decode import DecodeLimits, decode_gray
+from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.geometry.camera import Camera
+from featuredb.maps.exif_prior import prior_from_exif
+from featuredb.maps.feature_map import GeoPrior
+from reloc.reply import reply_from_result
+from reloc.result import LocaliseRequest
+from reloc.service.source import LocaliserLike
+from reloc.wire import (
+    CameraRequest,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    PriorRequest,
+    RequestError,
+)
+
+
+@dataclass(slots=True)
+class StageClock:
+    """Milliseconds of consecutive stages.
+
+    Attributes:
+        last: `time.perf_counter` at the end of the latest stage.
+        timings_ms: stage name -> milliseconds.
+    """
+
+    last: float
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+    def end(self, stage: str) -> None:
+        """The stage that began at the end of the one before ends now."""
+        now = time.perf_counter()
+        self.timings_ms[stage] = (now - self.last) * 1e3
+        self.last = now
+
+    def split(self, stages: dict[str, float], rest: str) -> None:
+        """The time since the latest stage consists of these, and of what they do not account for."""
+        parts = {name: ms for name, ms in stages.items() if name != "total"}
+        now = time.perf_counter()
+        self.timings_ms.update(parts)
+        self.timings_ms[rest] = max(0.0, (now - self.last) * 1e3 - math.fsum(parts.values()))
+        self.last = now
+
+    def finished(self) -> dict[str, float]:
+        """All stages and their sum as `total`, rounded to microseconds."""
+        rounded = {name: round(ms, 3) for name, ms in self.timings_ms.items()}
+        return {**rounded, "total": round(math.fsum(rounded.values()), 3)}
+
+
+def answer_query(
+    data: bytes,
+    wire_request: LocaliseWireRequest,
+    localiser: LocaliserLike,
+    *,
+    limits: DecodeLimits,
+    request_id: str,
+    clock: StageClock,
+    before_localising: Callable[[], None] = lambda: None,
+) -> LocaliseReply:
+    """Localise the image file in `data`.
+
+    Args:
+        data: bytes of the image file.
+        wire_request: what the client says about it.
+        localiser: answers from one snapshot.
+        limits: bytes and pixels allowed.
+        request_id: goes into the reply.
+        clock: its stages so far (queue, request) become part of the reply's timings.
+        before_localising: called after decoding; raises RequestError to stop (deadline).
+
+    Raises:
+        RequestError: bad image, bad request, too large, or maps of another extractor.
+    """
+    if wire_request.contribute:
+        raise RequestError(
+            ErrorCode.UNSUPPORTED,
+            "contribute: this server takes no contributions; send false or leave it out",
+        )
+    gray = _decode(data, limits)
+    clock.end("decode")
+    request = localise_request(wire_request, data, gray)
+    clock.end("exif")
+    before_localising()
+    try:
+        result = localiser.localise(gray, request)
+    except IncompatibleExtractorError as error:
+        raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
+    clock.split(result.timings_ms, "localise_rest")
+    reply = reply_from_result(result, request_id=request_id, timings_ms={})
+    clock.end("reply")
+    return reply.model_copy(update={"timings_ms": clock.finished()})
+
+
+def localise_request(
+    wire_request: LocaliseWireRequest, data: bytes, gray: NDArray[np.uint8]
+) -> LocaliseRequest:
+    """What the localiser needs to know, from the request and the file's EXIF.
+
+    Raises:
+        RequestError: BAD_REQUEST, the camera is none, or does not fit the image.
+    """
+    height, width = gray.shape
+    exif = read_exif(data)
+    prior = None if wire_request.prior is None else _prior(wire_request.prior)
+    if prior is None and wire_request.options.exif_prior:
+        prior = prior_from_exif(exif)
+    return LocaliseRequest(
+        camera=None if wire_request.camera is None else _camera(wire_request.camera, width, height),
+        camera_key=exif.camera_key or None,
+        exif_focal_px=exif.focal_px,
+        prior=prior,
+        map_ids=wire_request.options.maps,
+        want_inliers=wire_request.options.inliers,
+    )
+
+
+def _decode(data: bytes, limits: DecodeLimits) -> NDArray[np.uint8]:
+    if not data:
+        raise RequestError(ErrorCode.BAD_IMAGE, "payload: expected the bytes of an image file, found none")
+    try:
+        return decode_gray(data, limits)
+    except ImageError as error:
+        code = ErrorCode.TOO_LARGE if error.code == "too_large" else ErrorCode.BAD_IMAGE
+        raise RequestError(code, f"image: {error}") from error
+
+
+def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
+    try:
+        return Camera(
+            model=camera.model, width=camera.width, height=camera.height, params=camera.params
+        ).scaled_to(width, height)
+    except InvalidValueError as error:
+        raise RequestError(
+            ErrorCode.BAD_REQUEST, f"camera: {error} (the image has {width}x{height})"
+        ) from error
+
+
+def _prior_from_exif(exif: ExifInfo) -> GeoPrior | None:
+    """The photo's own position; without its height, whose datum photos do not say reliably."""
+    if exif.latitude_deg is None or exif.longitude_deg is None:
+        return None
+    return GeoPrior(
+        latitude_deg=exif.latitude_deg,
+        longitude_deg=exif.longitude_deg,
+        height_m=None,
+        sigma_horizontal_m=exif.sigma_horizontal_m,
+        sigma_vertical_m=exif.sigma_vertical_m,
+    )
+
+
+def _prior(prior: PriorRequest) -> GeoPrior:
+    try:
+        return GeoPrior(
+            latitude_deg=prior.lat,
+            longitude_deg=prior.lon,
+            height_m=prior.h,
+            sigma_horizontal_m=prior.sigma_m,
+            sigma_vertical_m=prior.sigma_vertical_m,
+        )
+    except FeatureDbError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"prior: {error}") from error

@@ -1,0 +1,82 @@
+"""What a server may be told."""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from featuredb.errors import InvalidValueError
+from featuredb.features.decode import DecodeLimits
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServeOptions:
+    """Options of one server.
+
+    Attributes:
+        listen: Zenoh endpoints to listen on; port 0 takes a free one. Empty where `config_path` says it.
+        config_path: a Zenoh configuration (JSON5); `listen` is added to it.
+        name: the database's name on the wire; "" takes the name of the database's folder.
+        workers: queries localised at a time; two fill the reference machine's two cores.
+        threads_per_worker: of OpenCV and BLAS within one query; more than one only pays when there are
+            more cores than workers.
+        max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
+            waiting ones are answered within 4 s, half of the deadline.
+        max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
+        deadline_s: from receipt to answer; under Zenoh's default query timeout of 10 s, so that the
+            client hears of it.
+        poll_interval_s: how often the store is asked for a newer version; also the delay of a hot reload.
+        shutdown_grace_s: how long queries in hand may take when the server stops.
+        limits: bytes and pixels of a query image.
+    """
+
+    listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    config_path: Path | None = None
+    name: str = ""
+    workers: int = 2
+    threads_per_worker: int = 1
+    max_queue: int = 32
+    max_queued_bytes: int = 512 * 2**20
+    deadline_s: float = 8.0
+    poll_interval_s: float = 1.0
+    shutdown_grace_s: float = 10.0
+    limits: DecodeLimits = field(default_factory=DecodeLimits)
+
+    def __post_init__(self) -> None:
+        for name, value in (
+            ("workers", self.workers),
+            ("threads_per_worker", self.threads_per_worker),
+            ("max_queue", self.max_queue),
+            ("max_queued_bytes", self.max_queued_bytes),
+            ("deadline_s", self.deadline_s),
+            ("poll_interval_s", self.poll_interval_s),
+        ):
+            if not value > 0:
+                raise InvalidValueError(f"ServeOptions.{name}: expected > 0, found {value}")
+        if not self.listen and self.config_path is None:
+            raise InvalidValueError("ServeOptions: expected endpoints to listen on, or a Zenoh configuration")
+        if self.name:
+            check_wire_name(self.name)
+
+
+def check_wire_name(name: str) -> str:
+    """`name`, if it can be one chunk of a Zenoh key.
+
+    Raises:
+        InvalidValueError: it cannot.
+    """
+    if not _NAME.fullmatch(name):
+        raise InvalidValueError(
+            "database name on the wire: expected 1..64 letters, digits, '_', '.', '-', beginning with a "
+            f"letter or digit, found {name!r}; choose one with --name"
+        )
+    return name
+
+
+def wire_name_of(database_url: str) -> str:
+    """A name for the wire out of the last part of the database's path or URL."""
+    last = re.split(r"[/\\]", database_url.rstrip("/\\"))[-1]
+    cleaned = re.sub(r"[^A-Za-z0-9_.-]+", "-", last).strip("-._")[:64]
+    return check_wire_name(cleaned or "default")

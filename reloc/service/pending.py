@@ -1,0 +1,135 @@
+"""One query in hand: answered exactly once, whoever comes first, and then dropped."""
+
+import logging
+import threading
+import time
+import uuid
+
+import zenoh
+
+from featuredb.errors import FeatureDbError
+from reloc.service.metrics import Metrics
+from reloc.wire import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
+
+logger = logging.getLogger(__name__)
+
+
+class PendingQuery:
+    """A `zenoh.Query` between receipt and answer.
+
+    A worker, the deadline watch and the shutdown may all want to answer; the first one does. Answering
+    drops the Zenoh query, without which the client would wait for its timeout.
+    """
+
+    __slots__ = (
+        "_answered",
+        "_key",
+        "_lock",
+        "_metrics",
+        "_query",
+        "deadline",
+        "received",
+        "request_id",
+        "size",
+    )
+
+    def __init__(self, query: zenoh.Query, key: str, deadline_s: float, metrics: Metrics) -> None:
+        self._query = query
+        self._key = key
+        self._metrics = metrics
+        self._lock = threading.Lock()
+        self._answered = False
+        self.received = time.perf_counter()
+        self.deadline = self.received + deadline_s
+        self.request_id = uuid.uuid4().hex
+        self.size = 0 if query.payload is None else len(query.payload)
+
+    @property
+    def answered(self) -> bool:
+        return self._answered
+
+    def attachment(self) -> bytes | None:
+        """The request's attachment; None where there is none or it was answered meanwhile."""
+        with self._lock:
+            if self._answered or self._query.attachment is None:
+                return None
+            return self._query.attachment.to_bytes()
+
+    def payload(self) -> bytes:
+        """The request's payload; empty where there is none or it was answered meanwhile."""
+        with self._lock:
+            if self._answered or self._query.payload is None:
+                return b""
+            return self._query.payload.to_bytes()
+
+    def answer(self, reply: LocaliseReply) -> bool:
+        """Send the reply; False if somebody was faster."""
+        payload = encode(reply)
+        with self._lock:
+            if self._answered:
+                return False
+            self._answered = True
+            latency_ms = (time.perf_counter() - self.received) * 1e3
+            self._metrics.answered(reply.reason, latency_ms)
+            self._send(payload, error=False)
+        logger.info(
+            "query answered",
+            extra={
+                "fields": {
+                    "event": "answered",
+                    "request_id": self.request_id,
+                    "status": reply.status,
+                    "reason": reply.reason,
+                    "inliers": reply.inliers,
+                    "snapshot": reply.snapshot,
+                    "bytes": self.size,
+                    "latency_ms": round(latency_ms, 3),
+                }
+            },
+        )
+        return True
+
+    def refuse(self, error: RequestError) -> bool:
+        """Send `reply_err`; False if somebody was faster."""
+        reply = ErrorReply(code=error.code, message=error.message, request_id=self.request_id)
+        payload = encode(reply)
+        with self._lock:
+            if self._answered:
+                return False
+            self._answered = True
+            self._metrics.failed(error.code)
+            self._send(payload, error=True)
+        level = logging.ERROR if error.code == ErrorCode.INTERNAL else logging.INFO
+        logger.log(
+            level,
+            "query refused",
+            extra={
+                "fields": {
+                    "event": "refused",
+                    "request_id": self.request_id,
+                    "code": error.code,
+                    "message": error.message,
+                    "bytes": self.size,
+                }
+            },
+        )
+        return True
+
+    def _send(self, payload: bytes, *, error: bool) -> None:
+        try:
+            with self._query as query:
+                if error:
+                    query.reply_err(payload, encoding=zenoh.Encoding.APPLICATION_JSON)
+                else:
+                    query.reply(self._key, payload, encoding=zenoh.Encoding.APPLICATION_JSON, express=True)
+        except zenoh.ZError:  # the client went away, or asked with a selector that takes no such key
+            logger.warning(
+                "reply could not be sent",
+                exc_info=True,
+                extra={"fields": {"event": "reply_failed", "request_id": self.request_id}},
+            )
+
+
+def as_request_error(error: FeatureDbError, code: ErrorCode) -> RequestError:
+    """The error as it goes over the wire."""
+    return RequestError(code, str(error))

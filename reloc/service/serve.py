@@ -1,0 +1,53 @@
+"""Serve one database until told to stop."""
+
+import signal
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
+from featuredb.store import Database
+from reloc.options import LocaliseOptions
+from reloc.service.database_source import DatabaseSource
+from reloc.service.options import ServeOptions, wire_name_of
+from reloc.service.server import Server
+
+
+def start_server(
+    database_url: str, options: ServeOptions | None = None, localise_options: LocaliseOptions | None = None
+) -> Server:
+    """Open the database, load its maps and listen; the server runs until `close`.
+
+    Raises:
+        DatabaseNotFoundError: there is no database at the URL.
+        ServiceStartError: cannot listen (port taken, bad endpoint, bad configuration).
+        FeatureDbError: the maps cannot be loaded.
+    """
+    options = options or ServeOptions()
+    database = Database.open(database_url)
+    name = options.name or wire_name_of(database_url)
+    return Server.start(DatabaseSource(database, localise_options), replace(options, name=name), name)
+
+
+def serve(
+    database_url: str,
+    options: ServeOptions | None = None,
+    localise_options: LocaliseOptions | None = None,
+    *,
+    on_ready: Callable[[Server], None] = lambda server: None,
+) -> None:
+    """Serve until SIGINT or SIGTERM; queries in hand are answered first. Call from the main thread.
+
+    Raises:
+        As `start_server`.
+    """
+    stop = threading.Event()
+    before = {
+        number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        with start_server(database_url, options, localise_options) as server:
+            on_ready(server)
+            stop.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,284 @@
+"""The relocalisation server: Zenoh in front, workers behind, the store watched."""
+
+import logging
+import threading
+import time
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from featuredb.errors import FeatureDbError
+from reloc.service.metrics import Metrics
+from reloc.service.options import ServeOptions
+from reloc.service.pending import PendingQuery
+from reloc.service.queueing import DeadlineWatch, QueryQueue
+from reloc.service.session import Keys, bind_free_port, open_server_session
+from reloc.service.source import AreaSource, ServedArea
+from reloc.service.watcher import AreaWatcher
+from reloc.service.worker import WorkerPool
+from reloc.wire import (
+    WIRE_VERSION,
+    ErrorCode,
+    Event,
+    EventType,
+    Limits,
+    MapsReply,
+    QueueStatus,
+    ReloadStatus,
+    RequestError,
+    StatusReply,
+    encode,
+)
+
+logger = logging.getLogger(__name__)
+
+_JSON = zenoh.Encoding.APPLICATION_JSON
+# A message larger than this is not even gathered by Zenoh; up to it the client hears TOO_LARGE.
+_MESSAGE_HEADROOM = 4
+
+
+class Server:
+    """A running server; `start` makes one, `close` (or leaving the `with` block) ends it.
+
+    Attributes:
+        database: name on the wire.
+        server_id: the Zenoh id of its session.
+        endpoints: where it listens; empty where only the configuration file knows.
+    """
+
+    def __init__(
+        self,
+        *,
+        source: AreaSource,
+        area: ServedArea,
+        served_version: int,
+        session: zenoh.Session,
+        endpoints: tuple[str, ...],
+        database: str,
+        options: ServeOptions,
+    ) -> None:
+        self.database = database
+        self.endpoints = endpoints
+        self.server_id = str(session.zid())
+        self._session = session
+        self._options = options
+        self._keys = Keys(database=database)
+        self._area = area
+        self._started = time.perf_counter()
+        self._metrics = Metrics()
+        self._reloads = 0
+        self._reload_error: str | None = None
+        self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
+        self._watch = DeadlineWatch()
+        self._workers = WorkerPool(self._queue, self._watch, lambda: self._area, options)
+        self._watcher = AreaWatcher(
+            source,
+            served_version=served_version,
+            poll_interval_s=options.poll_interval_s,
+            on_area=self._swap,
+            on_failure=self._reload_failed,
+        )
+        self._queryables: list[zenoh.Queryable[None]] = []
+        self._tokens: dict[str, zenoh.LivelinessToken] = {}
+        self._token_lock = threading.Lock()
+        self._closed = False
+
+    @classmethod
+    def start(cls, source: AreaSource, options: ServeOptions, database: str) -> Self:
+        """Load the area, then listen; when this returns, queries are answered.
+
+        Raises:
+            ServiceStartError: cannot listen.
+            FeatureDbError: the area cannot be loaded.
+        """
+        served_version = source.version()
+        area = source.load()
+        endpoints = tuple(bind_free_port(endpoint) for endpoint in options.listen)
+        session = open_server_session(
+            endpoints, options.config_path, _MESSAGE_HEADROOM * options.limits.max_bytes
+        )
+        server = cls(
+            source=source,
+            area=area,
+            served_version=served_version,
+            session=session,
+            endpoints=endpoints,
+            database=database,
+            options=options,
+        )
+        server._declare()
+        return server
+
+    def _declare(self) -> None:
+        self._watch.start()
+        self._workers.start()
+        # `complete`: of several servers of one database the nearest answers, not all of them.
+        for leaf, callback in (
+            ("localise", self._on_localise),
+            ("status", self._on_status),
+            ("maps", self._on_maps),
+        ):
+            self._queryables.append(
+                self._session.declare_queryable(self._keys.of(leaf), callback, complete=True)
+            )
+        self._advertise(self._area)  # after the queryables: who sees the token can ask at once
+        self._watcher.start()
+        self._log("serving", snapshot=self._area.snapshot, maps=len(self._area.maps), listen=self.endpoints)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Take no more queries, answer those in hand, say goodbye. The second call does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        self._publish("stopping", detail="the server is stopping")
+        with self._token_lock:
+            for token in self._tokens.values():
+                token.undeclare()
+            self._tokens.clear()
+        self._queue.close()
+        left = self._workers.join(self._options.shutdown_grace_s)
+        for item in (*self._queue.drain(), *left):
+            item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
+        for queryable in self._queryables:
+            queryable.undeclare()
+        self._watch.close()
+        self._watcher.close(timeout_s=self._options.shutdown_grace_s)
+        self._session.close()
+        self._log("stopped", queries=self._metrics.counts().model_dump())
+
+    def status(self) -> StatusReply:
+        """What `.../status` answers."""
+        options, area = self._options, self._area
+        return StatusReply(
+            database=self.database,
+            server_id=self.server_id,
+            version=_software_version(),
+            wire_version=WIRE_VERSION,
+            snapshot=area.snapshot,
+            maps=len(area.maps),
+            uptime_s=round(time.perf_counter() - self._started, 3),
+            queue=QueueStatus(
+                length=len(self._queue),
+                capacity=options.max_queue,
+                workers=options.workers,
+                busy=self._workers.busy,
+            ),
+            queries=self._metrics.counts(),
+            latency_ms=self._metrics.latency(),
+            reload=ReloadStatus(count=self._reloads, error=self._reload_error),
+            limits=Limits(
+                max_payload_bytes=options.limits.max_bytes,
+                max_pixels=options.limits.max_pixels,
+                deadline_s=options.deadline_s,
+            ),
+        )
+
+    # Zenoh calls these in threads of its own; they must return at once.
+
+    def _on_localise(self, query: zenoh.Query) -> None:
+        self._metrics.received()
+        item = PendingQuery(query, self._keys.of("localise"), self._options.deadline_s, self._metrics)
+        try:
+            if item.size > self._options.limits.max_bytes:
+                raise RequestError(
+                    ErrorCode.TOO_LARGE,
+                    f"payload: expected at most {self._options.limits.max_bytes} bytes, found {item.size}; "
+                    "send a smaller or more compressed picture",
+                )
+            self._queue.put(item)
+        except RequestError as error:
+            item.refuse(error)
+        else:
+            self._watch.add(item)
+
+    def _on_status(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(self._keys.of("status"), encode(self.status()), encoding=_JSON)
+
+    def _on_maps(self, query: zenoh.Query) -> None:
+        area = self._area
+        reply = MapsReply(database=self.database, snapshot=area.snapshot, maps=area.maps)
+        with query:
+            query.reply(self._keys.of("maps"), encode(reply), encoding=_JSON)
+
+    # The watcher calls these.
+
+    def _swap(self, area: ServedArea) -> None:
+        """Serve `area` from now on; queries in hand keep the old one until they are answered."""
+        old, self._area = self._area, area
+        self._reloads += 1
+        self._reload_error = None
+        self._log("reloaded", snapshot=area.snapshot, previous=old.snapshot, maps=len(area.maps))
+        self._advertise(area)
+        before, after = ({info.map_id: info for info in a.maps} for a in (old, area))
+        for map_id, info in after.items():
+            if map_id not in before or before[map_id].content_digest != info.content_digest:
+                self._publish("map_committed", map_id=map_id, detail=info.name)
+        for map_id in before.keys() - after.keys():
+            self._publish("map_retired", map_id=map_id, detail=before[map_id].name)
+        self._publish("reloaded", detail=f"from snapshot {old.snapshot}")
+
+    def _reload_failed(self, version: int, message: str) -> None:
+        self._reload_error = f"snapshot {version}: {message}"
+        self._publish("reload_failed", detail=self._reload_error)
+
+    def _advertise(self, area: ServedArea) -> None:
+        """Liveliness tokens of the server and of each tile it answers for."""
+        wanted = {self._keys.server_token(self.server_id)}
+        wanted |= {self._keys.tile_token(self.server_id, tile) for tile in area.tiles}
+        with self._token_lock:
+            if self._closed:
+                return
+            for key in wanted - self._tokens.keys():
+                self._tokens[key] = self._session.liveliness().declare_token(key)
+            for key in self._tokens.keys() - wanted:
+                self._tokens.pop(key).undeclare()
+
+    def _publish(self, kind: EventType, *, map_id: str | None = None, detail: str = "") -> None:
+        event = Event(
+            type=kind,
+            database=self.database,
+            server_id=self.server_id,
+            snapshot=self._area.snapshot,
+            map_id=map_id,
+            detail=detail,
+            time=datetime.now(UTC).isoformat(),
+        )
+        try:
+            self._session.put(
+                self._keys.of("events"),
+                encode(event),
+                encoding=_JSON,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+        except zenoh.ZError as error:
+            raise FeatureDbError(f"event {kind} could not be published: {error}") from error
+
+    def _log(self, event: str, **fields: object) -> None:
+        logger.info(
+            "%s %s",
+            self.database,
+            event,
+            extra={"fields": {"event": event, "database": self.database, **fields}},
+        )
+
+
+def _software_version() -> str:
+    try:
+        return version("featuredb")
+    except PackageNotFoundError:  # run from a source tree
+        return "0+source"

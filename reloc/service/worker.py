@@ -1,0 +1,114 @@
+"""The threads that answer queries."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from reloc.service.handler import StageClock, answer_query
+from reloc.service.options import ServeOptions
+from reloc.service.pending import PendingQuery
+from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.source import ServedArea
+from reloc.service.threads import capped_threads
+from reloc.wire import ErrorCode, RequestError, parse_request
+
+logger = logging.getLogger(__name__)
+
+
+class WorkerPool:
+    """Takes queries from the queue and answers each from the area in service at that moment."""
+
+    def __init__(
+        self,
+        queue: QueryQueue,
+        watch: DeadlineWatch,
+        area: Callable[[], ServedArea],
+        options: ServeOptions,
+    ) -> None:
+        self._queue = queue
+        self._watch = watch
+        self._area = area
+        self._options = options
+        self._busy: set[PendingQuery] = set()
+        self._lock = threading.Lock()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"localise-{i}", daemon=True)
+            for i in range(options.workers)
+        ]
+
+    @property
+    def busy(self) -> int:
+        return len(self._busy)
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def join(self, timeout_s: float) -> list[PendingQuery]:
+        """Wait for the workers to finish the closed queue; returns what they still have in hand."""
+        end = time.perf_counter() + timeout_s
+        for thread in self._threads:
+            thread.join(max(0.0, end - time.perf_counter()))
+        with self._lock:
+            return list(self._busy)
+
+    def _run(self) -> None:
+        with capped_threads(self._options.threads_per_worker):
+            while (item := self._queue.get()) is not None:
+                with self._lock:
+                    self._busy.add(item)
+                try:
+                    self._answer(item)
+                finally:
+                    with self._lock:
+                        self._busy.discard(item)
+
+    def _answer(self, item: PendingQuery) -> None:
+        try:
+            self._localise(item)
+        except RequestError as error:
+            item.request_id = error.request_id or item.request_id
+            item.refuse(error)
+        except Exception:
+            logger.exception(
+                "query failed", extra={"fields": {"event": "internal", "request_id": item.request_id}}
+            )
+            item.refuse(
+                RequestError(
+                    ErrorCode.INTERNAL,
+                    f"the server failed on this query; its log says why under request id {item.request_id}",
+                )
+            )
+
+    def _localise(self, item: PendingQuery) -> None:
+        clock = StageClock(last=item.received)
+        clock.end("queue")
+        request = parse_request(item.attachment())
+        item.request_id = request.request_id or item.request_id
+        if request.options.deadline_ms is not None:
+            wished = item.received + request.options.deadline_ms / 1e3
+            if wished < item.deadline:
+                item.deadline = wished
+                self._watch.add(item)
+        _check_deadline(item)
+        data = item.payload()
+        clock.end("request")
+        if item.answered:
+            return
+        reply = answer_query(
+            data,
+            request,
+            self._area().localiser,
+            limits=self._options.limits,
+            request_id=item.request_id,
+            clock=clock,
+            before_localising=lambda: _check_deadline(item),
+        )
+        _check_deadline(item)
+        item.answer(reply)
+
+
+def _check_deadline(item: PendingQuery) -> None:
+    if time.perf_counter() >= item.deadline:
+        raise deadline_error(item)

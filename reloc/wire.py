@@ -1,0 +1,385 @@
+"""The messages on the wire: request attachment, reply, error, status, maps and events.
+
+Models check untrusted text; `schemas/wire/*.json` says the same for other languages, and a test holds
+both together. A request refuses unknown fields, so that a misspelt option is not ignored silently. A
+reader of replies ignores fields that it does not know, so that a newer server can add some.
+"""
+
+import json
+from enum import StrEnum
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from featuredb.errors import ServiceError
+
+WIRE_VERSION = "1"
+MAX_ATTACHMENT_BYTES = 65_536  # a request needs a few hundred; more is a mistake or an attack
+_SHOWN_INPUT_CHARS = 80  # of a refused value, in the message that refuses it
+
+
+class ErrorCode(StrEnum):
+    """Why a query got `reply_err` instead of an answer."""
+
+    BAD_REQUEST = "BAD_REQUEST"  # the attachment is not a valid request
+    BAD_IMAGE = "BAD_IMAGE"  # the payload is not a readable image: unknown format, truncated, broken
+    TOO_LARGE = "TOO_LARGE"  # more bytes or pixels than the server takes
+    BUSY = "BUSY"  # the queue is full; try again later
+    DEADLINE = "DEADLINE"  # no answer within the deadline
+    INCOMPATIBLE_EXTRACTOR = "INCOMPATIBLE_EXTRACTOR"  # the maps were made with another feature extractor
+    UNSUPPORTED = "UNSUPPORTED"  # a valid wish that this server does not fulfil
+    SHUTTING_DOWN = "SHUTTING_DOWN"  # the server stops; ask another or later
+    INTERNAL = "INTERNAL"  # a defect of the server; its log has the request id
+
+
+class RequestError(ServiceError):
+    """A query cannot be answered; goes to the client as `reply_err`."""
+
+    def __init__(self, code: ErrorCode, message: str, request_id: str | None = None) -> None:
+        super().__init__(code.value, message, request_id)
+
+
+class _Request(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+class _Answer(BaseModel):
+    model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
+
+
+RequestId = Annotated[str, Field(pattern=r"^[A-Za-z0-9._:-]{1,128}$")]
+# Wide enough for any camera; a value outside is a unit mistake or nonsense.
+CameraParam = Annotated[float, Field(ge=-1e6, le=1e6)]
+Side = Annotated[int, Field(ge=1, le=65_535)]
+Quaternion4 = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
+Triple = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
+Pair = Annotated[tuple[float, ...], Field(min_length=2, max_length=2)]
+Row6 = Annotated[tuple[float, ...], Field(min_length=6, max_length=6)]
+Covariance6 = Annotated[tuple[Row6, ...], Field(min_length=6, max_length=6)]
+Count = Annotated[int, Field(ge=0)]
+Unit = Annotated[float, Field(ge=0, le=1)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+class CameraRequest(_Request):
+    """Intrinsics of the photo by COLMAP's model names; those of another size of the picture are scaled."""
+
+    model: Annotated[str, Field(pattern=r"^[A-Z_]{1,32}$")]
+    width: Side
+    height: Side
+    params: Annotated[tuple[CameraParam, ...], Field(min_length=3, max_length=12)]
+
+
+class PriorRequest(_Request):
+    """Where the photo may have been taken: WGS84 degrees, metres, one standard deviation.
+
+    `h` is in the maps' height datum. Its sigma defaults to 100 m, since heights of GPS receivers and
+    drones are off by tens of metres and rarely name their datum.
+    """
+
+    lat: Annotated[float, Field(ge=-90, le=90)]
+    lon: Annotated[float, Field(ge=-180, le=180)]
+    sigma_m: Annotated[float, Field(ge=0.01, le=1e6)]
+    h: Annotated[float, Field(ge=-12_000, le=100_000)] | None = None
+    sigma_vertical_m: Annotated[float, Field(ge=0.01, le=1e6)] = 100.0
+
+
+class RequestOptions(_Request):
+    """Wishes of one query."""
+
+    inliers: bool = False
+    exif_prior: bool = False
+    maps: (
+        Annotated[tuple[Annotated[str, Field(min_length=1, max_length=200)], ...], Field(max_length=1000)]
+        | None
+    ) = None
+    deadline_ms: Annotated[float, Field(ge=1, le=600_000)] | None = None
+
+
+class LocaliseWireRequest(_Request):
+    """The JSON attachment of a localise query; the payload is the image file's bytes."""
+
+    request_id: RequestId | None = None
+    camera: CameraRequest | None = None
+    prior: PriorRequest | None = None
+    contribute: bool = False
+    options: RequestOptions = RequestOptions()
+
+
+class Position(_Answer):
+    """OGC GeoPose position: WGS84 degrees, metres."""
+
+    lat: Annotated[float, Field(ge=-90, le=90)]
+    lon: Annotated[float, Field(ge=-180, le=180)]
+    h: float
+
+
+class Quaternion(_Answer):
+    """OGC GeoPose orientation: body axes to local east-north-up at the position."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+class UtmPose(_Answer):
+    """Camera centre in UTM metres and rotation of grid axes (east, north, up) into camera axes."""
+
+    epsg: int
+    easting: float
+    northing: float
+    height: float
+    cam_from_utm_xyzw: Quaternion4
+
+
+class Accuracy(_Answer):
+    """Radii that hold 68 % of the errors."""
+
+    horizontal_68_m: NotNegative
+    vertical_68_m: NotNegative
+    orientation_68_deg: NotNegative
+
+
+class CameraUsed(_Answer):
+    """Intrinsics that the pose was computed with, and where they came from."""
+
+    model: str
+    width: Side
+    height: Side
+    params: tuple[float, ...]
+    source: Literal["request", "map", "exif", "estimated"]
+
+
+class Lineage(_Answer):
+    """What placed a map on Earth."""
+
+    map_id: str
+    method: str
+    generation: Count
+    parents: tuple[str, ...]
+
+
+class RunnerUpPose(_Answer):
+    """The best pose elsewhere, which did not win."""
+
+    inliers: Count
+    distance_m: NotNegative
+    angle_deg: NotNegative
+    lat: float
+    lon: float
+
+
+class InlierPoints(_Answer):
+    """Evidence, on request: k pixels of the query, the UTM points they saw, and the row in `maps` of each."""
+
+    pixels: tuple[Pair, ...]
+    utm: tuple[Triple, ...]
+    map_rows: tuple[Count, ...]
+
+
+ReasonText = Literal[
+    "NO_COVERAGE",
+    "TOO_FEW_FEATURES",
+    "TOO_FEW_MATCHES",
+    "TOO_FEW_INLIERS",
+    "AMBIGUOUS",
+    "CONTRADICTS_PRIOR",
+]
+
+
+class LocaliseReply(_Answer):
+    """The answer to a localise query; the pose's fields are null when it is not localised."""
+
+    status: Literal["localised", "not_localised"]
+    reason: ReasonText | None
+    detail: str
+    position: Position | None
+    quaternion: Quaternion | None
+    body_axes: Literal["x forward, y left, z up"]
+    height_datum: str | None
+    utm: UtmPose | None
+    covariance: Covariance6 | None
+    accuracy: Accuracy | None
+    confidence: Unit
+    camera: CameraUsed | None
+    features: Count
+    matches: Count
+    inliers: Count
+    residual_rms_px: NotNegative | None
+    maps: tuple[str, ...]
+    lineage: tuple[Lineage, ...]
+    runner_up: RunnerUpPose | None
+    inlier_points: InlierPoints | None
+    snapshot: Count
+    timings_ms: dict[str, NotNegative]
+    request_id: str
+
+    @model_validator(mode="after")
+    def _pose_or_reason(self) -> "LocaliseReply":
+        pose = (self.position, self.quaternion, self.utm, self.covariance, self.accuracy, self.camera)
+        if self.status == "localised" and (self.reason is not None or any(p is None for p in pose)):
+            raise ValueError("a localised reply needs every field of the pose and no reason")
+        if self.status == "not_localised" and (self.reason is None or any(p is not None for p in pose)):
+            raise ValueError("a reply that is not localised needs a reason and no pose")
+        return self
+
+
+class ErrorReply(_Answer):
+    """Payload of `reply_err`."""
+
+    code: str
+    message: str
+    request_id: str | None
+
+
+class QueueStatus(_Answer):
+    length: Count
+    capacity: Count
+    workers: Count
+    busy: Count
+
+
+class Latency(_Answer):
+    """Milliseconds from receipt to reply over the latest answered queries; null before the first."""
+
+    count: Count
+    p50: NotNegative | None
+    p90: NotNegative | None
+    p99: NotNegative | None
+    max: NotNegative | None
+
+
+class QueryCounts(_Answer):
+    received: Count
+    localised: Count
+    not_localised: dict[str, Count]
+    errors: dict[str, Count]
+
+
+class ReloadStatus(_Answer):
+    """Hot reloads since the start; `error` is the latest failure while it lasts."""
+
+    count: Count
+    error: str | None
+
+
+class Limits(_Answer):
+    max_payload_bytes: Count
+    max_pixels: Count
+    deadline_s: NotNegative
+
+
+class StatusReply(_Answer):
+    """Answer of `.../status`."""
+
+    database: str
+    server_id: str
+    version: str
+    wire_version: str
+    snapshot: Count
+    maps: Count
+    uptime_s: NotNegative
+    queue: QueueStatus
+    queries: QueryCounts
+    latency_ms: Latency
+    reload: ReloadStatus
+    limits: Limits
+
+
+class BoundingBox(_Answer):
+    """WGS84 degrees."""
+
+    west: float
+    south: float
+    east: float
+    north: float
+
+
+class MapInfo(_Answer):
+    """One map that the server answers from."""
+
+    map_id: str
+    content_digest: str
+    name: str
+    epsg: int
+    height_datum: str
+    method: str
+    generation: Count
+    images: Count
+    points: Count
+    bounds: BoundingBox | None
+    tiles: tuple[str, ...]
+
+
+class MapsReply(_Answer):
+    """Answer of `.../maps`."""
+
+    database: str
+    snapshot: Count
+    maps: tuple[MapInfo, ...]
+
+
+EventType = Literal["map_committed", "map_retired", "reloaded", "reload_failed", "stopping"]
+
+
+class Event(_Answer):
+    """Publication on `.../events`."""
+
+    type: EventType
+    database: str
+    server_id: str
+    snapshot: Count
+    map_id: str | None
+    detail: str
+    time: str
+
+
+def parse_request(attachment: bytes | None) -> LocaliseWireRequest:
+    """Read the attachment of a localise query; none or an empty one means all defaults.
+
+    Raises:
+        RequestError: BAD_REQUEST with the field, what was expected and what was found.
+    """
+    if not attachment:
+        return LocaliseWireRequest()
+    if len(attachment) > MAX_ATTACHMENT_BYTES:
+        raise RequestError(
+            ErrorCode.BAD_REQUEST,
+            f"attachment: expected at most {MAX_ATTACHMENT_BYTES} bytes of JSON, found {len(attachment)}",
+        )
+    try:
+        return LocaliseWireRequest.model_validate_json(attachment)
+    except ValidationError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, _explain(error), _request_id_of(attachment)) from error
+
+
+def encode(message: BaseModel) -> bytes:
+    """A message as UTF-8 JSON."""
+    return message.model_dump_json().encode()
+
+
+def _explain(error: ValidationError) -> str:
+    """One line for people out of pydantic's list: field, expectation, what was found."""
+    parts = []
+    for item in error.errors(include_url=False)[:3]:
+        where = ".".join(str(step) for step in item["loc"]) or "attachment"
+        found: Any = item.get("input")
+        shown = repr(found)
+        if len(shown) > _SHOWN_INPUT_CHARS:
+            shown = shown[:_SHOWN_INPUT_CHARS] + "..."
+        parts.append(f"{where}: {item['msg']}, found {shown}")
+    return "; ".join(parts)
+
+
+def _request_id_of(attachment: bytes) -> str | None:
+    """The request id of a refused attachment, where it can still be read."""
+    try:
+        found = json.loads(attachment)
+    except (ValueError, RecursionError):
+        return None
+    request_id = found.get("request_id") if isinstance(found, dict) else None
+    try:
+        return LocaliseWireRequest(request_id=request_id).request_id
+    except ValidationError:
+        return None
