@@ -19,6 +19,8 @@ from featuredb.features.selection import spread_strongest
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
 _OCTAVE_LAYERS = 3
 _SIGMA = 1.6
+# The spread selection chooses among this many times as many of the strongest keypoints as it keeps.
+_POOL = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,23 +86,24 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
         raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
     small = _shrink(gray, options.max_side_px)
     sift = cv2.SIFT_create(
-        nfeatures=0,
+        # OpenCV keeps the strongest; describing them in the same pass shares the scale pyramid.
+        nfeatures=0 if options.upright else int(_POOL * options.max_features),
         nOctaveLayers=_OCTAVE_LAYERS,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,
         sigma=_SIGMA,
         enable_precise_upscale=True,
     )
-    keypoints = sift.detect(small, None)
     if options.upright:
-        keypoints = _upright(keypoints)
+        keypoints, raw = sift.compute(small, _upright(sift.detect(small, None)))
+    else:
+        keypoints, raw = sift.detectAndCompute(small, None)
     if not keypoints:
         return _features([], np.zeros((0, 128), np.uint8), gray.shape, small.shape, options)
     xy = cv2.KeyPoint.convert(keypoints)
     response = np.array([k.response for k in keypoints], dtype=np.float32)
     rows = spread_strongest(xy, response, small.shape[1], small.shape[0], options.max_features)
-    keypoints, raw = sift.compute(small, [keypoints[i] for i in rows])
-    return _features(keypoints, rootsift_8bit(raw), gray.shape, small.shape, options)
+    return _features([keypoints[i] for i in rows], rootsift_8bit(raw[rows]), gray.shape, small.shape, options)
 
 
 def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -1,0 +1,273 @@
+"""Several maps of one neighbourhood in one local frame, laid out for searching.
+
+An area is derived from maps and can be rebuilt at any time. Only points that carry descriptors are
+in it.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from featuredb.errors import IncompatibleExtractorError, InvalidValueError
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import FeatureMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Area:
+    """Maps in one frame. All arrays are read-only by convention.
+
+    Attributes:
+        frame: local ENU frame of everything here.
+        maps: the maps, without being copied; `point_map` and `image_map` index into it.
+        points: (p, 3) float64, metres in `frame`.
+        point_map: (p,) int32.
+        point_row: (p,) int64, row in the map's MapPoints.
+        point_covariance: (p, 3, 3) float64, square metres in `frame`, relative to the map's gauge.
+        view_direction: (p, 3) float64, mean unit vector from the point to the cameras that saw it.
+        view_spread_cos: (p,) float64, cosine of the angle between that mean and the outermost view.
+        view_distance: (p, 2) float64, smallest and largest distance of those cameras, metres.
+        descriptors: (p, 128) uint8, mean RootSIFT of the track, length 512.
+        see_image, see_point: (s,) int32, "image sees point", sorted by image.
+        image_start: (i + 1,) int64, slices of see_* per image.
+        image_map: (i,) int32.
+        image_center: (i, 3) float64, camera centres in `frame`.
+        image_scene: (i, 3) float64, median of the points that the image sees.
+        image_reach: (i,) float64, median distance of those points from the camera, metres.
+        covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
+        extractor_fingerprint: of all descriptors.
+        digest: names the content; equal digests hold equal areas.
+    """
+
+    frame: LocalFrame
+    maps: tuple[FeatureMap, ...]
+    points: FloatArray
+    point_map: NDArray[np.int32]
+    point_row: NDArray[np.int64]
+    point_covariance: FloatArray
+    view_direction: FloatArray
+    view_spread_cos: FloatArray
+    view_distance: FloatArray
+    descriptors: NDArray[np.uint8]
+    see_image: NDArray[np.int32]
+    see_point: NDArray[np.int32]
+    image_start: NDArray[np.int64]
+    image_map: NDArray[np.int32]
+    image_center: FloatArray
+    image_scene: FloatArray
+    image_reach: FloatArray
+    covisible: sparse.csr_array
+    extractor_fingerprint: str
+    digest: str
+
+    def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
+        """Rows of the points that any of these images sees, ascending, without repetition."""
+        if len(images) == 0:
+            return np.zeros(0, dtype=np.int32)
+        slices = [self.see_point[self.image_start[i] : self.image_start[i + 1]] for i in images]
+        return np.unique(np.concatenate(slices))
+
+    def camera_for_key(self, camera_key: str) -> Camera | None:
+        """Intrinsics of a map camera with this EXIF key; of the map with most images if several."""
+        found: list[tuple[int, Camera]] = []
+        for feature_map in self.maps:
+            for camera, key in zip(feature_map.cameras, feature_map.camera_keys, strict=False):
+                if key and key == camera_key:
+                    found.append((len(feature_map.images), camera))
+        return max(found, key=lambda item: item[0])[1] if found else None
+
+
+def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> Area:
+    """Lay the maps out in one frame (default: that of the map with most points).
+
+    Raises:
+        InvalidValueError: no maps.
+        IncompatibleExtractorError: the maps' descriptors come from different extractors.
+    """
+    if not maps:
+        raise InvalidValueError("build_area: expected at least one map, found none")
+    fingerprints = sorted({m.extractor_fingerprint for m in maps})
+    if len(fingerprints) > 1:
+        raise IncompatibleExtractorError(
+            f"build_area: maps of one area must share an extractor, found {fingerprints}; "
+            "ingest the photos of one of them again"
+        )
+    frame = frame or max(maps, key=lambda m: len(m.points)).frame
+    parts = [_lay_out(feature_map, frame) for feature_map in maps]
+    point_offset = np.cumsum([0] + [len(p.points) for p in parts])
+    image_offset = np.cumsum([0] + [len(p.image_center) for p in parts])
+    see_image = np.concatenate(
+        [p.see_image + o for p, o in zip(parts, image_offset[:-1], strict=True)]
+    ).astype(np.int32)
+    see_point = np.concatenate(
+        [p.see_point + o for p, o in zip(parts, point_offset[:-1], strict=True)]
+    ).astype(np.int32)
+    image_map = _repeat([len(p.image_center) for p in parts])
+    image_scene = np.concatenate([p.image_scene for p in parts])
+    image_reach = np.concatenate([p.image_reach for p in parts])
+    return Area(
+        frame=frame,
+        maps=tuple(maps),
+        points=np.concatenate([p.points for p in parts]),
+        point_map=_repeat([len(p.points) for p in parts]),
+        point_row=np.concatenate([p.point_row for p in parts]),
+        point_covariance=np.concatenate([p.point_covariance for p in parts]),
+        view_direction=np.concatenate([p.view_direction for p in parts]),
+        view_spread_cos=np.concatenate([p.view_spread_cos for p in parts]),
+        view_distance=np.concatenate([p.view_distance for p in parts]),
+        descriptors=np.concatenate([p.descriptors for p in parts]),
+        see_image=see_image,
+        see_point=see_point,
+        image_start=np.searchsorted(see_image, np.arange(len(image_map) + 1)).astype(np.int64),
+        image_map=image_map,
+        image_center=np.concatenate([p.image_center for p in parts]),
+        image_scene=image_scene,
+        image_reach=image_reach,
+        covisible=_covisibility(see_image, see_point, image_map, image_scene, image_reach),
+        extractor_fingerprint=fingerprints[0],
+        digest=_digest(maps, frame),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Part:
+    """One map, laid out; fields as in Area, counted from zero."""
+
+    points: FloatArray
+    point_row: NDArray[np.int64]
+    point_covariance: FloatArray
+    view_direction: FloatArray
+    view_spread_cos: FloatArray
+    view_distance: FloatArray
+    descriptors: NDArray[np.uint8]
+    see_image: NDArray[np.int32]
+    see_point: NDArray[np.int32]
+    image_center: FloatArray
+    image_scene: FloatArray
+    image_reach: FloatArray
+
+
+def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> _Part:
+    area_from_map = frame.enu_from(feature_map.frame)
+    observations = feature_map.observations
+    keep = np.flatnonzero(observations.has_descriptor)
+    rows, see_point = np.unique(observations.point_index[keep], return_inverse=True)
+    points = feature_map.points_local(frame)[rows]
+    ids = np.array([image.image_id for image in feature_map.images], dtype=np.int32)
+    by_id = np.argsort(ids)
+    see_image = by_id[np.searchsorted(ids[by_id], observations.image_id[keep])]
+    centers = np.array([area_from_map.act(i.cam_from_local.center) for i in feature_map.images]).reshape(
+        -1, 3
+    )
+    toward = centers[see_image] - points[see_point]
+    distance = np.linalg.norm(toward, axis=1)
+    unit = toward / np.maximum(distance, 1e-9)[:, None]
+    direction = _sum_by(see_point, unit, len(rows))
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
+    cosine = np.einsum("ij,ij->i", direction[see_point], unit)
+    spread = np.ones(len(rows))
+    np.minimum.at(spread, see_point, cosine)
+    near, far = np.full(len(rows), np.inf), np.zeros(len(rows))
+    np.minimum.at(near, see_point, distance)
+    np.maximum.at(far, see_point, distance)
+    order = np.lexsort((see_point, see_image))
+    see_image, see_point = see_image[order], see_point[order]
+    start = np.searchsorted(see_image, np.arange(len(centers) + 1))
+    scene, reach = centers.copy(), np.zeros(len(centers))
+    for i in range(len(centers)):
+        seen = points[see_point[start[i] : start[i + 1]]]
+        if len(seen):
+            scene[i] = np.median(seen, axis=0)
+            reach[i] = np.median(np.linalg.norm(seen - centers[i], axis=1))
+    return _Part(
+        points=points,
+        point_row=rows,
+        point_covariance=_full_covariance(feature_map.points.covariance[rows], area_from_map.rotation),
+        view_direction=direction,
+        view_spread_cos=spread,
+        view_distance=np.stack([near, far], axis=1),
+        descriptors=_mean_descriptors(observations.descriptors[keep][order], see_point, len(rows)),
+        see_image=see_image.astype(np.int32),
+        see_point=see_point.astype(np.int32),
+        image_center=centers,
+        image_scene=scene,
+        image_reach=reach,
+    )
+
+
+def _mean_descriptors(
+    descriptors: NDArray[np.uint8], point: NDArray[np.intp], count: int
+) -> NDArray[np.uint8]:
+    """Mean descriptor of each track, brought back to length 512 and 8 bits."""
+    total = _sum_by(point, descriptors.astype(np.float32), count)
+    norm = np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
+    return np.clip(np.rint(total * (512.0 / norm)), 0, 255).astype(np.uint8)
+
+
+def _sum_by(group: NDArray[np.intp], values: NDArray[np.floating], count: int) -> FloatArray:
+    """Sums (count, k) of rows of values (n, k) by group number (n,)."""
+    matrix = sparse.csr_array(
+        (np.ones(len(group)), (group, np.arange(len(group)))), shape=(count, len(group))
+    )
+    return np.asarray(matrix @ values, dtype=np.float64).reshape(count, -1)
+
+
+def _full_covariance(upper: NDArray[np.float32], rotation: FloatArray) -> FloatArray:
+    """(n, 3, 3) in turned axes from upper triangles (n, 6)."""
+    ee, en, eu, nn, nu, uu = np.asarray(upper, dtype=np.float64).T
+    full = np.stack([ee, en, eu, en, nn, nu, eu, nu, uu], axis=1).reshape(-1, 3, 3)
+    return np.asarray(rotation @ full @ rotation.T, dtype=np.float64)
+
+
+def _covisibility(
+    see_image: NDArray[np.int32],
+    see_point: NDArray[np.int32],
+    image_map: NDArray[np.int32],
+    image_scene: FloatArray,
+    image_reach: FloatArray,
+) -> sparse.csr_array:
+    """Shared points between images; images of different maps count as sharing when they look at one place.
+
+    Two maps share no points by construction. Images of different maps whose scenes' middles lie within
+    half of the smaller reach of each other are taken to overlap.
+    """
+    count = len(image_map)
+    sees = sparse.csr_array(
+        (np.ones(len(see_image), dtype=np.int32), (see_image, see_point)),
+        shape=(count, int(see_point.max()) + 1 if len(see_point) else 1),
+    )
+    shared = sparse.csr_array(sees @ sees.T)
+    if len(np.unique(image_map)) < 2:
+        return shared
+    from scipy.spatial import cKDTree
+
+    pairs = cKDTree(image_scene).query_pairs(0.5 * float(image_reach.max()), output_type="ndarray")
+    a, b = pairs[:, 0], pairs[:, 1]
+    gap = np.linalg.norm(image_scene[a] - image_scene[b], axis=1)
+    near = (image_map[a] != image_map[b]) & (gap < 0.5 * np.minimum(image_reach[a], image_reach[b]))
+    a, b = a[near], b[near]
+    links = sparse.coo_array(
+        (np.full(2 * len(a), 30, dtype=np.int32), (np.r_[a, b], np.r_[b, a])), shape=(count, count)
+    )
+    return sparse.csr_array(shared + links.tocsr())
+
+
+def _repeat(counts: list[int]) -> NDArray[np.int32]:
+    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+
+
+def _digest(maps: Sequence[FeatureMap], frame: LocalFrame) -> str:
+    digest = hashlib.sha256(repr(frame).encode())
+    for feature_map in maps:
+        digest.update(feature_map.map_id.encode())
+        digest.update(np.ascontiguousarray(feature_map.points.utm).tobytes())
+        digest.update(np.ascontiguousarray(feature_map.observations.descriptors).tobytes())
+    digest.update(str(DESCRIPTOR_SIZE).encode())
+    return digest.hexdigest()

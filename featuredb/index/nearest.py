@@ -1,0 +1,25 @@
+"""Exact nearest neighbours between two small sets of descriptors."""
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+
+def nearest(
+    query: NDArray[np.uint8], base: NDArray[np.uint8], k: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """The k nearest rows of `base` (m, 128) for each descriptor of `query` (n, 128), by exhaustion.
+
+    Returns:
+        Squared distances (n, k) float32, ascending, infinity where there are fewer than k; rows (n, k)
+        int64, -1 where there are fewer.
+    """
+    shape = (len(query), k)
+    if len(query) == 0 or len(base) == 0:
+        return np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int64)
+    found = min(k, len(base))
+    distance, row = faiss.knn(query.astype(np.float32), base.astype(np.float32), found)
+    if found < k:
+        distance = np.pad(distance, ((0, 0), (0, k - found)), constant_values=np.inf)
+        row = np.pad(row, ((0, 0), (0, k - found)), constant_values=-1)
+    return distance, row

@@ -1,0 +1,119 @@
+"""Whether a pose is believed: inliers, their spread, and how likely chance gives as many."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from featuredb.geometry.arrays import FloatArray
+from reloc.result import Reason
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AcceptanceOptions:
+    """Where the line is. tools/acceptance_study.py draws the distributions behind the numbers.
+
+    Attributes:
+        min_inliers: fewer are never believed.
+        min_log_nfa: smallest -log10 of the number of false alarms, see `log_nfa`.
+        min_coverage: smallest share of a 10x10 grid over the image that holds inliers.
+        rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
+    """
+
+    min_inliers: int = 15
+    min_log_nfa: float = 12.0
+    min_coverage: float = 0.05
+    rival_share: float = 0.6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """The figures behind a decision.
+
+    Attributes:
+        inliers: matches that agree with the pose.
+        log_nfa: -log10 of the expected number of as good poses among random matches.
+        coverage: share of a 10x10 grid over the image that holds inliers.
+        visible_share: guided inliers over map points that should be visible.
+    """
+
+    inliers: int
+    log_nfa: float
+    coverage: float
+    visible_share: float
+
+
+def log_nfa(matches: int, inliers: int, tolerance_px: float, width: int, height: int, sample: int) -> float:
+    """-log10 of the number of false alarms (Moisan and Stival 2004; Moulon et al., AC-RANSAC, 2012).
+
+    NFA = (n - s) C(n, k) C(k, s) p^(k - s): the number of poses with k inliers that one expects among all
+    minimal samples of s of n random matches, a random match being an inlier with the probability p that
+    a random pixel lies within the tolerance.
+    """
+    if inliers <= sample or matches < inliers:
+        return 0.0
+    chance = min(np.pi * tolerance_px**2 / (width * height), 1.0)
+    value = (
+        np.log(matches - sample)
+        + _log_choose(matches, inliers)
+        + _log_choose(inliers, sample)
+        + (inliers - sample) * np.log(chance)
+    )
+    return float(-value / np.log(10.0))
+
+
+def coverage(pixels: FloatArray, width: int, height: int) -> float:
+    """Share of the cells of a 10x10 grid over the image that hold at least one of the pixels (k, 2)."""
+    if len(pixels) == 0:
+        return 0.0
+    column = np.clip((pixels[:, 0] * 10 / width).astype(int), 0, 9)
+    row = np.clip((pixels[:, 1] * 10 / height).astype(int), 0, 9)
+    return len(np.unique(row * 10 + column)) / 100.0
+
+
+def independent_inliers(pixels: FloatArray, points: FloatArray, min_gap_px: float) -> NDArray[np.intp]:
+    """Rows of inliers that are measurements of their own.
+
+    Keypoints of one structure at several scales lie on top of each other and agree with any pose that one
+    of them agrees with; of those within one cell of `min_gap_px` only the first counts.
+    """
+    cell = np.floor(pixels / min_gap_px).astype(np.int64)
+    _, first = np.unique(cell, axis=0, return_index=True)
+    _, by_point = np.unique(np.round(points[first], 3), axis=0, return_index=True)
+    return np.sort(first[by_point])
+
+
+def _log_choose(n: int, k: int) -> float:
+    return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
+
+
+def verdict(evidence: Evidence, rival_inliers: int, options: AcceptanceOptions) -> tuple[Reason, str] | None:
+    """None if the pose is believed, else the reason and a sentence with the figures."""
+    if evidence.inliers < options.min_inliers:
+        return "TOO_FEW_INLIERS", f"{evidence.inliers} independent inliers, {options.min_inliers} needed"
+    if evidence.log_nfa < options.min_log_nfa:
+        return (
+            "TOO_FEW_INLIERS",
+            f"as many inliers arise by chance too easily: -log10(NFA) {evidence.log_nfa:.1f}, "
+            f"{options.min_log_nfa:.0f} needed",
+        )
+    if evidence.coverage < options.min_coverage:
+        return (
+            "TOO_FEW_INLIERS",
+            f"the inliers cover {100 * evidence.coverage:.0f} % of the photo, "
+            f"{100 * options.min_coverage:.0f} % needed",
+        )
+    if rival_inliers >= options.rival_share * evidence.inliers:
+        return (
+            "AMBIGUOUS",
+            f"a pose elsewhere has {rival_inliers} inliers, this one {evidence.inliers}",
+        )
+    return None
+
+
+def confidence(evidence: Evidence, rival_inliers: int) -> float:
+    """Probability in [0, 1] that an accepted pose is right."""
+    support = 1.0 - np.exp(-evidence.log_nfa / 15.0)
+    rivalry = 1.0 - rival_inliers / max(evidence.inliers, 1)
+    return float(np.clip(support * rivalry, 0.0, 1.0))

@@ -1,0 +1,54 @@
+"""Derivatives of pixels by points, pose and intrinsics, through any camera model, by central differences."""
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+
+
+def pixel_jacobians(
+    camera: Camera, cam_from_local: Rigid3, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of the pixels of points (k, 3), in front of the camera.
+
+    Returns:
+        By the points (k, 2, 3), and by the pose (k, 2, 6): a small rotation of the camera about the local
+        axes (rad), then a displacement of its centre (m): R_true = R(dtheta) R, C_true = C + dC for
+        local_from_cam = (R, C).
+    """
+    in_camera = cam_from_local.act(points)
+    step = 1e-5 * np.maximum(in_camera[:, 2], 1e-3)
+    by_camera = np.empty((len(points), 2, 3))
+    for axis in range(3):
+        offset = np.zeros_like(in_camera)
+        offset[:, axis] = step
+        by_camera[:, :, axis] = (camera.project(in_camera + offset) - camera.project(in_camera - offset)) / (
+            2.0 * step[:, None]
+        )
+    by_point = by_camera @ cam_from_local.rotation
+    x, y, z = (points - cam_from_local.center).T
+    zero = np.zeros_like(x)
+    crosses = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return by_point, np.concatenate([by_point @ crosses, -by_point], axis=2)
+
+
+def intrinsics_jacobian(camera: Camera, in_camera: FloatArray, steps: FloatArray) -> FloatArray:
+    """Derivatives (k, 2, q) of the pixels of camera-frame points (k, 3) by the camera's q parameters.
+
+    Args:
+        steps: (q,) finite-difference steps in the parameters' own units.
+    """
+    columns = []
+    for i, step in enumerate(steps):
+        up, down = list(camera.params), list(camera.params)
+        up[i] += step
+        down[i] -= step
+        columns.append(
+            (_with(camera, up).project(in_camera) - _with(camera, down).project(in_camera)) / (2 * step)
+        )
+    return np.stack(columns, axis=2)
+
+
+def _with(camera: Camera, params: list[float]) -> Camera:
+    return Camera(model=camera.model, width=camera.width, height=camera.height, params=tuple(params))

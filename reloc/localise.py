@@ -1,0 +1,320 @@
+"""One photo against indexed maps: a pose, or a reason why there is none.
+
+The steps, in order: features; clusters of map images that may show the same; 2D-3D matches inside each
+cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IncompatibleExtractorError
+from featuredb.features.extractor import extract
+from featuredb.features.features import Features
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import Area
+from reloc.acceptance import Evidence, confidence, coverage, independent_inliers, log_nfa, verdict
+from reloc.answer import make_answer
+from reloc.candidates import Cluster, IndexedArea, find_clusters
+from reloc.matching import Matches, guided_matches, match_cluster, visible_points
+from reloc.options import LocaliseOptions
+from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
+from reloc.prior import contradicts_prior
+from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
+from reloc.stopwatch import Stopwatch
+
+
+def localise(
+    gray: NDArray[np.uint8],
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions | None = None,
+    snapshot: int = 0,
+) -> LocaliseResult:
+    """Pose of a photo.
+
+    Args:
+        gray: (h, w) uint8, pixels as stored in the file.
+        areas: the indexed maps to search.
+        snapshot: version of the database that the areas come from, passed through.
+
+    Raises:
+        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        ImageError: the image is not (h, w) uint8 or tiny.
+    """
+    options = options or LocaliseOptions()
+    check_extractor(areas, options)
+    watch = Stopwatch()
+    features = extract(gray, options.extractor)
+    watch.split("features")
+    found = _search(features, request, areas, options, watch)
+    result = _decide(found, features, request, options, snapshot, watch)
+    watch.split("answer")
+    return result
+
+
+def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:
+    """Raise IncompatibleExtractorError where descriptors could not be compared."""
+    for indexed in areas:
+        if indexed.area.extractor_fingerprint != options.extractor.fingerprint:
+            raise IncompatibleExtractorError(
+                f"the maps were made by extractor {indexed.area.extractor_fingerprint}, this query uses "
+                f"{options.extractor.fingerprint}: their descriptors cannot be compared; use the same "
+                "extractor options (upright or not) as the ingest"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """The best pose that one cluster gives, with its matches and the evidence for it."""
+
+    area: Area
+    pose: PoseHypothesis
+    matches: Matches
+    evidence: Evidence
+    rows: NDArray[np.intp]  # matches that are independent inliers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Search:
+    """What the search found: candidates, best first, and how far it came."""
+
+    candidates: list[Candidate]
+    matches: int
+    reason: Reason | None
+    detail: str
+
+
+def _search(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions,
+    watch: Stopwatch,
+) -> _Search:
+    if len(features) < options.acceptance.min_inliers:
+        return _nothing(
+            "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
+        )
+    clusters = find_clusters(areas, features, request.prior, options.candidates)
+    watch.split("candidates")
+    if not clusters:
+        return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
+    candidates: list[Candidate] = []
+    most = 0
+    for cluster in clusters:
+        matches = match_cluster(features, cluster, options.matching)
+        watch.split("matching")
+        most = max(most, len(matches))
+        candidates.extend(_poses(features, cluster, matches, request, options, watch))
+        if candidates and _settled(candidates, cluster, clusters, options):
+            break
+    candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
+    if not candidates and most < options.pose.min_matches:
+        return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
+    return _Search(candidates=candidates, matches=most, reason=None, detail="")
+
+
+def _settled(
+    candidates: list[Candidate], cluster: Cluster, clusters: list[Cluster], options: LocaliseOptions
+) -> bool:
+    """Whether the remaining clusters need not be tried: this one is sure, and theirs have far fewer votes."""
+    rest = [c.score for c in clusters if c is not cluster and c.score < cluster.score]
+    best = max(candidates, key=lambda c: c.evidence.log_nfa)
+    sure = best.evidence.log_nfa > 4.0 * options.acceptance.min_log_nfa
+    return sure and all(score < 0.5 * cluster.score for score in rest)
+
+
+def _poses(
+    features: Features,
+    cluster: Cluster,
+    matches: Matches,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    watch: Stopwatch,
+) -> list[Candidate]:
+    """The cluster's best pose, and the best one among the matches that it leaves over."""
+    found: list[Candidate] = []
+    cameras = camera_hypotheses(features, cluster.area, request)
+    left = matches
+    for _ in range(2):
+        pose = _best_pose(features, cluster.area, left, cameras, options)
+        watch.split("pose")
+        if pose is None or pose.count < 4:
+            break
+        found.append(_refined(features, cluster, left, pose, options))
+        watch.split("guided")
+        taken = np.isin(left.point, found[0].matches.point[found[0].rows]) | pose.inliers
+        left = Matches(feature=left.feature[~taken], point=left.point[~taken], distance=left.distance[~taken])
+    return found
+
+
+def camera_hypotheses(
+    features: Features, area: Area, request: LocaliseRequest
+) -> list[tuple[Camera, CameraSource]]:
+    """Intrinsics to try: the request's; else a map camera with the same EXIF key; else the focal is free."""
+    if request.camera is not None:
+        return [(request.camera, "request")]
+    if request.camera_key:
+        camera = area.camera_for_key(request.camera_key)
+        if camera is not None and (camera.width, camera.height) == (features.width, features.height):
+            return [(camera, "map")]
+    longer = max(features.width, features.height)
+    if request.exif_focal_px:
+        return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]
+    # 1.2 times the longer side (a 45-degree lens) only starts the estimate.
+    return [(Camera.from_focal(features.width, features.height, 1.2 * longer), "estimated")]
+
+
+def _best_pose(
+    features: Features,
+    area: Area,
+    matches: Matches,
+    cameras: list[tuple[Camera, CameraSource]],
+    options: LocaliseOptions,
+) -> PoseHypothesis | None:
+    pixels, points = _pairs(features, area, matches)
+    found = [estimate_pose(pixels, points, camera, source, options.pose) for camera, source in cameras]
+    poses = [pose for pose in found if pose is not None]
+    return max(poses, key=lambda pose: pose.count) if poses else None
+
+
+def _refined(
+    features: Features, cluster: Cluster, matches: Matches, pose: PoseHypothesis, options: LocaliseOptions
+) -> Candidate:
+    """Refine on matches looked for where the pose says they are; keep that only if it agrees with more."""
+    area = cluster.area
+    pixels, points = _pairs(features, area, matches)
+    best, kept = refine_pose(pixels, points, pose, options.pose), matches
+    expected = visible_points(area, cluster.points.astype(np.int64), best.camera, best.cam_from_local)
+    guided = guided_matches(
+        features, area, cluster.points, best.camera, best.cam_from_local, options.matching
+    )
+    if len(guided) >= 4:
+        pixels, points = _pairs(features, area, guided)
+        again = refine_pose(pixels, points, best, options.pose)
+        if again.count >= best.count:
+            best, kept = again, guided
+    return _with_evidence(features, area, best, kept, len(matches), pose.count, len(expected), options)
+
+
+def _with_evidence(
+    features: Features,
+    area: Area,
+    pose: PoseHypothesis,
+    matches: Matches,
+    unguided: int,
+    unguided_inliers: int,
+    visible: int,
+    options: LocaliseOptions,
+) -> Candidate:
+    """The number of false alarms is that of the unguided matches: guided ones look where they are wanted."""
+    pixels, points = _pairs(features, area, matches)
+    inliers = np.flatnonzero(pose.inliers)
+    longer = max(pose.camera.width, pose.camera.height)
+    own = inliers[independent_inliers(pixels[inliers], points[inliers], 0.002 * longer)]
+    tolerance_px = options.pose.tolerance_rel * longer
+    sample = 4 if pose.focal_is_free else 3
+    evidence = Evidence(
+        inliers=len(own),
+        log_nfa=log_nfa(
+            unguided, unguided_inliers, tolerance_px, pose.camera.width, pose.camera.height, sample
+        ),
+        coverage=coverage(pixels[own], pose.camera.width, pose.camera.height),
+        visible_share=len(own) / max(visible, 1),
+    )
+    return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+
+
+def _decide(
+    found: _Search,
+    features: Features,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    snapshot: int,
+    watch: Stopwatch,
+) -> LocaliseResult:
+    def refuse(
+        reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None
+    ) -> LocaliseResult:
+        return LocaliseResult(
+            reason=reason,
+            detail=detail,
+            pose=None,
+            confidence=0.0,
+            features=len(features),
+            matches=found.matches,
+            inliers=inliers,
+            runner_up=rival,
+            snapshot=snapshot,
+            timings_ms=watch.timings_ms,
+        )
+
+    if found.reason is not None:
+        return refuse(found.reason, found.detail)
+    if not found.candidates:
+        return refuse("TOO_FEW_INLIERS", f"no pose agrees with the {found.matches} matches")
+    best = found.candidates[0]
+    rival = _runner_up(best, found.candidates[1:])
+    refusal = verdict(best.evidence, rival.inliers if rival else 0, options.acceptance)
+    if refusal is not None:
+        return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
+    pixels, points = _pairs(features, best.area, best.matches)
+    rows = best.matches.point[best.rows]
+    uncertainty = pose_uncertainty(
+        pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose
+    )
+    answer = make_answer(best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
+    against = contradicts_prior(answer, request.prior)
+    if against is not None:
+        return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
+    return LocaliseResult(
+        reason=None,
+        detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
+        pose=answer,
+        confidence=confidence(best.evidence, rival.inliers if rival else 0),
+        features=len(features),
+        matches=found.matches,
+        inliers=best.evidence.inliers,
+        runner_up=rival,
+        snapshot=snapshot,
+        timings_ms=watch.timings_ms,
+    )
+
+
+def _runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
+    """The best other pose that is another place: further than 2 m or 5 degrees from the winner."""
+    winner = best.pose.cam_from_local
+    for other in others:
+        pose = _in_frame_of(best.area, other)
+        distance_m = float(np.linalg.norm(pose.center - winner.center))
+        angle_deg = pose.angle_to_deg(winner)
+        if distance_m > 2.0 or angle_deg > 5.0:
+            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
+            return RunnerUp(
+                inliers=other.evidence.inliers,
+                distance_m=distance_m,
+                angle_deg=angle_deg,
+                latitude_deg=float(lat),
+                longitude_deg=float(lon),
+            )
+    return None
+
+
+def _in_frame_of(area: Area, candidate: Candidate) -> Rigid3:
+    if candidate.area is area:
+        return candidate.pose.cam_from_local
+    return candidate.pose.cam_from_local @ candidate.area.frame.enu_from(area.frame)
+
+
+def _pairs(features: Features, area: Area, matches: Matches) -> tuple[FloatArray, FloatArray]:
+    """Pixels (m, 2) and points (m, 3) of the matches, float64."""
+    return features.xy[matches.feature].astype(np.float64), area.points[matches.point]
+
+
+def _nothing(reason: Reason, detail: str, matches: int = 0) -> _Search:
+    return _Search(candidates=[], matches=matches, reason=reason, detail=detail)

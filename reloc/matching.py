@@ -1,0 +1,144 @@
+"""2D-3D matches: by descriptors inside a covisibility cluster, then guided by a pose."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from featuredb.features.features import Features
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import Area
+from featuredb.index.nearest import nearest
+from reloc.candidates import Cluster
+from reloc.options import MatchOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Matches:
+    """Pairs of a query feature and a map point; no feature and no point of one map twice.
+
+    Attributes:
+        feature: (m,) rows of the query's features.
+        point: (m,) rows of the area's points.
+        distance: (m,) descriptor distances (descriptors have length 512).
+    """
+
+    feature: NDArray[np.int64]
+    point: NDArray[np.int64]
+    distance: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.feature)
+
+
+def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
+    """Best point of each feature, if the second-best place is clearly worse; each map by itself.
+
+    Within one map every place has one point, so the ratio test asks whether a feature is unique there.
+    Another map of the same place has the same point again; it must not compete.
+    """
+    area = cluster.area
+    parts = []
+    for map_row in np.unique(area.point_map[cluster.points]):
+        points = cluster.points[area.point_map[cluster.points] == map_row]
+        parts.append(_match_points(features, area, points.astype(np.int64), options))
+    return _concatenate(parts)
+
+
+def _match_points(
+    features: Features, area: Area, points: NDArray[np.int64], options: MatchOptions
+) -> Matches:
+    squared, row = nearest(features.descriptors, area.descriptors[points], 3)
+    distance = np.sqrt(np.maximum(squared, 0.0))
+    position = area.points[points[np.maximum(row, 0)]]
+    same_m = options.same_place * area.view_distance[points[np.maximum(row[:, 0], 0)]].mean(axis=1)
+    second_is_same = np.linalg.norm(position[:, 1] - position[:, 0], axis=1) < same_m
+    rival = np.where(second_is_same, distance[:, 2], distance[:, 1])
+    good = np.flatnonzero((row[:, 0] >= 0) & (distance[:, 0] < options.ratio * rival))
+    return _one_to_one(features.xy, good, points[row[good, 0]], distance[good, 0])
+
+
+def guided_matches(
+    features: Features,
+    area: Area,
+    points: NDArray[np.int32],
+    camera: Camera,
+    cam_from_local: Rigid3,
+    options: MatchOptions,
+) -> Matches:
+    """Matches of the points that the pose makes visible, looked for where they project.
+
+    Args:
+        points: rows of the area's points to project.
+    """
+    rows = visible_points(area, points.astype(np.int64), camera, cam_from_local)
+    if len(rows) == 0 or len(features) == 0:
+        return _concatenate([])
+    pixels = camera.project(cam_from_local.act(area.points[rows]))
+    radius = options.guided_radius_rel * max(camera.width, camera.height)
+    tree = cKDTree(features.xy)
+    pairs = tree.sparse_distance_matrix(cKDTree(pixels), radius, output_type="coo_matrix")
+    feature, point = pairs.row.astype(np.int64), rows[pairs.col]
+    difference = features.descriptors[feature].astype(np.float32) - area.descriptors[point]
+    distance = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+    close = distance < options.guided_max_distance
+    return _one_to_one(features.xy, feature[close], point[close], distance[close])
+
+
+def visible_points(
+    area: Area, points: NDArray[np.int64], camera: Camera, cam_from_local: Rigid3
+) -> NDArray[np.int64]:
+    """Those of the points that project into the image and are seen from a side that the map knows.
+
+    A point counts as seen from a known side when the ray to the new camera lies within the cone of the
+    map's own views, widened by 30 degrees: SIFT does not follow much further.
+    """
+    pixels = camera.project(cam_from_local.act(area.points[points]))
+    with np.errstate(invalid="ignore"):
+        inside = (
+            (pixels[:, 0] >= 0)
+            & (pixels[:, 1] >= 0)
+            & (pixels[:, 0] < camera.width)
+            & (pixels[:, 1] < camera.height)
+        )
+    toward = cam_from_local.center - area.points[points]
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
+    cosine = np.einsum("ij,ij->i", toward, area.view_direction[points])
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
+    cone = np.arccos(np.clip(area.view_spread_cos[points], -1.0, 1.0)) + np.radians(30.0)
+    return points[inside & (angle <= cone)]
+
+
+def _one_to_one(
+    xy: NDArray[np.float32],
+    feature: NDArray[np.int64],
+    point: NDArray[np.int64],
+    distance: NDArray[np.float32],
+) -> Matches:
+    """Keep the closest match of each feature's place and of each point.
+
+    SIFT gives a place several keypoints when its orientation is not clear; they are one measurement.
+    """
+    order = np.argsort(distance, kind="stable")
+    feature, point, distance = feature[order], point[order], distance[order]
+    _, first = np.unique(point, return_index=True)
+    first.sort()
+    feature, point, distance = feature[first], point[first], distance[first]
+    place = np.round(xy[feature] * 2.0).astype(np.int64)
+    _, first = np.unique(place, axis=0, return_index=True)
+    first.sort()
+    return Matches(feature=feature[first], point=point[first], distance=distance[first])
+
+
+def _concatenate(parts: list[Matches]) -> Matches:
+    if not parts:
+        return Matches(
+            feature=np.zeros(0, np.int64), point=np.zeros(0, np.int64), distance=np.zeros(0, np.float32)
+        )
+    return Matches(
+        feature=np.concatenate([p.feature for p in parts]),
+        point=np.concatenate([p.point for p in parts]),
+        distance=np.concatenate([p.distance for p in parts]),
+    )

@@ -1,0 +1,83 @@
+"""Settings of the localisation, one class per stage, every threshold with its reason."""
+
+from dataclasses import dataclass, field
+
+from featuredb.features.extractor import ExtractorOptions
+from reloc.acceptance import AcceptanceOptions
+from reloc.self_calibration import LensPriors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateOptions:
+    """Which images of the maps are tried.
+
+    Attributes:
+        vote_features: the strongest query features that vote.
+        vote_neighbours: map points that each of them votes for.
+        max_cluster_images: images of one covisibility cluster; about what one photo can see.
+        max_clusters: clusters that are tried, best first.
+        single_cluster_points: an area with at most so many points in reach is matched as a whole, without
+            voting: exhaustive matching against it costs less than voting would.
+        prior_sigmas: images within so many standard deviations of the prior are in reach ...
+        prior_reach: ... plus so many times the distance from which they look at their scene.
+    """
+
+    vote_features: int = 800
+    vote_neighbours: int = 3
+    max_cluster_images: int = 20
+    max_clusters: int = 3
+    single_cluster_points: int = 6000
+    prior_sigmas: float = 3.0
+    prior_reach: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MatchOptions:
+    """2D-3D matching.
+
+    Attributes:
+        ratio: largest ratio of distances of the best to the second-best place.
+        same_place: map points closer together than this share of their viewing distance are one place
+            (a track that broke in two), and do not compete in the ratio test.
+        guided_radius_rel: radius in which a projected point looks for its keypoint, as a share of the
+            image's longer side (8 pixels at 1600).
+        guided_max_distance: largest descriptor distance (length 512) of such a match.
+    """
+
+    ratio: float = 0.85
+    same_place: float = 0.005
+    guided_radius_rel: float = 0.005
+    guided_max_distance: float = 300.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseOptions:
+    """Robust pose.
+
+    Attributes:
+        tolerance_rel: inlier tolerance as a share of the image's longer side (4 pixels at 1600): SIFT's
+            own 1 px, the map's point errors, and a lens that is not quite the map's.
+        min_matches: fewer are not tried.
+        max_iterations, confidence, seed: of RANSAC.
+        lens: what is known of a lens that neither the request nor a map describes.
+    """
+
+    tolerance_rel: float = 0.0025
+    min_matches: int = 8
+    max_iterations: int = 20_000
+    confidence: float = 0.9999
+    seed: int = 0
+    lens: LensPriors = field(default_factory=LensPriors)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocaliseOptions:
+    """All of the localisation's settings."""
+
+    extractor: ExtractorOptions = field(
+        default_factory=lambda: ExtractorOptions(max_side_px=1200, max_features=3000)
+    )
+    candidates: CandidateOptions = field(default_factory=CandidateOptions)
+    matching: MatchOptions = field(default_factory=MatchOptions)
+    pose: PoseOptions = field(default_factory=PoseOptions)
+    acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)

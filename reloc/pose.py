@@ -1,0 +1,249 @@
+"""Absolute pose from 2D-3D matches: LO-RANSAC, focal length where unknown, refinement, covariance."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import poselib
+import pycolmap
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from reloc.jacobians import pixel_jacobians
+from reloc.options import PoseOptions
+from reloc.self_calibration import calibrate
+
+CameraSource = Literal["request", "map", "exif", "estimated"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseHypothesis:
+    """A pose with the matches that agree with it.
+
+    Attributes:
+        cam_from_local: area frame to camera.
+        camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
+        inliers: (m,) bool over the matches that it was estimated from.
+        prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
+        calibrated_covariance: (6, 6) where the lens was estimated with the pose, else None.
+    """
+
+    cam_from_local: Rigid3
+    camera: Camera
+    camera_source: CameraSource
+    inliers: NDArray[np.bool_]
+    prior_focal_px: float
+    calibrated_covariance: FloatArray | None = None
+
+    @property
+    def count(self) -> int:
+        return int(self.inliers.sum())
+
+    @property
+    def focal_is_free(self) -> bool:
+        """Whether the lens was estimated together with the pose."""
+        return self.camera_source in ("exif", "estimated")
+
+
+def estimate_pose(
+    pixels: FloatArray, points: FloatArray, camera: Camera, source: CameraSource, options: PoseOptions
+) -> PoseHypothesis | None:
+    """LO-RANSAC (poselib's P3P; pycolmap's P4Pf where the focal length is free), or None.
+
+    Args:
+        pixels: (m, 2) full-size pixels. points: (m, 3) metres in the area's frame.
+        camera: intrinsics, or a start for the focal length where `source` is exif or estimated.
+    """
+    if len(pixels) < options.min_matches:
+        return None
+    tolerance_px = options.tolerance_rel * max(camera.width, camera.height)
+    if source in ("exif", "estimated"):
+        found = _ransac_focal(pixels, points, camera, tolerance_px, options)
+    else:
+        found = _ransac(pixels, points, camera, tolerance_px, options)
+    if found is None:
+        return None
+    prior_focal_px = camera.focal_px
+    cam_from_local, camera = found
+    residual = reprojection_errors(pixels, points, camera, cam_from_local)
+    return PoseHypothesis(
+        cam_from_local=cam_from_local,
+        camera=camera,
+        camera_source=source,
+        inliers=residual < tolerance_px,
+        prior_focal_px=prior_focal_px,
+    )
+
+
+def _ransac(
+    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+) -> tuple[Rigid3, Camera] | None:
+    pose, info = poselib.estimate_absolute_pose(
+        pixels,
+        points,
+        _poselib_camera(camera),
+        {
+            "max_reproj_error": tolerance_px,
+            "seed": options.seed,
+            "success_prob": options.confidence,
+            "min_iterations": 200,
+            "max_iterations": options.max_iterations,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": 0.25 * tolerance_px},
+    )
+    if info["num_inliers"] < 4:
+        return None
+    w, x, y, z = pose.q
+    return Rigid3.from_quaternion([x, y, z, w], pose.t), camera
+
+
+def _ransac_focal(
+    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+) -> tuple[Rigid3, Camera] | None:
+    settings = pycolmap.AbsolutePoseEstimationOptions()
+    settings.estimate_focal_length = True
+    settings.ransac.max_error = tolerance_px
+    settings.ransac.random_seed = options.seed
+    settings.ransac.confidence = options.confidence
+    settings.ransac.max_num_trials = options.max_iterations
+    settings.ransac.min_num_trials = 200
+    working = camera.to_pycolmap()  # pycolmap writes the focal length into it
+    found = pycolmap.estimate_absolute_pose(pixels, points, working, settings)
+    if found is None or found["num_inliers"] < 4:
+        return None
+    focal = float(np.mean([working.params[i] for i in working.focal_length_idxs()]))
+    # 0.3 to 5 times the longer side is 118 to 11 degrees of view: outside lies no camera that SIFT serves.
+    if not 0.3 <= focal / max(camera.width, camera.height) <= 5.0:
+        return None
+    return _from_pycolmap(found["cam_from_world"]), Camera.from_pycolmap(working)
+
+
+def refine_pose(
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions
+) -> PoseHypothesis:
+    """Robust refinement (Cauchy) on all matches within reach, then the inliers counted anew.
+
+    The lens is refined too where it is not known, within what lenses are like.
+    """
+    tolerance_px = options.tolerance_rel * max(start.camera.width, start.camera.height)
+    pose = start
+    for _ in range(2):
+        residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
+        near = residual < 2.0 * tolerance_px
+        if near.sum() < 4:
+            break
+        if pose.focal_is_free:
+            pose = _refine_with_lens(pixels[near], points[near], pose, tolerance_px, options)
+        else:
+            pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
+    residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
+    return replace(pose, inliers=residual < tolerance_px)
+
+
+def _refine_known_lens(
+    pixels: FloatArray,
+    points: FloatArray,
+    near: NDArray[np.bool_],
+    start: PoseHypothesis,
+    tolerance_px: float,
+) -> PoseHypothesis:
+    settings = pycolmap.AbsolutePoseRefinementOptions()
+    settings.loss_function_scale = 0.25 * tolerance_px
+    found = pycolmap.refine_absolute_pose(
+        pycolmap.Rigid3d(start.cam_from_local.matrix()[:3]),
+        pixels,
+        points,
+        near,
+        start.camera.to_pycolmap(),
+        settings,
+    )
+    return start if found is None else replace(start, cam_from_local=_from_pycolmap(found["cam_from_world"]))
+
+
+def _refine_with_lens(
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, tolerance_px: float, options: PoseOptions
+) -> PoseHypothesis:
+    priors = options.lens
+    found = calibrate(
+        pixels,
+        points,
+        start.cam_from_local,
+        start.camera,
+        start.prior_focal_px,
+        priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel,
+        0.25 * tolerance_px,
+        priors,
+    )
+    return replace(
+        start,
+        cam_from_local=found.cam_from_local,
+        camera=found.camera,
+        calibrated_covariance=found.covariance,
+    )
+
+
+def reprojection_errors(
+    pixels: FloatArray, points: FloatArray, camera: Camera, cam_from_local: Rigid3
+) -> FloatArray:
+    """(m,) distances in pixels, infinity for points behind the camera."""
+    difference = camera.project(cam_from_local.act(points)) - pixels
+    error = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseUncertainty:
+    """Covariance of a pose, measurement part.
+
+    Attributes:
+        covariance: (6, 6), area frame's axes: rotation of the camera (rad) before displacement of its
+            centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C).
+        residual_rms_px: of the inliers.
+        variance_factor: chi-square per degree of freedom of the residuals against 1 px and the points'
+            own covariance; the covariance is scaled by it.
+    """
+
+    covariance: FloatArray
+    residual_rms_px: float
+    variance_factor: float
+
+
+def pose_uncertainty(
+    pixels: FloatArray, points: FloatArray, point_covariance: FloatArray, pose: PoseHypothesis
+) -> PoseUncertainty:
+    """From the Jacobian of the inliers, scaled by the measured residuals.
+
+    Args:
+        pixels, points: (k, 2), (k, 3) of the inliers only.
+        point_covariance: (k, 3, 3) in the area's frame.
+    """
+    by_point, by_pose = pixel_jacobians(pose.camera, pose.cam_from_local, points)
+    residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
+    noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
+    weight = np.linalg.inv(noise)
+    information = np.einsum("nij,nik,nkl->jl", by_pose, weight, by_pose)
+    chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
+    factor = chi_square / max(2 * len(points) - 6, 1)
+    covariance = np.linalg.pinv(information, hermitian=True) * factor
+    if pose.calibrated_covariance is not None:
+        covariance = pose.calibrated_covariance
+    return PoseUncertainty(
+        covariance=covariance,
+        residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
+        variance_factor=factor,
+    )
+
+
+def _poselib_camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "params": list(camera.params),
+    }
+
+
+def _from_pycolmap(rigid: Any) -> Rigid3:
+    return Rigid3.from_matrix(rigid.matrix())

@@ -1,0 +1,155 @@
+"""Pose and lens together, where the lens is not known: robust least squares with priors on the intrinsics.
+
+A photo of a nearly flat scene hardly tells focal length from height, nor a curved field from a bent lens.
+The priors keep the estimate where lenses are, and the covariance says what the photo could not tell.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from reloc.jacobians import intrinsics_jacobian, pixel_jacobians
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensPriors:
+    """Standard deviations of what is known of a lens before the photo is looked at.
+
+    Attributes:
+        exif_focal_rel: EXIF focal lengths miss the true one by cropped video-like modes and by rounding of
+            the 35 mm equivalent: on `brighton` by 26 %, on well-behaved cameras by 1 to 3 %.
+        unknown_focal_rel: without EXIF: a factor of two either way.
+        radial: k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1.
+        center_rel: principal points of consumer cameras lie within 1 % of the longer side of the middle.
+    """
+
+    exif_focal_rel: float = 0.15
+    unknown_focal_rel: float = 0.7
+    radial: float = 0.04
+    center_rel: float = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibrated:
+    """Pose and camera with the covariance (6, 6) of the pose, intrinsics marginalised; as in
+    pixel_jacobians."""
+
+    cam_from_local: Rigid3
+    camera: Camera
+    covariance: FloatArray
+
+
+def calibrate(
+    pixels: FloatArray,
+    points: FloatArray,
+    start_pose: Rigid3,
+    start_camera: Camera,
+    prior_focal_px: float,
+    focal_sigma_rel: float,
+    noise_px: float,
+    priors: LensPriors,
+) -> Calibrated:
+    """Refine pose, focal length, radial distortion and principal point of a SIMPLE_RADIAL camera.
+
+    Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
+
+    Args:
+        pixels, points: (k, 2), (k, 3), mostly inliers.
+        noise_px: residuals of this size are normal; scale of the Cauchy loss.
+
+    Raises:
+        InvalidValueError: the camera is not SIMPLE_RADIAL.
+    """
+    if start_camera.model != "SIMPLE_RADIAL":
+        raise InvalidValueError(f"calibrate: expected a SIMPLE_RADIAL camera, found {start_camera.model}")
+    pose, camera = start_pose, start_camera
+    longer = max(camera.width, camera.height)
+    prior_mean = np.array([prior_focal_px, camera.width / 2, camera.height / 2, 0.0])
+    prior_sigma = np.array(
+        [
+            focal_sigma_rel * prior_focal_px,
+            priors.center_rel * longer,
+            priors.center_rel * longer,
+            priors.radial,
+        ]
+    )
+    problem = _Problem(
+        pixels=pixels, points=points, noise_px=noise_px, prior_mean=prior_mean, prior_sigma=prior_sigma
+    )
+    damping = 1e-4
+    cost = problem.cost(pose, camera)
+    system = problem.linearise(pose, camera)
+    for _ in range(15):
+        step = np.linalg.solve(
+            system.information + damping * np.diag(np.diag(system.information)), system.gradient
+        )
+        moved_pose, moved_camera = _step(pose, camera, step)
+        moved_cost = problem.cost(moved_pose, moved_camera)
+        if moved_cost > cost:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        done = cost - moved_cost < 1e-6 * cost
+        pose, camera, cost, damping = moved_pose, moved_camera, moved_cost, 0.3 * damping
+        system = problem.linearise(pose, camera)
+        if done:
+            break
+    covariance = np.linalg.inv(system.information)
+    return Calibrated(cam_from_local=pose, camera=camera, covariance=covariance[:6, :6])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _System:
+    """Normal equations of one Levenberg-Marquardt step: (10, 10) and (10,)."""
+
+    information: FloatArray
+    gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Problem:
+    """Measurements and priors; parameters are pose (6) then focal, centre x, centre y, radial."""
+
+    pixels: FloatArray
+    points: FloatArray
+    noise_px: float
+    prior_mean: FloatArray
+    prior_sigma: FloatArray
+
+    def cost(self, pose: Rigid3, camera: Camera) -> float:
+        """Half the Cauchy loss in units of the noise plus half the priors' chi-square."""
+        residual = camera.project(pose.act(self.points)) - self.pixels
+        squared = np.sum(residual**2, axis=1) / self.noise_px**2
+        squared = np.where(np.isfinite(squared), squared, 1e6)
+        prior = ((np.asarray(camera.params) - self.prior_mean) / self.prior_sigma) ** 2
+        return 0.5 * float(np.log1p(squared).sum() + prior.sum())
+
+    def linearise(self, pose: Rigid3, camera: Camera) -> _System:
+        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2)."""
+        in_camera = pose.act(self.points)
+        front = in_camera[:, 2] > 0.1
+        steps = np.array([1e-4 * camera.params[0], 0.1, 0.1, 1e-4])
+        _, by_pose = pixel_jacobians(camera, pose, self.points[front])
+        jacobian = np.concatenate([by_pose, intrinsics_jacobian(camera, in_camera[front], steps)], axis=2)
+        residual = self.pixels[front] - camera.project(in_camera[front])
+        weight = 1.0 / (1.0 + np.sum(residual**2, axis=1) / self.noise_px**2) / self.noise_px**2
+        information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
+        gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
+        information[6:, 6:] += np.diag(1.0 / self.prior_sigma**2)
+        gradient[6:] += (self.prior_mean - np.asarray(camera.params)) / self.prior_sigma**2
+        return _System(information=information, gradient=gradient)
+
+
+def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:
+    rotation = pose.rotation @ so3_exp(delta[:3]).T
+    center = pose.center + delta[3:6]
+    params = np.asarray(camera.params) + delta[6:]
+    params[0] = np.clip(params[0], 0.7 * camera.params[0], 1.4 * camera.params[0])  # one step's reach
+    moved = Camera(model=camera.model, width=camera.width, height=camera.height, params=tuple(params))
+    return Rigid3(rotation=rotation, translation=-rotation @ center), moved
