@@ -22,6 +22,10 @@ logger = logging.getLogger(__name__)
 # orphans; it is well below the vacuum's shortest default grace of a day.
 LONGEST_COMMIT = timedelta(hours=6)
 
+# Keys of what a commit to `maps` says about itself.
+OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
+KEPT_FROM = "featuredb.kept_from"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CommitResult:
@@ -108,16 +112,10 @@ class Database:
             SnapshotNotFoundError: no such version, before the first one, or removed by vacuum.
         """
         maps = self.table(MAPS)
-        commits = {commit.version: commit for commit in maps.commits()}
-        version = maps.version if as_of is None else _version_as_of(as_of, commits)
-        if version != maps.version:
-            maps = self.table(MAPS, version)
-        return Snapshot(
-            version=version,
-            timestamp=commits[version].timestamp,
-            rows=_read_rows(maps),
-            children={name: self.table(name) for name in CHILD_TABLES},
-        )
+        if as_of is None:
+            return self._snapshot_of(maps, maps.commits(limit=1)[0])
+        commit = _commit_as_of(as_of, maps.commits())
+        return self._snapshot_of(self.table(MAPS, commit.version), commit)
 
     def poll_version(self) -> int:
         """Number of the newest snapshot: one look at the log, no data read."""
@@ -156,7 +154,7 @@ class Database:
 
         def attempt() -> list[CommitResult]:
             maps = self.table(MAPS)
-            rows = _read_rows(maps)
+            rows = read_rows(maps)
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
             for feature_map in pending:
@@ -167,7 +165,9 @@ class Database:
             version = maps.version
             if pending:
                 change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces)
-                version = _apply(maps, change, operation="commit", maps_changed=[m.map_id for m in pending])
+                version = apply_change(
+                    maps, change, operation="commit", maps_changed=[m.map_id for m in pending]
+                )
             written = {m.map_id: encoded[m.map_id].row["write_id"] for m in pending}
             return [
                 CommitResult(
@@ -193,8 +193,8 @@ class Database:
 
         def attempt() -> int:
             maps = self.table(MAPS)
-            change, retired[:] = retire_map(_read_rows(maps), map_id, reason)
-            return _apply(maps, change, operation="retire", maps_changed=retired, reason=reason)
+            change, retired[:] = retire_map(read_rows(maps), map_id, reason)
+            return apply_change(maps, change, operation="retire", maps_changed=retired, reason=reason)
 
         retry_stale(f"retire {map_id}", attempt)
         return tuple(retired)
@@ -210,7 +210,7 @@ class Database:
             maps = self.table(MAPS)
             old = self.snapshot(as_of)
             change = Change(rows=old.rows(), added=[], only_adds=False)
-            return _apply(
+            return apply_change(
                 maps, change, operation="rollback", maps_changed=[], reason=f"to version {old.version}"
             )
 
@@ -222,12 +222,20 @@ class Database:
             HistoryEntry(
                 version=commit.version,
                 timestamp=commit.timestamp,
-                operation=commit.metadata.get("featuredb.operation", _OPERATIONS.get(commit.operation, "")),
-                maps=tuple(filter(None, commit.metadata.get("featuredb.maps", "").split("\n"))),
-                reason=commit.metadata.get("featuredb.reason", ""),
+                operation=commit.metadata.get(OPERATION, _OPERATIONS.get(commit.operation, "")),
+                maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
+                reason=commit.metadata.get(REASON, ""),
             )
             for commit in self.table(MAPS).commits()
         ]
+
+    def _snapshot_of(self, maps: Table, commit: Commit) -> Snapshot:
+        return Snapshot(
+            version=commit.version,
+            timestamp=commit.timestamp,
+            rows=read_rows(maps),
+            children={name: self.table(name) for name in CHILD_TABLES},
+        )
 
     def _write_children(self, feature_map: FeatureMap) -> EncodedMap:
         """Write the rows that stay invisible until a row of `maps` names them."""
@@ -279,7 +287,7 @@ def _already_there(
     return row
 
 
-def _read_rows(maps: Table) -> list[Row]:
+def read_rows(maps: Table) -> list[Row]:
     try:
         rows: list[Row] = maps.dataset().to_table().to_pylist()
     except FileNotFoundError as error:
@@ -291,33 +299,46 @@ def _read_rows(maps: Table) -> list[Row]:
     return rows
 
 
-def _version_as_of(as_of: int | datetime, commits: Mapping[int, Commit]) -> int:
+def _commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
+    """The commit of a number, or the newest at a time; commits come newest first."""
+    first_kept = oldest_kept_version(commits)
+    readable = [commit for commit in commits if commit.version >= first_kept]
     if isinstance(as_of, datetime):
         if as_of.tzinfo is None:
             raise SnapshotNotFoundError(f"expected a time with a time zone, found {as_of.isoformat()}")
-        earlier = [version for version, commit in commits.items() if commit.timestamp <= as_of]
-        if not earlier:
-            raise SnapshotNotFoundError(f"the database has no version as old as {as_of.isoformat()}")
-        return max(earlier)
-    if as_of not in commits:
+        fitting = [commit for commit in readable if commit.timestamp <= as_of]
+    else:
+        fitting = [commit for commit in readable if commit.version == as_of]
+    if not fitting:
         raise SnapshotNotFoundError(
-            f"expected a version from {min(commits)} to {max(commits)}, found {as_of}; "
-            "`featuredb history` lists them"
+            f"expected a version from {readable[-1].version} ({readable[-1].timestamp.isoformat()}) to "
+            f"{readable[0].version}, found {as_of}; `featuredb history` lists them, older ones were vacuumed"
         )
-    return as_of
+    return fitting[0]
 
 
-def _apply(
-    maps: Table, change: Change, *, operation: str, maps_changed: Sequence[str], reason: str = ""
+def oldest_kept_version(commits: Sequence[Commit]) -> int:
+    """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
+    return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
+
+
+def apply_change(
+    maps: Table,
+    change: Change,
+    *,
+    operation: str,
+    maps_changed: Sequence[str],
+    reason: str = "",
+    extra: Mapping[str, str] | None = None,
 ) -> int:
-    """Commit a change as the very next version, or raise StaleVersionError."""
-    metadata = {
-        "featuredb.operation": operation,
-        "featuredb.maps": "\n".join(maps_changed),
-        "featuredb.reason": reason,
-    }
+    """Commit a change as the very next version and return its number.
+
+    Raises:
+        StaleVersionError: someone else committed since `maps` was read.
+    """
     if change.only_adds and not change.added:
         return maps.version
+    metadata = {OPERATION: operation, CHANGED: "\n".join(maps_changed), REASON: reason, **(extra or {})}
     if change.only_adds:
         return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
     return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)

@@ -178,8 +178,8 @@ class Table:
             for row in rows
         ]
 
-    def commits(self) -> list[Commit]:
-        """The log, newest first."""
+    def commits(self, limit: int | None = None) -> list[Commit]:
+        """The log, newest first; each entry is one small file to read."""
         return [
             Commit(
                 version=entry["version"],
@@ -187,7 +187,7 @@ class Table:
                 operation=str(entry.get("operation", "")),
                 metadata={k: str(v) for k, v in entry.items() if k.startswith("featuredb.")},
             )
-            for entry in self._delta.history()
+            for entry in self._delta.history(limit)
         ]
 
     def append(self, rows: pa.Table) -> None:

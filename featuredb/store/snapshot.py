@@ -1,14 +1,13 @@
 """One version of a database, for reading. Nothing that is committed later shows in it."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
 
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from featuredb.errors import FeatureDbError, MapNotFoundError, StoreError
+from featuredb.errors import MapNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map
@@ -120,9 +119,11 @@ class Snapshot:
         row = self._row(map_id)
         return decode_map(row, {name: self._batches(name, row) for name in CHILD_TABLES})
 
-    def dataset(self, table: str) -> ds.Dataset:
-        """The child rows that this snapshot sees, retired maps included; read lazily."""
-        write_ids = [row["write_id"] for row in self._rows.values()]
+    def dataset(self, table: str, *, include_retired: bool = True) -> ds.Dataset:
+        """The child rows that this snapshot sees, as an Arrow dataset that reads when asked."""
+        write_ids = [
+            row["write_id"] for row in self._rows.values() if include_retired or row["status"] != RETIRED
+        ]
         return (
             self._children[table]
             .dataset()
@@ -140,19 +141,26 @@ class Snapshot:
             )
         return self._rows[map_id]
 
-    def _batches(self, table: str, row: Row) -> Iterable[pa.RecordBatch]:
+    def _batches(self, table: str, row: Row) -> list[pa.RecordBatch]:
         """The map's rows of one child table, from the few files that can hold them."""
-        pruning: list[tuple[str, str, Any]] = [("write_id", "=", row["write_id"])]
         try:
-            dataset = self._children[table].dataset(pruning)
-            wanted = ds.field("write_id") == row["write_id"]
-            yield from dataset.to_batches(filter=wanted, use_threads=False)
-        except (OSError, ValueError) as error:
-            if isinstance(error, FeatureDbError):
-                raise
+            try:
+                return self._read(table, row["write_id"])
+            except FileNotFoundError:
+                # Compacted and vacuumed since this snapshot was taken: the same rows, in newer files.
+                self._children[table].refresh()
+                return self._read(table, row["write_id"])
+        except (OSError, pa.ArrowException) as error:
             raise StoreError(
                 f"map {row['map_id']}: cannot read its {table} ({error}); run `featuredb verify`"
             ) from error
+
+    def _read(self, table: str, write_id: str) -> list[pa.RecordBatch]:
+        dataset = self._children[table].dataset([("write_id", "=", write_id)])
+        batches: list[pa.RecordBatch] = dataset.to_table(
+            filter=ds.field("write_id") == write_id, use_threads=False
+        ).to_batches()
+        return batches
 
 
 def _summary(row: Row) -> MapSummary:

@@ -1,0 +1,99 @@
+"""What subcommands share: the database argument and plain tables for people."""
+
+import argparse
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+
+from featuredb.errors import InvalidValueError
+from featuredb.store import Database
+
+LONGEST_CELL = 72  # a wider cell makes a table unreadable; csv and json give everything
+
+
+def add_database_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the positional DB and the options to reach it."""
+    parser.add_argument(
+        "db", metavar="DB", help="folder or URL of the database, e.g. maps.db, s3://bucket/maps"
+    )
+    parser.add_argument(
+        "--storage-option",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
+        help="option of the object store, e.g. AWS_ENDPOINT_URL=...; may be repeated",
+    )
+
+
+def storage_options(args: argparse.Namespace) -> dict[str, str]:
+    """The --storage-option values.
+
+    Raises:
+        InvalidValueError: one is not KEY=VALUE.
+    """
+    options = {}
+    for text in args.storage_option:
+        key, separator, value = text.partition("=")
+        if not separator or not key:
+            raise InvalidValueError(f"--storage-option: expected KEY=VALUE, found {text!r}")
+        options[key] = value
+    return options
+
+
+def open_database(args: argparse.Namespace) -> Database:
+    """The existing database that the arguments name."""
+    return Database.open(args.db, storage_options=storage_options(args))
+
+
+def version_or_time(text: str) -> int | datetime:
+    """A snapshot given by number, or by an ISO 8601 time (UTC where it names no zone)."""
+    if text.isdigit():
+        return int(text)
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"expected a version number or a time such as 2026-05-01T12:00, found {text!r}"
+        ) from error
+    return time if time.tzinfo else time.replace(tzinfo=UTC)
+
+
+def hours(text: str) -> float:
+    """A number of hours, >= 0."""
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected a number of hours, found {text!r}") from error
+    if not 0 <= value < 1e6:
+        raise argparse.ArgumentTypeError(f"expected 0 <= hours < 1000000, found {text}")
+    return value
+
+
+def format_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """Columns aligned for reading, numbers to the right."""
+    body = [list(row) for row in rows]
+    cells = [list(header), *([_cell(value) for value in row] for row in body)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
+    right = [
+        bool(body) and all(isinstance(row[i], int | float) or row[i] is None for row in body)
+        for i in range(len(header))
+    ]
+    lines = [
+        "  ".join(
+            c.rjust(w) if r else c.ljust(w) for c, w, r in zip(row, widths, right, strict=True)
+        ).rstrip()
+        for row in cells
+    ]
+    lines.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join(lines) + "\n"
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    if isinstance(value, datetime):
+        return value.strftime("%Y-%m-%d %H:%M:%S")
+    text = value.hex() if isinstance(value, bytes) else str(value)
+    text = text.replace("\n", " ")
+    return text if len(text) <= LONGEST_CELL else text[: LONGEST_CELL - 1] + "…"

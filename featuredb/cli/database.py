@@ -1,0 +1,237 @@
+"""The commands that keep a database: init, maps, history, sql, verify, retire, rollback, compact, vacuum."""
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Callable
+from datetime import date, datetime
+from typing import Any
+
+from featuredb.cli.common import (
+    add_database_argument,
+    format_table,
+    hours,
+    open_database,
+    storage_options,
+    version_or_time,
+)
+from featuredb.store import Database
+from featuredb.store.maintenance import VacuumOptions, compact, vacuum
+from featuredb.store.sql import SqlResult, SqlSession
+from featuredb.store.verify import verify
+
+_DEFAULTS = VacuumOptions()
+
+
+def register(subparsers: Any) -> None:
+    """Add the database commands to the parser of `featuredb`."""
+    _command(subparsers, "init", run_init, "make an empty database")
+    maps = _command(subparsers, "maps", run_maps, "list the maps")
+    maps.add_argument("--all", action="store_true", help="retired maps, too")
+    _add_as_of(maps)
+    maps.add_argument("--json", action="store_true", help="everything that is known, as JSON")
+    _command(subparsers, "history", run_history, "list the versions of the database")
+    sql = _command(
+        subparsers,
+        "sql",
+        run_sql,
+        "read by SQL (DuckDB): maps, images, cameras, points, observations",
+        epilog='example: featuredb sql DB "select tile, count(*) from points group by tile"; see docs/sql.md',
+    )
+    sql.add_argument("query", metavar="SELECT", help="one reading statement")
+    sql.add_argument("--format", choices=("table", "csv", "json"), default="table", help="default: table")
+    _add_as_of(sql)
+    check = _command(
+        subparsers, "verify", run_verify, "check every file, row and reference; exit 1 if broken"
+    )
+    check.add_argument("--json", action="store_true", help="the report as JSON")
+    retire = _command(
+        subparsers, "retire", run_retire, "take a map out of service, with all that hangs on it"
+    )
+    retire.add_argument("map_id", metavar="MAP")
+    retire.add_argument("--reason", required=True, help="kept with the map")
+    rollback = _command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
+    rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
+    _command(subparsers, "compact", run_compact, "merge small files")
+    _register_vacuum(subparsers)
+
+
+def run_init(args: argparse.Namespace) -> int:
+    database = Database.create(args.db, storage_options=storage_options(args))
+    sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
+    return 0
+
+
+def run_maps(args: argparse.Namespace) -> int:
+    snapshot = open_database(args).snapshot(args.as_of)
+    maps = snapshot.maps(include_retired=args.all)
+    if args.json:
+        wanted = {m.map_id for m in maps}
+        rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
+        _write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
+        return 0
+    header = ("map", "name", "status", "method", "gen", "epsg", "images", "points", "residual_m", "committed")
+    rows_ = [
+        (
+            m.map_id, m.name, m.status, m.method, m.generation, m.epsg, m.images, m.points,
+            round(m.residual_rms_m, 3), m.created_at,
+        )
+        for m in maps
+    ]  # fmt: skip
+    sys.stdout.write(format_table(header, rows_))
+    return 0
+
+
+def run_history(args: argparse.Namespace) -> int:
+    rows = [
+        (e.version, e.timestamp, e.operation, ", ".join(e.maps), e.reason)
+        for e in open_database(args).history()
+    ]
+    sys.stdout.write(format_table(("version", "time", "operation", "maps", "reason"), rows))
+    return 0
+
+
+def run_sql(args: argparse.Namespace) -> int:
+    with SqlSession(open_database(args).snapshot(args.as_of)) as session:
+        write_result(session.query(args.query), args.format)
+    return 0
+
+
+def run_verify(args: argparse.Namespace) -> int:
+    report = verify(open_database(args))
+    if args.json:
+        _write_json(
+            {
+                "ok": report.ok,
+                "version": report.version,
+                "maps": report.maps,
+                "files": report.files,
+                "rows": report.rows,
+                "problems": [{"where": p.where, "what": p.what} for p in report.problems],
+                "orphans": list(report.orphans),
+            }
+        )
+        return 0 if report.ok else 1
+    for problem in report.problems:
+        sys.stdout.write(f"PROBLEM {problem.where}: {problem.what}\n")
+    for orphan in report.orphans:
+        sys.stdout.write(f"orphan rows of write {orphan}: harmless, `featuredb vacuum` removes them\n")
+    verdict = "sound" if report.ok else f"{len(report.problems)} problems"
+    sys.stdout.write(
+        f"version {report.version}: {report.maps} maps, {report.files} files, {report.rows} rows: {verdict}\n"
+    )
+    return 0 if report.ok else 1
+
+
+def run_retire(args: argparse.Namespace) -> int:
+    retired = open_database(args).retire(args.map_id, args.reason)
+    sys.stdout.write(f"retired: {', '.join(retired) if retired else 'nothing, it was retired already'}\n")
+    return 0
+
+
+def run_rollback(args: argparse.Namespace) -> int:
+    sys.stdout.write(f"version {open_database(args).rollback(args.version)}\n")
+    return 0
+
+
+def run_compact(args: argparse.Namespace) -> int:
+    for table, saved in compact(open_database(args)).items():
+        sys.stdout.write(f"{table}: {saved} files less\n")
+    return 0
+
+
+def run_vacuum(args: argparse.Namespace) -> int:
+    options = VacuumOptions(
+        history_h=args.keep_history_hours,
+        orphan_grace_h=args.orphan_grace_hours,
+        file_grace_h=args.file_grace_hours,
+    )
+    report = vacuum(open_database(args), options, dry_run=args.dry_run)
+    would = "would remove" if report.dry_run else "removed"
+    sys.stdout.write(
+        f"{would} {len(report.files)} files and the rows of {len(report.write_ids)} writes that no map "
+        f"names; versions from {report.kept_from} on stay readable\n"
+    )
+    return 0
+
+
+def write_result(result: SqlResult, output: str) -> None:
+    """Write a query's rows to stdout as table, csv or json; the latter two row by row."""
+    if output == "table":
+        sys.stdout.write(format_table(result.columns, result.rows))
+    elif output == "csv":
+        writer = csv.writer(sys.stdout, lineterminator="\n")
+        writer.writerow(result.columns)
+        for row in result.rows:
+            writer.writerow([v.hex() if isinstance(v, bytes) else v for v in row])
+    else:
+        sys.stdout.write("[")
+        for count, row in enumerate(result.rows):
+            sys.stdout.write(",\n" if count else "\n")
+            sys.stdout.write(_json_text(dict(zip(result.columns, row, strict=True))))
+        sys.stdout.write("\n]\n")
+
+
+def _command(
+    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text, epilog=epilog)
+    add_database_argument(parser)
+    parser.set_defaults(run=run)
+    return parser
+
+
+def _register_vacuum(subparsers: Any) -> None:
+    parser = _command(subparsers, "vacuum", run_vacuum, "remove what no snapshot needs any more")
+    parser.add_argument(
+        "--keep-history-hours",
+        type=hours,
+        default=_DEFAULTS.history_h,
+        help="snapshots of this time stay readable (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--orphan-grace-hours",
+        type=hours,
+        default=_DEFAULTS.orphan_grace_h,
+        help="rows of unfinished commits stay this long (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--file-grace-hours",
+        type=hours,
+        default=_DEFAULTS.file_grace_h,
+        help="unused files stay this long for running readers (default: %(default)s)",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="only say what would be removed")
+
+
+def _add_as_of(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--as-of",
+        type=version_or_time,
+        metavar="VERSION",
+        help="an earlier version, by number or ISO 8601 time (UTC unless it says otherwise)",
+    )
+
+
+def _write_json(value: Any) -> None:
+    sys.stdout.write(_json_text(value, indent=2) + "\n")
+
+
+def _json_text(value: Any, indent: int | None = None) -> str:
+    return json.dumps(_plain(value), indent=indent, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: times as ISO 8601, bytes as hex, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, float):
+        return value if abs(value) < float("inf") else None
+    return value if isinstance(value, bool | int | str | None) else str(value)

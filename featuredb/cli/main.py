@@ -1,0 +1,110 @@
+"""`featuredb`: finds the subcommands, parses, runs, and turns errors into messages and exit codes.
+
+A package adds subcommands by an entry point of the group "featuredb.commands" that names a function
+`register(subparsers)`. It calls `subparsers.add_parser(...)` and `parser.set_defaults(run=function)`;
+`function(args)` does the work and returns an exit code, None for 0. It raises FeatureDbError for what a user
+can do something about.
+
+Exit codes: 0 done; 1 done, and the answer is no (damage found, not localised); 2 wrong usage or a
+FeatureDbError; 70 a defect of the program; 130 interrupted.
+"""
+
+import argparse
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, version
+from typing import Any
+
+from featuredb.errors import FeatureDbError
+
+logger = logging.getLogger(__name__)
+
+COMMAND_GROUP = "featuredb.commands"
+EXIT_NO, EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 1, 2, 70, 130
+LOG_LEVELS = ("debug", "info", "warning", "error")
+
+Register = Callable[[Any], None]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code."""
+    common, rest = _common_parser().parse_known_args(sys.argv[1:] if argv is None else list(argv))
+    _configure_logging("debug" if common.debug else common.log_level)
+    parser = build_parser(entry_points(group=COMMAND_GROUP))
+    try:
+        args = parser.parse_args(rest)
+    except SystemExit as stop:  # argparse has printed help or the error
+        return int(stop.code or 0)
+    args.debug, args.log_level = common.debug, common.log_level
+    return run_command(args.run, args)
+
+
+def build_parser(commands: Iterable[EntryPoint]) -> argparse.ArgumentParser:
+    """The parser with all subcommands that can be loaded; one that cannot is reported and left out."""
+    parser = argparse.ArgumentParser(
+        prog="featuredb",
+        description="Geo-registered feature maps and visual relocalisation.",
+        parents=[_common_parser()],
+    )
+    parser.add_argument("--version", action="version", version=f"featuredb {_version()}")
+    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in sorted(commands, key=lambda c: c.name):
+        try:
+            register: Register = command.load()
+            register(subparsers)
+        except Exception as error:  # a plugin may fail in any way, and the others must live
+            logger.warning("commands %r are not available: %s: %s", command.name, type(error).__name__, error)
+            logger.debug("loading %s failed", command.value, exc_info=True)
+    return parser
+
+
+def run_command(run: Callable[[argparse.Namespace], int | None], args: argparse.Namespace) -> int:
+    """Run one subcommand; errors become one line on stderr, with a traceback only when debugging."""
+    try:
+        code = run(args)
+        sys.stdout.flush()
+        return code or 0
+    except FeatureDbError as error:
+        logger.debug("%s", error, exc_info=True)
+        sys.stderr.write(f"featuredb: {error}\n")
+        return EXIT_ERROR
+    except KeyboardInterrupt:
+        sys.stderr.write("featuredb: interrupted\n")
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # The reader of our output (`| head`) has seen enough. Python would complain again at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception:
+        logger.exception("a defect of the program; please report it with the lines below")
+        return EXIT_DEFECT
+
+
+def _version() -> str:
+    try:
+        return version("featuredb")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _common_parser() -> argparse.ArgumentParser:
+    """Options that stand anywhere on the command line."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--debug", action="store_true", help="log everything, show tracebacks of errors")
+    parser.add_argument("--log-level", choices=LOG_LEVELS, default="warning", help="default: warning")
+    return parser
+
+
+def _configure_logging(level: str) -> None:
+    """Log to stderr; the libraries below only speak when something is wrong."""
+    logging.basicConfig(
+        stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s", level=logging.WARNING
+    )
+    for package in ("featuredb", "ingest", "reloc"):
+        logging.getLogger(package).setLevel(level.upper())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

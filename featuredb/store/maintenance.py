@@ -1,0 +1,171 @@
+"""Compaction and vacuum: fewer files, and no rows that nothing can see any more."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+
+from featuredb.store.changes import Change
+from featuredb.store.database import (
+    KEPT_FROM,
+    Database,
+    apply_change,
+    oldest_kept_version,
+    read_rows,
+    write_time,
+)
+from featuredb.store.delta import Commit, Table, retry_stale
+from featuredb.store.tables import CHILD_TABLES, MAPS, TABLES
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VacuumOptions:
+    """How much of the past to keep.
+
+    Attributes:
+        history_h: snapshots that were newest within this time stay readable. 30 days: long enough to notice
+            that a merge was wrong and to roll it back.
+        orphan_grace_h: child rows without a map stay this long, since a running commit may be about to name
+            them. A day; commits give up after six hours. Take less only where nobody else writes.
+        file_grace_h: files that no snapshot uses stay this long for readers that have opened them. A day.
+    """
+
+    history_h: float = 24.0 * 30
+    orphan_grace_h: float = 24.0
+    file_grace_h: float = 24.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VacuumReport:
+    """What was removed, or with `dry_run` would be.
+
+    Attributes:
+        kept_from: oldest version that stays readable.
+        write_ids: of child rows that no kept version names.
+        files: paths of data files; with `dry_run` without those that only the removal of rows sets free.
+    """
+
+    kept_from: int
+    write_ids: tuple[str, ...]
+    files: tuple[str, ...]
+    dry_run: bool
+
+
+def compact(database: Database) -> dict[str, int]:
+    """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
+    saved = {}
+    for name in CHILD_TABLES:
+        saved[name] = database.table(name).compact()
+    saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
+    return saved
+
+
+def vacuum(
+    database: Database, options: VacuumOptions | None = None, *, dry_run: bool = False
+) -> VacuumReport:
+    """Remove what no kept snapshot can see: rows of crashed and replaced writes, files of old versions.
+
+    The commit to `maps` that says from which version on the past is kept comes first, so that nobody rolls
+    back to a version whose rows are about to go.
+
+    Raises:
+        ConflictError, StoreError
+    """
+    options = options or VacuumOptions()
+    now = datetime.now(UTC)
+    kept_from = retry_stale("vacuum", lambda: _announce(database, options, now, dry_run))
+    named = write_ids_of_history(database, kept_from)
+    grace = timedelta(hours=options.orphan_grace_h)
+    orphans: set[str] = set()
+    for name in CHILD_TABLES:
+        table = database.table(name)
+        found = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
+        if found and not dry_run:
+            table.delete_writes(found)
+        orphans |= found
+    return VacuumReport(
+        kept_from=kept_from,
+        write_ids=tuple(sorted(orphans)),
+        files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
+        dry_run=dry_run,
+    )
+
+
+def write_ids_of_history(database: Database, first_version: int) -> set[str]:
+    """All write ids that the versions from `first_version` on name."""
+    maps = database.table(MAPS)
+    named: set[str] = set()
+    seen_files: frozenset[str] = frozenset()
+    for version in range(maps.version, first_version - 1, -1):
+        table = database.table(MAPS, version)
+        files = frozenset(file.path for file in table.files())
+        if files - seen_files:  # otherwise it shows a part of what a newer version shows
+            named.update(row["write_id"] for row in read_rows(table))
+        seen_files |= files
+    return named
+
+
+def write_ids_in(table: Table) -> set[str]:
+    """All write ids that a child table holds: from the log where a file has one, else from the file."""
+    found: set[str] = set()
+    mixed = False
+    for file in table.files():
+        if file.min_write_id is not None and file.min_write_id == file.max_write_id:
+            found.add(file.min_write_id)
+        else:
+            mixed = True
+    if mixed:
+        unknown = ~ds.field("write_id").isin(sorted(found)) if found else None
+        for batch in table.dataset().to_batches(columns=["write_id"], filter=unknown, use_threads=False):
+            found.update(pc.unique(batch.column("write_id")).to_pylist())
+    return found
+
+
+def _compact_maps(database: Database) -> int:
+    maps = database.table(MAPS)
+    files = len(maps.files())
+    if files <= 1:
+        return 0
+    change = Change(rows=read_rows(maps), added=[], only_adds=False)
+    apply_change(maps, change, operation="compact", maps_changed=[])
+    return files - 1
+
+
+def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> int:
+    """Commit from which version on the past is kept; returns that version."""
+    maps = database.table(MAPS)
+    commits = maps.commits()
+    kept_from = _oldest_within(commits, now - timedelta(hours=options.history_h))
+    kept_from = max(kept_from, oldest_kept_version(commits))
+    if not dry_run and kept_from > oldest_kept_version(commits):
+        change = Change(rows=read_rows(maps), added=[], only_adds=False)
+        reason = f"versions before {kept_from} are gone"
+        apply_change(
+            maps,
+            change,
+            operation="vacuum",
+            maps_changed=[],
+            reason=reason,
+            extra={KEPT_FROM: str(kept_from)},
+        )
+    return kept_from
+
+
+def _oldest_within(commits: Iterable[Commit], cutoff: datetime) -> int:
+    """The version that was newest at the cutoff (all later ones are kept, too); 0 if none is so old."""
+    return max((commit.version for commit in commits if commit.timestamp <= cutoff), default=0)
+
+
+def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
+    files = []
+    for name in TABLES:
+        table = database.table(name)
+        # Versions of `maps` are kept by number; the newest child table serves all of them.
+        keep = range(kept_from, table.version + 1) if name == MAPS else ()
+        removed = table.vacuum(
+            timedelta(hours=options.file_grace_h), dry_run=dry_run, keep_versions=list(keep)
+        )
+        files += [f"{name}/{path}" for path in removed]
+    return files

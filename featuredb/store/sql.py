@@ -1,0 +1,96 @@
+"""Read-only SQL over one snapshot, by DuckDB. The home of duckdb.
+
+DuckDB sees Arrow datasets that show only rows of that snapshot, pulls the columns and row groups that a query
+needs, and has no way to files, network, extensions or settings.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any
+
+import duckdb
+import pyarrow as pa
+
+from featuredb.errors import StoreError
+from featuredb.store.encode import map_rows_table
+from featuredb.store.snapshot import Snapshot
+from featuredb.store.tables import CHILD_TABLES, MAPS
+
+VIEWS = (MAPS, *CHILD_TABLES, "cameras")
+_BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
+_ALLOWED = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
+
+_CAMERAS_VIEW = """
+    CREATE VIEW cameras AS
+    SELECT map_id, camera_id, c.model, c.width, c.height, c.params, camera_keys[camera_id + 1] AS camera_key
+    FROM (SELECT map_id, camera_keys, unnest(cameras) AS c, generate_subscripts(cameras, 1) - 1 AS camera_id
+          FROM stored_maps WHERE status <> 'retired')
+"""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SqlResult:
+    """Column names and the rows, which are computed while one iterates; once only."""
+
+    columns: tuple[str, ...]
+    rows: Iterator[tuple[Any, ...]]
+
+
+class SqlSession:
+    """DuckDB over one snapshot; a context manager.
+
+    Views: `maps` (retired ones included, see its column `status`); `images`, `points`, `observations` and
+    `cameras` of the maps that are not retired.
+    """
+
+    def __init__(self, snapshot: Snapshot) -> None:
+        self.snapshot = snapshot
+        self._connection = duckdb.connect(":memory:", config={"python_enable_replacements": "false"})
+        self._register()
+
+    def __enter__(self) -> "SqlSession":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._connection.close()
+
+    def query(self, text: str) -> SqlResult:
+        """Run one SELECT (or WITH, FROM, VALUES, DESCRIBE, SHOW, SUMMARIZE, EXPLAIN).
+
+        Raises:
+            StoreError: not one reading statement, or DuckDB refuses it; the message is DuckDB's.
+        """
+        try:
+            statements = self._connection.extract_statements(text)
+        except duckdb.Error as error:
+            raise StoreError(f"SQL: {error}") from error
+        if len(statements) != 1 or statements[0].type not in _ALLOWED:
+            found = ", ".join(s.type.name for s in statements) or "nothing"
+            raise StoreError(f"SQL: expected one SELECT, found {found}; this is read-only")
+        try:
+            self._connection.execute(statements[0])
+        except duckdb.Error as error:
+            raise StoreError(f"SQL: {error}") from error
+        columns = tuple(column[0] for column in self._connection.description or [])
+        return SqlResult(columns=columns, rows=self._fetch())
+
+    def _register(self) -> None:
+        rows = self.snapshot.rows()
+        self._connection.register("stored_maps", map_rows_table(rows))
+        self._connection.execute("CREATE VIEW maps AS SELECT * EXCLUDE (write_id) FROM stored_maps")
+        self._connection.execute(_CAMERAS_VIEW)
+        for name in CHILD_TABLES:
+            self._connection.register(f"stored_{name}", self.snapshot.dataset(name, include_retired=False))
+            self._connection.execute(f"CREATE VIEW {name} AS SELECT * EXCLUDE (write_id) FROM stored_{name}")
+        self._connection.execute("SET enable_external_access = false")
+        self._connection.execute("SET lock_configuration = true")
+
+    def _fetch(self) -> Iterator[tuple[Any, ...]]:
+        try:
+            while rows := self._connection.fetchmany(_BATCH_ROWS):
+                yield from rows
+        except (duckdb.Error, OSError, pa.ArrowException) as error:
+            raise StoreError(f"SQL: {error}") from error

@@ -1,0 +1,200 @@
+"""Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.dataset as ds
+
+from featuredb.errors import FeatureDbError
+from featuredb.geo.tiles import tile_of
+from featuredb.geometry.arrays import FloatArray
+from featuredb.store.database import Database, oldest_kept_version
+from featuredb.store.delta import Table
+from featuredb.store.encode import Row, content_digest
+from featuredb.store.maintenance import write_ids_in, write_ids_of_history
+from featuredb.store.snapshot import Snapshot
+from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, MAPS, OBSERVATIONS, POINTS, TABLES
+
+_LIGHT_COLUMNS = {
+    IMAGES: ["image_index", "image_id", "camera_id", "easting", "northing", "height", "zone", "tile"],
+    POINTS: ["point_index", "easting", "northing", "height", "zone", "tile"],
+    OBSERVATIONS: ["observation_index", "point_index", "image_id", "zone", "tile"],
+}
+_INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """One thing that is wrong: where (table and file, or map), and what."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerifyReport:
+    """What was looked at and what is wrong.
+
+    Attributes:
+        version: of the snapshot that was checked.
+        maps, files, rows: how many of each were checked.
+        problems: damage; empty in a sound database.
+        orphans: write ids of child rows that no version names, left by a crash or written just now by a
+            commit under way. No damage: nobody reads them, and `vacuum` removes them.
+    """
+
+    version: int
+    maps: int
+    files: int
+    rows: int
+    problems: tuple[Problem, ...]
+    orphans: tuple[str, ...]
+
+    @property
+    def ok(self) -> bool:
+        return not self.problems
+
+
+def verify(database: Database) -> VerifyReport:
+    """Check the newest snapshot; reads every file and every row of it once.
+
+    Raises:
+        StoreError: the table `maps` itself, without which nothing can be said, is not readable.
+    """
+    snapshot = database.snapshot()
+    problems: list[Problem] = []
+    files = rows = 0
+    for name in TABLES:
+        table = database.table(name)
+        live = table.files()
+        files += len(live)
+        rows += sum(file.rows for file in live)
+        problems += check_files(table)
+    for row in snapshot.rows():
+        problems += check_map(snapshot, row)
+    orphans = [] if problems else _orphans(database)
+    return VerifyReport(
+        version=snapshot.version,
+        maps=len(snapshot.rows()),
+        files=files,
+        rows=rows,
+        problems=tuple(problems),
+        orphans=tuple(orphans),
+    )
+
+
+def check_files(table: Table) -> Iterator[Problem]:
+    """Does every file open, and has it as many rows as the log says?"""
+    expected = {file.path: file.rows for file in table.files()}
+    for fragment in table.dataset().get_fragments():
+        where = f"{table.spec.name}/{fragment.path}"
+        try:
+            found = fragment.metadata.num_rows
+        except (OSError, pa.ArrowException) as error:
+            yield Problem(where=where, what=f"cannot be opened: {_one_line(error)}")
+            continue
+        if found != expected[fragment.path]:
+            yield Problem(
+                where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
+            )
+
+
+def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
+    """Do the child rows of one map agree with its row, with each other and with what was committed?"""
+    where = f"map {row['map_id']}"
+    mine = ds.field("write_id") == row["write_id"]
+    tables: dict[str, pa.Table] = {}
+    for name in CHILD_TABLES:
+        try:
+            tables[name] = snapshot.dataset(name).to_table(_LIGHT_COLUMNS[name], filter=mine)
+        except (OSError, pa.ArrowException) as error:
+            yield Problem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
+    if len(tables) < len(CHILD_TABLES):
+        return
+    found = [
+        *_check_counts(row, tables),
+        *_check_references(row, tables),
+        *_check_places(row, tables),
+    ]
+    yield from (Problem(where=where, what=what) for what in found)
+    if found:
+        return
+    try:
+        digest = content_digest(snapshot.load_map(row["map_id"]))
+    except FeatureDbError as error:
+        yield Problem(where=where, what=f"cannot be loaded: {_one_line(error)}")
+        return
+    if digest != row["content_digest"]:
+        yield Problem(where=where, what="its rows are not those that were committed: content digests differ")
+
+
+def _check_counts(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
+    for name, table in tables.items():
+        if len(table) != row[name]:
+            yield f"expected {row[name]} rows in {name}, found {len(table)}"
+        index = np.sort(table[_INDEX[name]].to_numpy())
+        if not np.array_equal(index, np.arange(len(table))):
+            yield f"{name}: {_INDEX[name]} is not each of 0 to {len(table) - 1} once"
+
+
+def _check_references(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
+    seen, images = tables[OBSERVATIONS], tables[IMAGES]
+    lost = pc.sum(pc.invert(pc.is_in(seen["point_index"], tables[POINTS]["point_index"]))).as_py()
+    if lost:
+        yield f"{lost} observations name a point that is not there"
+    lost = pc.sum(pc.invert(pc.is_in(seen["image_id"], images["image_id"]))).as_py()
+    if lost:
+        yield f"{lost} observations name an image that is not there"
+    camera = images["camera_id"].to_numpy()
+    lost = int(((camera < 0) | (camera >= len(row["cameras"]))).sum())
+    if lost:
+        yield f"{lost} images name a camera that is not there"
+
+
+def _check_places(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
+    """Coordinates finite and inside the map's box; zone and tile those of the coordinates."""
+    for name, table in tables.items():
+        if pc.any(pc.not_equal(table["zone"], row["epsg"])).as_py():
+            yield f"{name}: rows in another zone than {row['epsg']}"
+    for name in (IMAGES, POINTS):
+        utm = _utm(tables[name])
+        if not np.isfinite(utm).all():
+            yield f"{name}: coordinates that are not finite"
+            return
+        wrong = int((tile_of(utm) != tables[name]["tile"].to_numpy()).sum())
+        if wrong:
+            yield f"{name}: {wrong} rows in another tile than their coordinates'"
+    points = _utm(tables[POINTS])
+    if len(points):
+        low, high = [row[b] for b in BOUNDS[:3]], [row[b] for b in BOUNDS[3:]]
+        outside = int((~((points >= low) & (points <= high)).all(axis=1)).sum())
+        if outside:
+            yield f"{outside} points outside the map's box"
+    wrong = _observations_in_wrong_tile(tables)
+    if wrong:
+        yield f"observations: {wrong} rows in another tile than their point"
+
+
+def _observations_in_wrong_tile(tables: dict[str, pa.Table]) -> int:
+    points, seen = tables[POINTS], tables[OBSERVATIONS]
+    position = pc.index_in(seen["point_index"], points["point_index"])
+    known = pc.is_valid(position)
+    tiles = points["tile"].take(position.filter(known))
+    return int(pc.sum(pc.not_equal(tiles, seen["tile"].filter(known))).as_py() or 0)
+
+
+def _utm(table: pa.Table) -> FloatArray:
+    return np.column_stack([table[name].to_numpy() for name in ("easting", "northing", "height")])
+
+
+def _orphans(database: Database) -> list[str]:
+    first = oldest_kept_version(database.table(MAPS).commits())
+    present = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
+    return sorted(present - write_ids_of_history(database, first))
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]
