@@ -6,7 +6,7 @@ folder, keyed by name, size and modification time, spares that the next time.
 
 import hashlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,12 +17,12 @@ from featuredb.features.exif import read_exif
 from featuredb.features.image_header import check_signature
 from featuredb.maps.exif_prior import prior_from_exif
 from ingest.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
+from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photo import Photo
 from ingest.scan_cache import Examined, read_cache, write_cache
 from ingest.walk import FoundFile, walk
 
-Progress = Callable[[int, int], None]
 
 # Raised when the same file would be judged differently, so that old caches are not used.
 _VERSION = 1
@@ -83,7 +83,7 @@ class ScanResult:
 def scan_folder(
     folder: Path,
     options: ScanOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
     cache_file: Path | None = None,
 ) -> ScanResult:
     """Look at every file of a folder.
@@ -91,7 +91,7 @@ def scan_folder(
     Args:
         folder: the photos.
         options: default ScanOptions().
-        progress: called with the number of files done and of all files, from the calling thread.
+        progress: called as progress("scan", files done, all files).
         cache_file: where results are kept for the next run; None: nowhere.
 
     Raises:
@@ -112,7 +112,7 @@ def _examine_all(
     files: Sequence[FoundFile],
     known: dict[str, Examined],
     options: ScanOptions,
-    progress: Progress | None,
+    progress: Progress,
     cache_file: Path | None,
     key: str,
 ) -> tuple[dict[str, Examined], int]:
@@ -128,15 +128,13 @@ def _examine_all(
         else:
             todo.append(file)
     done = len(files) - len(todo)
-    if progress:
-        progress(done, len(files))
+    progress("scan", done, len(files))
     workers = options.workers or min(8, os.cpu_count() or 1)
     with ThreadPoolExecutor(workers, thread_name_prefix="scan") as pool:
         futures = {pool.submit(examine, file, options.limits): file for file in todo}
         for count, future in enumerate(as_completed(futures), start=1):
             results[futures[future].name] = future.result()
-            if progress:
-                progress(done + count, len(files))
+            progress("scan", done + count, len(files))
             if cache_file and count % _SAVE_EVERY == 0:
                 write_cache(cache_file, key, results)
     if cache_file and (todo or results.keys() != known.keys()):
