@@ -108,7 +108,7 @@ def visible_points(
     cosine = np.einsum("ij,ij->i", toward, area.view_direction[points])
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     cone = np.arccos(np.clip(area.view_spread_cos[points], -1.0, 1.0)) + np.radians(30.0)
-    return points[inside & (angle <= cone)]
+    return np.asarray(points[inside & (angle <= cone)], dtype=np.int64)
 
 
 def _one_to_one(

@@ -1,10 +1,9 @@
 """The wire's reply out of a localisation result."""
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.geo.geopose import BODY_AXES
 from reloc.result import Inliers, LocalisedPose, LocaliseResult
 from reloc.wire import (
     Accuracy,
@@ -45,10 +44,13 @@ def reply_from_result(
         snapshot=result.snapshot,
         timings_ms=timings_ms,
         request_id=request_id,
-        body_axes=BODY_AXES,
+        body_axes=_BODY_AXES,
         **fields,
     )
 
+
+# The same words as featuredb.geo.geopose.BODY_AXES; a test compares them.
+_BODY_AXES: Literal["x forward, y left, z up"] = "x forward, y left, z up"
 
 _NO_POSE: dict[str, Any] = {
     "position": None,

@@ -85,9 +85,8 @@ def calibrate(
     cost = problem.cost(pose, camera)
     system = problem.linearise(pose, camera)
     for _ in range(15):
-        step = np.linalg.solve(
-            system.information + damping * np.diag(np.diag(system.information)), system.gradient
-        )
+        damped = system.information + damping * np.diag(np.diag(system.information))
+        step: FloatArray = np.linalg.solve(damped, system.gradient).astype(np.float64)
         moved_pose, moved_camera = _step(pose, camera, step)
         moved_cost = problem.cost(moved_pose, moved_camera)
         if moved_cost > cost:
@@ -100,7 +99,7 @@ def calibrate(
         system = problem.linearise(pose, camera)
         if done:
             break
-    covariance = np.linalg.inv(system.information)
+    covariance: FloatArray = np.linalg.inv(system.information).astype(np.float64)
     return Calibrated(cam_from_local=pose, camera=camera, covariance=covariance[:6, :6])
 
 

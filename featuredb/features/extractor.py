@@ -6,6 +6,7 @@ The half pixel between OpenCV (centre of the top-left pixel at (0, 0)) and this 
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -85,7 +86,8 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     if min(height, width) < 32:
         raise ImageError(f"extract: expected at least 32x32 pixels, found {width}x{height}")
     small = _shrink(gray, options.max_side_px)
-    sift = cv2.SIFT_create(
+    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
+    sift = create(
         # OpenCV keeps the strongest; describing them in the same pass shares the scale pyramid.
         nfeatures=0 if options.upright else int(_POOL * options.max_features),
         nOctaveLayers=_OCTAVE_LAYERS,
@@ -100,7 +102,7 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
         keypoints, raw = sift.detectAndCompute(small, None)
     if not keypoints:
         return _features([], np.zeros((0, 128), np.uint8), gray.shape, small.shape, options)
-    xy = cv2.KeyPoint.convert(keypoints)
+    xy = np.asarray(cv2.KeyPoint.convert(keypoints), dtype=np.float32)
     response = np.array([k.response for k in keypoints], dtype=np.float32)
     rows = spread_strongest(xy, response, small.shape[1], small.shape[0], options.max_features)
     return _features([keypoints[i] for i in rows], rootsift_8bit(raw[rows]), gray.shape, small.shape, options)
@@ -112,7 +114,7 @@ def rootsift_8bit(sift: NDArray[np.float32]) -> NDArray[np.uint8]:
     round(512 sqrt(d / |d|_1)) clipped to 255, as COLMAP has it: length 512 up to clipping and rounding.
     """
     total = np.maximum(sift.sum(axis=1, keepdims=True), np.float32(1e-9))
-    return np.clip(np.rint(512.0 * np.sqrt(sift / total)), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(512.0 * np.sqrt(sift / total)), 0, 255), dtype=np.uint8)
 
 
 def _shrink(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:

@@ -208,7 +208,7 @@ def _mean_descriptors(
     """Mean descriptor of each track, brought back to length 512 and 8 bits."""
     total = _sum_by(point, descriptors.astype(np.float32), count)
     norm = np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
-    return np.clip(np.rint(total * (512.0 / norm)), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(total * (512.0 / norm)), 0, 255), dtype=np.uint8)
 
 
 def _sum_by(group: NDArray[np.intp], values: NDArray[np.floating], count: int) -> FloatArray:

@@ -117,7 +117,7 @@ def load_or_build(
 
 def _read(path: Path, expected: int, options: IndexOptions) -> DescriptorIndex:
     mmap = path.stat().st_size >= options.mmap_from_bytes
-    index = faiss.read_index(str(path), faiss.IO_FLAG_MMAP | faiss.IO_FLAG_READ_ONLY if mmap else 0)
+    index: Any = faiss.read_index(str(path), faiss.IO_FLAG_MMAP | faiss.IO_FLAG_READ_ONLY if mmap else 0)
     if index.ntotal != expected or index.d != DESCRIPTOR_SIZE:
         raise StoreError(
             f"expected {expected} descriptors of {DESCRIPTOR_SIZE} bytes, found {index.ntotal} of {index.d}"

@@ -1,0 +1,170 @@
+"""The active maps of one snapshot, indexed and ready to answer."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.index.area import build_area
+from featuredb.index.descriptor_index import load_or_build
+from featuredb.store import Database, MapSummary, Snapshot
+from reloc.candidates import IndexedArea
+from reloc.localise import localise
+from reloc.options import LocaliseOptions
+from reloc.result import LocaliseRequest, LocaliseResult
+
+_LOG = logging.getLogger(__name__)
+# Maps whose boxes come this close belong to one area: a photo may see both.
+_AREA_GAP_M = 300.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Loaded:
+    """One indexed area and what it was made of: the write ids of its maps, sorted."""
+
+    key: tuple[str, ...]
+    map_ids: frozenset[str]
+    indexed: IndexedArea
+
+
+class Localiser:
+    """Answers queries from one snapshot. Never changes; threads may share it."""
+
+    def __init__(self, loaded: Sequence[_Loaded], options: LocaliseOptions, snapshot: int) -> None:
+        self._loaded = tuple(loaded)
+        self._options = options
+        self._snapshot = snapshot
+
+    @classmethod
+    def open(
+        cls,
+        database: Database,
+        options: LocaliseOptions | None = None,
+        as_of: int | datetime | None = None,
+        *,
+        previous: "Localiser | None" = None,
+        cache: Path | None = None,
+    ) -> "Localiser":
+        """Load and index the active maps of a snapshot.
+
+        Args:
+            as_of: snapshot number or time; None: the newest.
+            previous: areas that have not changed since are taken over from it.
+            cache: folder for index files of large areas; None: indexes live in memory only.
+
+        Raises:
+            StoreError: the database cannot be read.
+        """
+        options = options or LocaliseOptions()
+        snapshot = database.snapshot(as_of)
+        active = [m for m in snapshot.maps() if m.status == "active" and m.descriptors and m.box]
+        known = {loaded.key: loaded for loaded in previous._loaded} if previous else {}
+        loaded = []
+        for group in _group(active):
+            key = tuple(sorted(m.write_id for m in group))
+            loaded.append(known[key] if key in known else _load(snapshot, group, key, cache))
+        return cls(loaded, options, snapshot.version)
+
+    @property
+    def snapshot(self) -> int:
+        """Version of the database that it answers from."""
+        return self._snapshot
+
+    @property
+    def areas(self) -> tuple[IndexedArea, ...]:
+        """All areas, of whatever extractor."""
+        return tuple(loaded.indexed for loaded in self._loaded)
+
+    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+        """Pose of the image (h, w) uint8, or the reason why there is none.
+
+        Raises:
+            MapNotFoundError: the request names maps that the snapshot does not serve.
+            IncompatibleExtractorError: all maps are of another extractor.
+            ImageError: not a usable image.
+        """
+        areas = self._chosen(request.map_ids)
+        fingerprint = self._options.extractor.fingerprint
+        matching = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
+        if areas and not matching:
+            found = ", ".join(sorted({a.area.extractor_fingerprint for a in areas}))
+            raise IncompatibleExtractorError(
+                f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
+                "cannot be compared; start the server with the extractor options of the ingest"
+            )
+        return localise(gray, request, matching, self._options, self._snapshot)
+
+    def _chosen(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
+        """The areas, or new ones of the named maps only."""
+        if map_ids is None:
+            return [loaded.indexed for loaded in self._loaded]
+        wanted = set(map_ids)
+        unknown = wanted - {m for loaded in self._loaded for m in loaded.map_ids}
+        if unknown:
+            raise MapNotFoundError(
+                f"snapshot {self._snapshot} serves no map {', '.join(sorted(unknown))}; "
+                "`featuredb maps` lists what there is"
+            )
+        chosen = []
+        for loaded in self._loaded:
+            if loaded.map_ids <= wanted:
+                chosen.append(loaded.indexed)
+            elif loaded.map_ids & wanted:
+                area = build_area([m for m in loaded.indexed.area.maps if m.map_id in wanted])
+                chosen.append(
+                    IndexedArea(area=area, index=load_or_build(area.descriptors, area.digest, None))
+                )
+        return chosen
+
+
+def _load(snapshot: Snapshot, group: list[MapSummary], key: tuple[str, ...], cache: Path | None) -> _Loaded:
+    area = build_area([snapshot.load_map(m.map_id) for m in group])
+    index = load_or_build(area.descriptors, area.digest, cache)
+    _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
+    return _Loaded(
+        key=key,
+        map_ids=frozenset(m.map_id for m in group),
+        indexed=IndexedArea(area=area, index=index),
+    )
+
+
+def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
+    """Maps whose boxes come within _AREA_GAP_M of each other, directly or through others; one extractor each.
+
+    Boxes are compared as spheres around their middles in one Cartesian frame, across zone borders.
+    """
+    if not maps:
+        return []
+    frame: LocalFrame | None = None
+    centers, radii = [], []
+    for summary in maps:
+        box = summary.box
+        assert box is not None
+        corners = np.array(
+            [
+                [box.min_easting, box.min_northing, box.min_height],
+                [box.max_easting, box.max_northing, box.max_height],
+            ]
+        )
+        middle = corners.mean(axis=0)
+        frame = frame or LocalFrame.from_utm(
+            float(middle[0]), float(middle[1]), float(middle[2]), summary.epsg
+        )
+        centers.append(frame.enu_from_utm(middle, summary.epsg))
+        radii.append(0.5 * float(np.linalg.norm(corners[1] - corners[0])))
+    place, radius = np.array(centers), np.array(radii)
+    gap = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
+    extractor = np.array([m.extractor_fingerprint for m in maps])
+    near = (gap < _AREA_GAP_M) & (extractor[:, None] == extractor[None])
+    rows, columns = np.nonzero(near)
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=near.shape)
+    count, label = connected_components(graph, directed=False)
+    return [[m for m, of in zip(maps, label, strict=True) if of == i] for i in range(count)]
