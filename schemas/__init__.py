@@ -1,4 +1,4 @@
-"""JSON Schemas of the tables (`tables/`) and of the messages on the wire (`wire/`): data files and a loader."""
+"""JSON Schemas of the tables (`tables/`) and of the messages on the wire (`wire/`): data and a loader."""
 
 import json
 from importlib.resources import files
