@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 
-from featuredb.errors import InvalidValueError
+from featuredb.errors import GeodesyError, InvalidValueError
 from featuredb.geo.checks import as_geodetic
 from featuredb.geo.projections import shift_heights
 
@@ -116,7 +116,10 @@ def ellipsoidal_height(
             reason=f"the geoid grid of {checked} ({names}) is not installed; "
             f"install it by 'projsync --file {GEOID_GRIDS[checked][0]}' in PROJ's data directory",
         )
-    height = shift_heights(place, grid, _WGS84_FROM_NAD83 if checked == "navd88" else "")[0]
+    try:
+        height = shift_heights(place, grid, _WGS84_FROM_NAD83 if checked == "navd88" else "")[0]
+    except GeodesyError as error:
+        return HeightConversion(height_m=None, reason=str(error))
     if not np.isfinite(height):
         return HeightConversion(
             height_m=None,

@@ -92,7 +92,9 @@ class GeoPose:
         (bottom) edge and roll is 0, as drones' gimbals tell it.
         """
         yaw, pitch, roll = self.yaw_pitch_roll_deg
-        return (90.0 - yaw) % 360.0, -pitch, roll
+        heading = (90.0 - yaw) % 360.0
+        # The remainder of a tiny negative number rounds to 360 itself.
+        return (heading if heading < 360.0 else 0.0), -pitch, roll
 
     def to_json(self) -> dict[str, Any]:
         """As a Basic-Quaternion object, ready for `json.dumps`."""

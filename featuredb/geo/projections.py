@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pyproj import Proj, Transformer
 from pyproj.enums import TransformDirection
+from pyproj.exceptions import ProjError
 
 from featuredb.errors import GeodesyError
 from featuredb.geometry.arrays import FloatArray
@@ -92,9 +93,16 @@ def shift_heights(lat_lon_h: FloatArray, grid: Path, after: str = "") -> FloatAr
         lat_lon_h: (n, 3) latitude, longitude (degrees), height (m) above the geoid.
         grid: a grid file; given by its full path, PROJ looks for it nowhere else.
         after: further steps of the pipeline, in radians.
+
+    Raises:
+        GeodesyError: PROJ cannot read the grid.
     """
     pipeline = f'{_DEGREES_IN}+proj=vgridshift +grids="{grid}" +multiplier=1 {after}'
-    return _raw_transform(pipeline, lat_lon_h[:, [1, 0, 2]])[:, 2]
+    try:
+        shifted = _raw_transform(pipeline, lat_lon_h[:, [1, 0, 2]])
+    except ProjError as error:
+        raise GeodesyError(f"PROJ cannot read the geoid grid {grid}; install it anew ({error})") from error
+    return shifted[:, 2]
 
 
 def utm_factors(latitude_deg: float, longitude_deg: float, zone: int, south: bool) -> tuple[float, float]:

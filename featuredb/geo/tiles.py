@@ -83,7 +83,8 @@ def _tile_indices(utm: ArrayLike) -> NDArray[np.int64]:
     plane = points[:, :2]
     if not np.isfinite(plane).all():
         raise InvalidValueError("tiles: expected finite eastings and northings, found NaN or infinity")
-    indices = np.floor(plane / TILE_SIZE_M)
+    # The inner floor keeps a denormal below zero below zero; over whole metres the division is exact.
+    indices = np.floor(np.floor(plane) / TILE_SIZE_M)
     bad = ((indices < _MIN_INDEX) | (indices > _MAX_INDEX)).any(axis=1)
     if bad.any():
         raise GeodesyError(f"tiles: {plane[bad][0].tolist()} is no UTM easting and northing in metres")

@@ -1,4 +1,4 @@
-"""Group laws of Rigid3 and Sim3, against SciPy's matrix exponential and logarithm and numerical derivatives."""
+"""Group laws of Rigid3 and Sim3, against SciPy's matrix functions and numerical derivatives."""
 
 from collections.abc import Callable
 

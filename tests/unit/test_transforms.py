@@ -157,6 +157,6 @@ def test_frozen_array_keeps_values_or_refuses() -> None:
         ([1 + 2j], np.float64),
         ([[1.0], [1.0, 2.0]], np.float64),
     ):
-        with pytest.raises(InvalidValueError, match="^a: expected"):
+        with pytest.raises(InvalidValueError, match=r"^a: expected"):
             frozen_array("a", value, (1,), dtype)  # type: ignore[arg-type]
     assert issubclass(InvalidValueError, FeatureDbError)
