@@ -93,14 +93,14 @@ class Client:
                 session, self._database, self._connect, self._connect_timeout_s
             )
         except ServiceError:
-            session.close()  # type: ignore[no-untyped-call]
+            session.close()
             raise
         self._open_session = session
 
     def close(self) -> None:
         """Disconnect; the second call does nothing."""
         if self._open_session is not None:
-            self._open_session.close()  # type: ignore[no-untyped-call]
+            self._open_session.close()
             self._open_session = None
 
     @property

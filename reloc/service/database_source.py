@@ -1,5 +1,7 @@
 """Areas of a database: the maps of its newest snapshot and a localiser over them."""
 
+from pathlib import Path
+
 import numpy as np
 
 from featuredb.geo.utm import geodetic_from_utm
@@ -13,9 +15,13 @@ from reloc.wire import BoundingBox, MapInfo
 class DatabaseSource:
     """Loads what a database offers now; see `reloc.service.source.AreaSource`."""
 
-    def __init__(self, database: Database, options: LocaliseOptions | None = None) -> None:
+    def __init__(
+        self, database: Database, options: LocaliseOptions | None = None, index_cache: Path | None = None
+    ) -> None:
         self._database = database
         self._options = options or LocaliseOptions()
+        self._index_cache = index_cache
+        self._previous: Localiser | None = None
 
     def version(self) -> int:
         """Number of the newest snapshot: one look at the table's log."""
@@ -27,7 +33,10 @@ class DatabaseSource:
         Raises:
             FeatureDbError: the store cannot be read, or maps do not fit together.
         """
-        localiser = Localiser.open(self._database, self._options)
+        localiser = Localiser.open(
+            self._database, self._options, previous=self._previous, cache=self._index_cache
+        )
+        self._previous = localiser
         snapshot = self._database.snapshot(localiser.snapshot)
         active = [summary for summary in snapshot.maps() if summary.status == "active"]
         return ServedArea(localiser=localiser, maps=tuple(map_info(summary) for summary in active))

@@ -13,6 +13,7 @@ from featuredb.errors import (
     ImageError,
     IncompatibleExtractorError,
     InvalidValueError,
+    MapNotFoundError,
 )
 from featuredb.features.decode import DecodeLimits, decode_gray
 from featuredb.features.exif import ExifInfo, read_exif
@@ -102,6 +103,10 @@ def answer_query(
         result = localiser.localise(gray, request)
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
+    except MapNotFoundError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
+    except ImageError as error:
+        raise RequestError(ErrorCode.BAD_IMAGE, f"image: {error}") from error
     clock.split(result.timings_ms, "localise_rest")
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
     clock.end("reply")

@@ -108,7 +108,7 @@ class PendingQuery:
                     "event": "refused",
                     "request_id": self.request_id,
                     "code": error.code,
-                    "message": error.message,
+                    "refusal": error.message,
                     "bytes": self.size,
                 }
             },

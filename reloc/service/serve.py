@@ -3,7 +3,6 @@
 import signal
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 
 from featuredb.store import Database
 from reloc.options import LocaliseOptions
@@ -13,23 +12,21 @@ from reloc.service.server import Server
 
 
 def start_server(
-    database_url: str, options: ServeOptions | None = None, localise_options: LocaliseOptions | None = None
+    database: Database, options: ServeOptions | None = None, localise_options: LocaliseOptions | None = None
 ) -> Server:
-    """Open the database, load its maps and listen; the server runs until `close`.
+    """Load the database's maps and listen; the server runs until `close`.
 
     Raises:
-        DatabaseNotFoundError: there is no database at the URL.
         ServiceStartError: cannot listen (port taken, bad endpoint, bad configuration).
         FeatureDbError: the maps cannot be loaded.
     """
     options = options or ServeOptions()
-    database = Database.open(database_url)
-    name = options.name or wire_name_of(database_url)
-    return Server.start(DatabaseSource(database, localise_options), replace(options, name=name), name)
+    name = options.name or wire_name_of(database.url)
+    return Server.start(DatabaseSource(database, localise_options), options, name)
 
 
 def serve(
-    database_url: str,
+    database: Database,
     options: ServeOptions | None = None,
     localise_options: LocaliseOptions | None = None,
     *,
@@ -45,7 +42,7 @@ def serve(
         number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
     }
     try:
-        with start_server(database_url, options, localise_options) as server:
+        with start_server(database, options, localise_options) as server:
             on_ready(server)
             stop.wait()
     finally:

@@ -26,7 +26,6 @@ from tests.support.service import (
     ScriptedLocaliser,
     area_of,
     client_of,
-    localised,
     not_localised,
     photo,
     running_server,
@@ -146,9 +145,12 @@ def test_maps_of_another_extractor_are_refused_not_answered_wrongly():
     def refuse(gray, request):
         raise IncompatibleExtractorError("map-a was made with sift-2, this server extracts sift-1")
 
-    with running_server(ScriptedLocaliser(1, refuse)) as server, client_of(server) as client:
-        with pytest.raises(ServiceError, match="sift-2") as caught:
-            client.localise(photo(), request_id="wrong-extractor")
+    with (
+        running_server(ScriptedLocaliser(1, refuse)) as server,
+        client_of(server) as client,
+        pytest.raises(ServiceError, match="sift-2") as caught,
+    ):
+        client.localise(photo(), request_id="wrong-extractor")
     assert caught.value.code == "INCOMPATIBLE_EXTRACTOR"
     assert caught.value.request_id == "wrong-extractor"
 

@@ -1,0 +1,255 @@
+"""Subcommands `serve`, `query` and `localise`; what they need is imported when they run."""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
+
+if TYPE_CHECKING:
+    from featuredb.geometry.arrays import FloatArray
+    from reloc.wire import CameraRequest, LocaliseReply, PriorRequest
+
+_NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
+_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def register(subparsers: Any) -> None:
+    """Add the subcommands to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    serve = subparsers.add_parser(
+        "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."
+    )
+    add_database_argument(serve)
+    serve.add_argument(
+        "--listen",
+        action="append",
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint, may be repeated; default {_DEFAULT_ENDPOINT} where no --config is given",
+    )
+    serve.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
+    serve.add_argument("--workers", type=int, default=2, help="queries localised at a time; default 2")
+    serve.add_argument("--max-queue", type=int, default=32, help="queries that may wait; default 32")
+    serve.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="per query; default 8")
+    serve.set_defaults(run=_serve)
+
+    query = subparsers.add_parser(
+        "query", help="ask a server where photos were taken", description="Ask a server over Zenoh."
+    )
+    query.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
+    query.add_argument("--connect", default=_DEFAULT_ENDPOINT, metavar="ENDPOINT", help="Zenoh endpoint")
+    query.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect")
+    query.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    query.add_argument("--timeout", type=float, default=10.0, metavar="SECONDS", help="per image; default 10")
+    _add_query_arguments(query)
+    query.set_defaults(run=_query)
+
+    localise = subparsers.add_parser(
+        "localise",
+        help="localise photos without a server",
+        description="The same as `query`, with the database opened here.",
+    )
+    add_database_argument(localise)
+    localise.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
+    _add_query_arguments(localise)
+    localise.set_defaults(run=_localise)
+
+
+def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--prior", metavar="LAT,LON,SIGMA_M", help="where it may have been taken: WGS84 degrees, metres"
+    )
+    parser.add_argument("--exif-prior", action="store_true", help="the photo's own GPS is the prior")
+    parser.add_argument(
+        "--camera",
+        metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
+        help="intrinsics by COLMAP's model, e.g. PINHOLE,4000,3000,3200,3200,2000,1500",
+    )
+    parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
+    parser.add_argument("--json", action="store_true", help="print one JSON reply per line")
+    parser.add_argument(
+        "--overlay",
+        type=Path,
+        metavar="PNG",
+        help="write the photo with the projected map; with several images their names are appended",
+    )
+
+
+def _serve(args: argparse.Namespace) -> int:
+    import cv2
+
+    from featuredb.cli.common import open_database
+    from reloc.service.logs import log_to
+    from reloc.service.options import ServeOptions
+    from reloc.service.serve import serve
+    from reloc.service.server import Server
+
+    listen = tuple(args.listen or (() if args.config else (_DEFAULT_ENDPOINT,)))
+    options = ServeOptions(
+        listen=listen,
+        config_path=args.config,
+        name=args.name,
+        workers=args.workers,
+        max_queue=args.max_queue,
+        deadline_s=args.deadline,
+    )
+    database = open_database(args)
+    log_to(sys.stderr)
+    # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+    def announce(server: Server) -> None:
+        where = ", ".join(server.endpoints) or str(args.config)
+        sys.stdout.write(
+            f"serving {server.database!r} (snapshot {server.status().snapshot}, {server.status().maps} maps) "
+            f"on {where}; stop with Ctrl-C\n"
+        )
+        sys.stdout.flush()
+
+    serve(database, options, on_ready=announce)
+    return 0
+
+
+def _query(args: argparse.Namespace) -> int:
+    from reloc.client import Client
+
+    prior, camera = _parse_prior(args.prior), _parse_camera(args.camera)
+    with Client(args.connect, args.database, config_path=args.config) as client:
+
+        def ask(data: bytes) -> "LocaliseReply":
+            return client.localise(
+                data,
+                prior,
+                camera,
+                timeout_s=args.timeout,
+                inliers=args.overlay is not None,
+                exif_prior=args.exif_prior,
+                maps=tuple(args.map) if args.map else None,
+            )
+
+        return _answer_all(args, ask)
+
+
+def _localise(args: argparse.Namespace) -> int:
+    import time
+    import uuid
+
+    from featuredb.cli.common import open_database
+    from featuredb.features.decode import DecodeLimits
+    from reloc.localiser import Localiser
+    from reloc.overlay import map_points_in_view
+    from reloc.service.handler import StageClock, answer_query
+    from reloc.wire import LocaliseWireRequest, RequestOptions
+
+    request = LocaliseWireRequest(
+        prior=_parse_prior(args.prior),
+        camera=_parse_camera(args.camera),
+        options=RequestOptions(
+            inliers=args.overlay is not None,
+            exif_prior=args.exif_prior,
+            maps=tuple(args.map) if args.map else None,
+        ),
+    )
+    localiser = Localiser.open(open_database(args))
+
+    def ask(data: bytes) -> "LocaliseReply":
+        return answer_query(
+            data,
+            request,
+            localiser,
+            limits=DecodeLimits(),
+            request_id=uuid.uuid4().hex,
+            clock=StageClock(last=time.perf_counter()),
+        )
+
+    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+
+
+def _answer_all(
+    args: argparse.Namespace,
+    ask: Callable[[bytes], "LocaliseReply"],
+    other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
+) -> int:
+    """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
+    from reloc.overlay import write_overlay
+    from reloc.wording import describe
+
+    codes = {0}
+    for path in map(Path, args.image):
+        try:
+            data = path.read_bytes()
+            reply = ask(data)
+            sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
+            sys.stdout.flush()
+            if reply.status != "localised":
+                codes.add(_NOT_LOCALISED)
+            elif args.overlay is not None:
+                target = _overlay_path(args.overlay, path, args.image)
+                write_overlay(target, data, reply, other_points(reply))
+                sys.stderr.write(f"wrote {target}\n")
+        except OSError as error:
+            sys.stderr.write(f"featuredb: {path}: {error.strerror or error}\n")
+            codes.add(2)
+        except ServiceError as error:
+            sys.stderr.write(f"featuredb: {path}: {error}\n")
+            codes.add(2)
+            if error.code == "NO_SERVER":
+                break
+        except FeatureDbError as error:
+            sys.stderr.write(f"featuredb: {path}: {error}\n")
+            codes.add(2)
+    return max(codes)
+
+
+def _as_json_line(path: Path, reply: "LocaliseReply") -> str:
+    import json
+
+    return json.dumps({"image": str(path), **reply.model_dump(mode="json")}) + "\n"
+
+
+def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:
+    if len(list(images)) == 1:
+        return overlay
+    return overlay.with_name(f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}")
+
+
+def _parse_prior(text: str | None) -> "PriorRequest | None":
+    from pydantic import ValidationError
+
+    from reloc.wire import PriorRequest
+
+    if text is None:
+        return None
+    try:
+        lat, lon, sigma_m = (float(part) for part in text.split(","))
+        return PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
+    except (ValueError, ValidationError) as error:
+        raise InvalidValueError(
+            f"--prior: expected LAT,LON,SIGMA_M in degrees and metres such as 47.37,8.54,25, found {text!r}"
+        ) from error
+
+
+def _parse_camera(text: str | None) -> "CameraRequest | None":
+    from pydantic import ValidationError
+
+    from reloc.wire import CameraRequest
+
+    if text is None:
+        return None
+    try:
+        model, width, height, *params = text.split(",")
+        return CameraRequest(
+            model=model.strip(),
+            width=int(width),
+            height=int(height),
+            params=tuple(float(p) for p in params),
+        )
+    except (ValueError, ValidationError) as error:
+        raise InvalidValueError(
+            "--camera: expected MODEL,WIDTH,HEIGHT,PARAMS... such as "
+            f"PINHOLE,4000,3000,3200,3200,2000,1500, found {text!r}"
+        ) from error

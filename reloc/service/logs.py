@@ -1,0 +1,34 @@
+"""Structured logs: one JSON object per line."""
+
+import json
+import logging
+from datetime import UTC, datetime
+from typing import Any, TextIO
+
+
+class JsonLinesFormatter(logging.Formatter):
+    """time, level, logger, message, and the `fields` that a record carries (event, request_id ...)."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        line: dict[str, Any] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "message": record.getMessage(),
+        }
+        fields = getattr(record, "fields", None)
+        if isinstance(fields, dict):
+            line.update({name: value for name, value in fields.items() if name not in line})
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def log_to(stream: TextIO, level: int = logging.INFO) -> None:
+    """Write the service's logs to a stream; for the program's entry, not for library code."""
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(JsonLinesFormatter())
+    for name in ("reloc", "featuredb"):
+        logger = logging.getLogger(name)
+        logger.addHandler(handler)
+        logger.setLevel(level)

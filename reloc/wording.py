@@ -1,0 +1,41 @@
+"""Answers in words for people."""
+
+from reloc.wire import LocaliseReply
+
+# What a person can do about each reason.
+ADVICE = {
+    "NO_COVERAGE": "no map lies near the prior (or the database is empty): check the prior, "
+    "or ingest photos of the place",
+    "TOO_FEW_FEATURES": "the photo shows too little texture: take a sharper, lighter or wider one",
+    "TOO_FEW_MATCHES": "the maps know little of what it shows: try a photo from a more similar viewpoint, "
+    "a prior (--prior), or add photos of the place to the database",
+    "TOO_FEW_INLIERS": "the matches do not agree on one pose: give a prior (--prior) or the camera "
+    "(--camera), or take another photo",
+    "AMBIGUOUS": "two different places explain it about equally well: give a prior (--prior)",
+    "CONTRADICTS_PRIOR": "the photo fits a place far from the prior: check the prior or widen its sigma",
+}
+
+
+def describe(name: str, reply: LocaliseReply) -> str:
+    """A few lines about one answer."""
+    total = reply.timings_ms.get("total", 0.0)
+    if reply.utm is None or reply.position is None or reply.accuracy is None or reply.camera is None:
+        advice = ADVICE.get(reply.reason or "", "")
+        return (
+            f"{name}: not localised: {reply.reason} ({reply.detail})\n"
+            f"  {reply.inliers} of {reply.matches} matches agree, {reply.features} features, {total:.0f} ms\n"
+            f"  try: {advice}\n"
+        )
+    utm, position, accuracy = reply.utm, reply.position, reply.accuracy
+    return (
+        f"{name}: localised, confidence {reply.confidence:.3f}\n"
+        f"  UTM       EPSG:{utm.epsg}  E {utm.easting:.3f}  N {utm.northing:.3f}  "
+        f"height {utm.height:.3f} m ({reply.height_datum})\n"
+        f"  WGS84     {position.lat:.8f}, {position.lon:.8f}  h {position.h:.3f} m\n"
+        f"  68 %      {accuracy.horizontal_68_m:.3f} m horizontally, "
+        f"{accuracy.vertical_68_m:.3f} m vertically, {accuracy.orientation_68_deg:.3f} deg\n"
+        f"  evidence  {reply.inliers} of {reply.matches} matches agree, residual "
+        f"{reply.residual_rms_px or 0.0:.2f} px, camera from {reply.camera.source}, "
+        f"maps {', '.join(reply.maps)}\n"
+        f"  time      {total:.0f} ms, snapshot {reply.snapshot}\n"
+    )
