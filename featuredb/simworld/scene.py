@@ -1,0 +1,262 @@
+"""What stands where: planar faces and ellipsoids in a local east-north-up frame. No pixels, no files.
+
+Everything that a sensor can meet is one of two primitives, so any camera, LiDAR or ortho sensor needs two
+intersections only, and both have a closed form.
+"""
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray, frozen_array
+
+# Names of textures; a face holds the index. The painters in `materials` and `ground` know what they mean.
+TEXTURES = (
+    "ground",
+    "fields",
+    "water",
+    "facade_brick",
+    "facade_plaster",
+    "facade_ochre",
+    "facade_panel",
+    "facade_stone",
+    "roof_red",
+    "roof_brown",
+    "roof_slate",
+    "roof_bitumen",
+    "roof_metal",
+    "plain",
+    "wood",
+    "car",
+    "leaves",
+)
+SKY_ID = -1
+
+
+def texture_index(name: str) -> int:
+    """Index of a texture in TEXTURES."""
+    return TEXTURES.index(name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Faces:
+    """n one-sided planar faces; a point of face i is origin + s * edge_s + t * edge_t.
+
+    A parallelogram has s and t in [0, 1], a triangle has s, t >= 0 and s + t <= 1. The outside is where
+    edge_s x edge_t points to.
+
+    Attributes:
+        origin, edge_s, edge_t: (n, 3) float64, metres.
+        triangle: (n,) bool.
+        texture: (n,) int16, index into TEXTURES.
+        uv: (n, 6) float64 texture coordinates in metres: u0, v0 at the origin, then du, dv along edge_s,
+            then du, dv along edge_t.
+        detail_uv: (n, 2) float64, metres: where the fine-detail texture starts; equal values and equal
+            `uv` give exactly equal looks. NaN means no detail.
+        tint: (n, 3) float64 factors on red, green, blue: paint and light from the sun.
+        object_id: (n,) int32, one number per building, car, ...
+    """
+
+    origin: FloatArray
+    edge_s: FloatArray
+    edge_t: FloatArray
+    triangle: NDArray[np.bool_]
+    texture: NDArray[np.int16]
+    uv: FloatArray
+    detail_uv: FloatArray
+    tint: FloatArray
+    object_id: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        n = len(self.origin)
+        for name, columns, dtype in _FACE_COLUMNS:
+            value = np.array(getattr(self, name), dtype=dtype)
+            if value.shape != ((n, columns) if columns else (n,)):
+                raise InvalidValueError(f"Faces.{name}: expected {n} rows of {columns}, found {value.shape}")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.origin)
+
+    @classmethod
+    def concatenate(cls, parts: "list[Faces]") -> Self:
+        """All faces of the parts, in their order."""
+        if not parts:
+            return cls(**{n: np.zeros((0, c) if c else 0, dtype=t) for n, c, t in _FACE_COLUMNS})
+        return cls(**{n: np.concatenate([getattr(p, n) for p in parts]) for n, _, _ in _FACE_COLUMNS})
+
+    def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Faces":
+        """The same faces at rotation @ x + translation; textures move with them."""
+        turn, shift = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
+        return Faces(
+            origin=self.origin @ turn.T + shift,
+            edge_s=self.edge_s @ turn.T,
+            edge_t=self.edge_t @ turn.T,
+            **{n: getattr(self, n) for n, _, _ in _FACE_COLUMNS[3:]},
+        )
+
+    def shaded(self, to_sun: ArrayLike, ambient: float = 0.55) -> "Faces":
+        """The same faces with Lambert's light from the unit vector `to_sun` multiplied into `tint`."""
+        normal = np.cross(self.edge_s, self.edge_t)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        light = ambient + (1.1 - ambient) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0)
+        columns = {n: getattr(self, n) for n, _, _ in _FACE_COLUMNS}
+        return Faces(**{**columns, "tint": self.tint * light[:, None]})
+
+
+_FACE_COLUMNS: tuple[tuple[str, int, Any], ...] = (
+    ("origin", 3, np.float64),
+    ("edge_s", 3, np.float64),
+    ("edge_t", 3, np.float64),
+    ("triangle", 0, np.bool_),
+    ("texture", 0, np.int16),
+    ("uv", 6, np.float64),
+    ("detail_uv", 2, np.float64),
+    ("tint", 3, np.float64),
+    ("object_id", 0, np.int32),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ellipsoids:
+    """n ellipsoids with axes along east, north, up: the crowns of trees and bushes.
+
+    Attributes:
+        center, radii: (n, 3) float64, metres.
+        tint: (n, 3) float64 factors on red, green, blue.
+        texture_uv: (n, 2) float64 metres, where each crown cuts its piece from the leaf texture.
+        object_id: (n,) int32.
+    """
+
+    center: FloatArray
+    radii: FloatArray
+    tint: FloatArray
+    texture_uv: FloatArray
+    object_id: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        n = len(self.center)
+        for name, columns in (("center", 3), ("radii", 3), ("tint", 3), ("texture_uv", 2)):
+            object.__setattr__(
+                self, name, frozen_array(f"Ellipsoids.{name}", getattr(self, name), (n, columns))
+            )
+        object.__setattr__(
+            self, "object_id", frozen_array("Ellipsoids.object_id", self.object_id, (n,), np.int32)
+        )
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Building:
+    """A box with a roof, in the town's own axes.
+
+    Attributes:
+        x, y: centre, metres. yaw_deg: counter-clockwise turn of its width from the town's x axis.
+        width, depth: metres. base, eaves: heights of the lowest ground and of the eaves, metres.
+        ridge: height of the ridge over the eaves, 0 for a flat roof.
+        facade, roof: names of textures.
+        facade_u, detail_u, roof_u: where its pieces of the textures start, metres; equal numbers make
+            equal looks.
+        tint: factors on red, green, blue of the facade.
+    """
+
+    x: float
+    y: float
+    yaw_deg: float
+    width: float
+    depth: float
+    base: float
+    eaves: float
+    ridge: float
+    facade: str
+    roof: str
+    facade_u: float
+    detail_u: float
+    roof_u: float
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+
+    def footprint(self) -> FloatArray:
+        """Corners (4, 2), counter-clockwise, from the front left one, town axes, metres."""
+        a = np.radians(self.yaw_deg)
+        turn = np.array([[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]])
+        half = 0.5 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [self.width, self.depth]
+        return np.asarray(half @ turn.T + [self.x, self.y], dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Street:
+    """A straight street in town axes: along x or y, at `at` on the other axis, from `start` to `end`, metres."""
+
+    along: str
+    at: float
+    start: float
+    end: float
+    width: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundPlan:
+    """What the ground painter needs, in town axes, metres.
+
+    Attributes:
+        seed: of all randomness in the paint.
+        size: width (x) and height (y) of the painted rectangle, centred on the origin.
+        streets, buildings: as laid out. plazas, car_parks, gardens: rectangles (x0, y0, x1, y1).
+        trees: (n, 3) x, y, crown radius, for their shadows.
+        profile: (k, 2) knots (y, height) of the terrain, which depends on y only.
+        river: y0, y1 of the bed.
+        to_sun: unit vector.
+    """
+
+    seed: int
+    size: tuple[float, float]
+    streets: tuple[Street, ...]
+    buildings: tuple[Building, ...]
+    plazas: tuple[tuple[float, float, float, float], ...]
+    car_parks: tuple[tuple[float, float, float, float], ...]
+    gardens: tuple[tuple[float, float, float, float], ...]
+    trees: tuple[tuple[float, float, float], ...]
+    profile: tuple[tuple[float, float], ...]
+    river: tuple[float, float]
+    to_sun: tuple[float, float, float]
+
+    def height(self, y: ArrayLike) -> FloatArray:
+        """Terrain height in metres at y (any shape)."""
+        knots = np.asarray(self.profile)
+        return np.asarray(np.interp(np.asarray(y, dtype=np.float64), knots[:, 0], knots[:, 1]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """The town, placed on Earth.
+
+    Attributes:
+        name: for people. seed: of the layout and the textures.
+        frame: local ENU frame; all faces and ellipsoids are in it, metres.
+        epsg: UTM zone of the answers.
+        enu_from_town: (3, 3) rotation about up; the town's axes are not those of the compass.
+        plan: the ground, in town axes.
+        faces, ellipsoids: all that stands still.
+    """
+
+    name: str
+    seed: int
+    frame: LocalFrame
+    epsg: int
+    enu_from_town: FloatArray
+    plan: GroundPlan
+    faces: Faces
+    ellipsoids: Ellipsoids
+    texel_m: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(
+            self, "enu_from_town", frozen_array("Scene.enu_from_town", self.enu_from_town, (3, 3))
+        )

@@ -1,0 +1,57 @@
+"""A texture: an image with its size on the ground and its area-averaged pyramid."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image8 = NDArray[np.uint8]
+
+_SMALLEST_LEVEL_PX = 8  # a level below this is one colour for all that matters
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Texture:
+    """Levels (h, w, 3) uint8 RGB, each half the one before, by area average.
+
+    Row and column run with v and u; texel (row i, column j) of level 0 covers u in [j, j+1) * texel_m.
+
+    Attributes:
+        levels: level 0 first.
+        texel_m: size of a texel of level 0, metres.
+    """
+
+    levels: tuple[Image8, ...]
+    texel_m: float
+
+    @classmethod
+    def from_image(cls, image: Image8, texel_m: float) -> Self:
+        """Build the pyramid; odd sizes lose their last row or column in the next level."""
+        levels = [np.ascontiguousarray(image)]
+        while min(levels[-1].shape[:2]) >= 2 * _SMALLEST_LEVEL_PX:
+            above = levels[-1]
+            h, w = above.shape[0] // 2, above.shape[1] // 2
+            half = cv2.resize(above[: 2 * h, : 2 * w], (w, h), interpolation=cv2.INTER_AREA)
+            levels.append(np.asarray(half, dtype=np.uint8))
+        return cls(levels=tuple(levels), texel_m=texel_m)
+
+    def sample(self, u: NDArray[np.float32], v: NDArray[np.float32], level: int) -> Image8:
+        """Bilinear colours (..., 3) uint8 at u, v (2-D arrays, metres), of one level; the texture repeats."""
+        scale = np.float32(1.0 / (self.texel_m * 2**level))
+        return np.asarray(
+            cv2.remap(
+                self.levels[level],
+                u * scale - np.float32(0.5),
+                v * scale - np.float32(0.5),
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_WRAP,
+            ),
+            dtype=np.uint8,
+        )
+
+
+def to_image(rgb: NDArray[np.float32]) -> Image8:
+    """Colours in 0..255 as float to uint8."""
+    return np.clip(rgb + 0.5, 0, 255).astype(np.uint8)

@@ -1,0 +1,234 @@
+"""Writes a simulated world: folders of photos, and the truth beside them."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.simworld import negatives
+from featuredb.simworld.flight import (
+    FlightOptions,
+    pedestrians,
+    survey,
+    survey_half_extent,
+    visitors,
+)
+from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
+from featuredb.simworld.photograph import photo_bytes, take_photo
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.sensor import SensorOptions, jpeg_bytes
+from featuredb.simworld.shot import Shot
+from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.truth import Truth, read_truth, true_image, write_truth
+
+Progress = Callable[[int, int], None]
+
+_VISITORS_SEED = 40  # negatives made of town photos are other photos than the queries
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorldOptions:
+    """What to write. The same options give the same bytes.
+
+    Attributes:
+        seed: of everything.
+        town_size_m: width and height of the town.
+        flight: the survey; its gps_error holds for the queries too.
+        queries, street: numbers of held-out drone photos and of street photos.
+        query_width: pixels.
+        street_width: pixels, of the widest of the cameras.
+        negatives_per_kind: photos of each of NEGATIVE_KINDS.
+        sensor: of all cameras.
+        workers: processes; 0 takes one per core.
+    """
+
+    seed: int = 1
+    town_size_m: tuple[float, float] = (380.0, 330.0)
+    flight: FlightOptions = field(default_factory=FlightOptions)
+    queries: int = 60
+    query_width: int = 1600
+    street: int = 40
+    street_width: int = 1600
+    negatives_per_kind: int = 34
+    sensor: SensorOptions = field(default_factory=SensorOptions)
+    workers: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.queries, self.street, self.negatives_per_kind, self.workers) < 0:
+            raise InvalidValueError(f"WorldOptions: expected numbers >= 0, found {self}")
+
+    @classmethod
+    def short(cls, seed: int = 1) -> "WorldOptions":
+        """A world for tests: 24 survey photos, 8 queries, few of the rest, seconds to make."""
+        return cls(
+            seed=seed,
+            town_size_m=(260.0, 230.0),
+            flight=FlightOptions(lines=4, per_line=5, oblique=4, width=1024),
+            queries=8,
+            query_width=1024,
+            street=4,
+            street_width=1024,
+            negatives_per_kind=1,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class World:
+    """A world on disk.
+
+    Attributes:
+        folder: holds drone/, queries/, street/, negatives/<kind>/ and truth.json.
+        truth: of the photos of the town.
+    """
+
+    folder: Path
+    truth: Truth
+
+    def images(self, group: Literal["drone", "queries", "street"]) -> list[Path]:
+        """Photos of one group, by name."""
+        return [self.folder / image.name for image in self.truth.group(group)]
+
+    def negatives(self, kind: NegativeKind | None = None) -> list[Path]:
+        """Negatives of one kind, or all."""
+        return sorted((self.folder / "negatives").glob(f"{kind or '*'}/*.jpg"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Task:
+    """One file: a shot of the town, or the i-th negative of a kind."""
+
+    options: WorldOptions
+    group: Literal["drone", "queries", "street", "negatives"]
+    index: int
+    kind: NegativeKind = "blank"
+
+
+def write_world(folder: Path, options: WorldOptions, progress: Progress | None = None) -> World:
+    """Write all photos and truth.json into `folder` (made if missing; files of the same names are replaced).
+
+    Args:
+        progress: called with (files done, files in all).
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    folder = Path(folder)
+    tasks = _tasks(options)
+    for task in tasks:
+        (folder / _task_name(task)).parent.mkdir(parents=True, exist_ok=True)
+    # truth.json comes last: a folder with it is complete.
+    (folder / "truth.json").unlink(missing_ok=True)
+    for done, (name, data) in enumerate(_run(tasks, options.workers), start=1):
+        (folder / name).write_bytes(data)
+        if progress is not None:
+            progress(done, len(tasks))
+    scene = town_of(options)
+    images = [true_image(scene, shot) for group in ("drone", "queries", "street") for shot in _shots(options, group)]
+    truth = Truth(seed=options.seed, epsg=scene.epsg, frame=scene.frame, images={i.name: i for i in images})
+    write_truth(folder, truth)
+    return open_world(folder)
+
+
+def open_world(folder: Path) -> World:
+    """A world that was written before.
+
+    Raises:
+        InvalidValueError: no truth.json there.
+    """
+    return World(folder=Path(folder), truth=read_truth(Path(folder)))
+
+
+@lru_cache(maxsize=2)
+def town_of(options: WorldOptions) -> Scene:
+    """The scene of a world: for depth truth, other sensors, other cameras."""
+    return make_town(options.seed, size_m=options.town_size_m)
+
+
+@lru_cache(maxsize=2)
+def _other_town_of(options: WorldOptions) -> Scene:
+    return make_town(options.seed + 1000, name="other town", size_m=options.town_size_m, place=OTHER_TOWN_PLACE)
+
+
+@lru_cache(maxsize=16)
+def _shots(options: WorldOptions, group: str, other: bool = False, seed_shift: int = 0) -> tuple[Shot, ...]:
+    scene = _other_town_of(options) if other else town_of(options)
+    seed = options.seed + seed_shift
+    if group == "drone":
+        return tuple(survey(scene, options.flight, seed))
+    if group == "queries":
+        count = options.negatives_per_kind if seed_shift else options.queries
+        return tuple(visitors(scene, options.flight, count, seed, width=options.query_width))
+    extent = survey_half_extent(options.flight)
+    return tuple(pedestrians(scene, options.street, seed, width=options.street_width, extent_m=extent))
+
+
+def _tasks(options: WorldOptions) -> list[_Task]:
+    counts = {"drone": options.flight.lines * options.flight.per_line + options.flight.oblique}
+    counts |= {"queries": options.queries, "street": options.street}
+    tasks = [_Task(options=options, group=g, index=i) for g, n in counts.items() for i in range(n)]  # type: ignore[arg-type]
+    # Kind by kind, so that a process paints the other town once at most.
+    kinds = [kind for kind in NEGATIVE_KINDS for _ in range(options.negatives_per_kind)]
+    return tasks + [
+        _Task(options=options, group="negatives", index=i % options.negatives_per_kind, kind=kind)
+        for i, kind in enumerate(kinds)
+    ]
+
+
+def _task_name(task: _Task) -> str:
+    if task.group == "negatives":
+        return f"negatives/{task.kind}/{task.kind}_{task.index + 1:04d}.jpg"
+    return _shots(task.options, task.group)[task.index].name
+
+
+def _run(tasks: list[_Task], workers: int) -> Iterator[tuple[str, bytes]]:
+    """Names and bytes of all files, in any order, from a pool of processes (or here, for one worker)."""
+    count = min(workers or os.cpu_count() or 1, len(tasks))
+    if count <= 1:
+        for task in tasks:
+            yield _make(task)
+        return
+    # Spawned, not forked: the caller may have threads (Zenoh, a progress bar) that a fork would cut off.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
+        futures = [pool.submit(_make, task) for task in tasks]
+        for future in as_completed(futures):
+            yield future.result()
+
+
+def _one_thread() -> None:
+    """The pool is the parallelism; OpenCV's own threads would fight over the same cores."""
+    cv2.setNumThreads(1)
+
+
+def _make(task: _Task) -> tuple[str, bytes]:
+    """Name and bytes of one file."""
+    options = task.options
+    if task.group != "negatives":
+        shot = _shots(options, task.group)[task.index]
+        return shot.name, photo_bytes(town_of(options), shot, options.sensor)
+    return _task_name(task), _negative(task)
+
+
+def _negative(task: _Task) -> bytes:
+    options, kind = task.options, task.kind
+    rng = np.random.default_rng((options.seed, 21, NEGATIVE_KINDS.index(kind), task.index))
+    width = options.query_width
+    if kind == "other_town":
+        shot = replace(_shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[task.index])
+        return photo_bytes(_other_town_of(options), shot, options.sensor)
+    if kind in ("mirrored", "blurred"):
+        shot = _shots(options, "queries", seed_shift=_VISITORS_SEED)[task.index]
+        photo = take_photo(town_of(options), shot, options.sensor)
+        image = negatives.mirrored(photo) if kind == "mirrored" else negatives.blurred(photo, rng)
+    else:
+        painter = {"blank": negatives.blank, "noise": negatives.noise, "text": negatives.text}[kind]
+        image = painter(rng, width, width * 3 // 4)
+    return jpeg_bytes(image, options.sensor.jpeg_quality)
