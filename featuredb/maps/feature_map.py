@@ -9,10 +9,12 @@ from datetime import datetime
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
+from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -46,8 +48,15 @@ class GeoPrior:
                 "GeoPrior: expected latitude in [-90, 90] and longitude in [-180, 180] degrees, "
                 f"found {self.latitude_deg}, {self.longitude_deg}"
             )
+        if self.height_m is not None and not np.isfinite(self.height_m):
+            raise InvalidValueError(
+                f"GeoPrior.height_m: expected a finite number or None, found {self.height_m}"
+            )
         if not (0 < self.sigma_horizontal_m < np.inf and 0 < self.sigma_vertical_m < np.inf):
-            raise InvalidValueError("GeoPrior: expected standard deviations > 0 m")
+            raise InvalidValueError(
+                "GeoPrior: expected finite standard deviations > 0 m, "
+                f"found {self.sigma_horizontal_m}, {self.sigma_vertical_m}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,9 +88,7 @@ class MapImage:
 
     def __post_init__(self) -> None:
         if self.covariance is not None:
-            object.__setattr__(
-                self, "covariance", frozen_array("MapImage.covariance", self.covariance, (6, 6))
-            )
+            object.__setattr__(self, "covariance", _covariance("MapImage.covariance", self.covariance, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -153,7 +160,10 @@ class MapObservations:
                 "has_descriptor",
                 frozen_array("MapObservations.has_descriptor", self.has_descriptor, (m,), np.bool_),
             ),
-            ("descriptors", frozen_array("MapObservations.descriptors", self.descriptors, (m, 128), np.uint8)),
+            (
+                "descriptors",
+                frozen_array("MapObservations.descriptors", self.descriptors, (m, 128), np.uint8),
+            ),
         ):
             object.__setattr__(self, name, value)
 
@@ -183,7 +193,11 @@ class Placement:
     def __post_init__(self) -> None:
         if self.method not in MAP_METHODS:
             raise InvalidValueError(f"Placement.method: expected one of {MAP_METHODS}, found {self.method!r}")
-        object.__setattr__(self, "covariance", frozen_array("Placement.covariance", self.covariance, (7, 7)))
+        if not 0 <= self.residual_rms_m < np.inf:
+            raise InvalidValueError(
+                f"Placement.residual_rms_m: expected a finite number >= 0, found {self.residual_rms_m}"
+            )
+        object.__setattr__(self, "covariance", _covariance("Placement.covariance", self.covariance, 7))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,9 +215,14 @@ class FeatureMap:
         camera_keys: for each camera the EXIF key (make, model, size, focal) that a query may share, ""
             where the camera belongs to one image only; same length as cameras, or empty.
         extractor_fingerprint: of all descriptors.
+        status: quarantined, active or retired; only active maps answer queries.
         generation: 0 for maps placed by GPS, LiDAR or control points; parents' maximum + 1 otherwise.
         parents: map ids that placed this one.
         provenance: options and versions that made it, JSON-able.
+
+    Raises:
+        InvalidValueError: parts that contradict each other, or an unknown status or datum.
+        GeodesyError: `epsg` is no UTM zone.
     """
 
     map_id: str
@@ -227,6 +246,10 @@ class FeatureMap:
 
     def __post_init__(self) -> None:
         where = f"FeatureMap {self.map_id}"
+        if not self.map_id:
+            raise InvalidValueError("FeatureMap: expected a map_id, found an empty one")
+        zone_of(self.epsg)
+        check_datum(self.height_datum)
         if self.status not in MAP_STATUSES:
             raise InvalidValueError(f"{where}: expected a status of {MAP_STATUSES}, found {self.status!r}")
         if self.camera_keys and len(self.camera_keys) != len(self.cameras):
@@ -252,3 +275,18 @@ class FeatureMap:
 
     def with_status(self, status: MapStatus) -> "FeatureMap":
         return replace(self, status=status)
+
+
+def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:
+    """A read-only (size, size) covariance, after checking that it can be one.
+
+    Eigenvalues are judged against the largest one, since rotations (radians) and positions (metres) differ by
+    orders of magnitude and rounding leaves tiny negative ones.
+    """
+    covariance: FloatArray = frozen_array(name, value, (size, size))
+    largest = float(np.abs(covariance).max())
+    if np.abs(covariance - covariance.T).max() > 1e-6 * largest:
+        raise InvalidValueError(f"{name}: expected a symmetric matrix, found {covariance.tolist()}")
+    if np.linalg.eigvalsh(covariance).min() < -1e-6 * largest:
+        raise InvalidValueError(f"{name}: expected no negative eigenvalue, found {covariance.tolist()}")
+    return covariance
