@@ -23,7 +23,6 @@ from ingest.photo import Photo
 from ingest.scan_cache import Examined, read_cache, write_cache
 from ingest.walk import FoundFile, walk
 
-
 # Raised when the same file would be judged differently, so that old caches are not used.
 _VERSION = 1
 # The cache is written this often, so that a kill costs at most so many files.

@@ -1,0 +1,327 @@
+"""What an ingest did: one value, written as JSON for programs and as a page for people."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from ingest.workspace import atomic_file, write_json
+
+FileStatus = Literal["registered", "not_registered", "skipped"]
+MapOutcomeStatus = Literal["committed", "already_there", "refused"]
+SCHEMA_ID = "featuredb/ingest/report/1"
+REPORT_JSON, REPORT_HTML = "report.json", "report.html"
+
+_TRACK_BINS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 50)
+_PERCENTILES = (50, 90, 99)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageTiming:
+    """How long a stage took.
+
+    Attributes:
+        name: scan, extract, match ...
+        seconds: wall time.
+        reused: results taken over from an earlier run, of `total`.
+    """
+
+    name: str
+    seconds: float
+    reused: int = 0
+    total: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoOutcome:
+    """One file of the folder and what happened to it.
+
+    Attributes:
+        name: path within the folder.
+        status: registered (part of a map), not_registered (usable, but in no map), skipped (not usable).
+        reason_code, reason: why it is in no map; "" where it is.
+        width, height: pixels as stored, 0 where unknown.
+        camera_key: its camera, "" where unknown.
+        capture_time: or None.
+        has_gps: whether it says where it was taken.
+        features: found in it, or None where it did not come so far.
+        matches: verified with other photos.
+        observations: of map points.
+        map_id: its map, "" for none.
+        reprojection_px: mean reprojection error of its observations.
+        gps_residual_m: east, north, up of its GPS position minus its place in the map, metres; up is NaN without a
+            height.
+        gps_used: whether its GPS helped to place the map (False: it was an outlier).
+        warnings: what was wrong in its metadata.
+    """
+
+    name: str
+    status: FileStatus
+    reason_code: str = ""
+    reason: str = ""
+    width: int = 0
+    height: int = 0
+    camera_key: str = ""
+    capture_time: datetime | None = None
+    has_gps: bool = False
+    features: int | None = None
+    matches: int | None = None
+    observations: int | None = None
+    map_id: str = ""
+    reprojection_px: float | None = None
+    gps_residual_m: tuple[float, float, float] | None = None
+    gps_used: bool | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOutcome:
+    """One set of intrinsics.
+
+    Attributes:
+        name: its EXIF key, or the photo's name.
+        photos: how many photos share it.
+        focal_before_px: from EXIF, None where that says nothing.
+        focal_after_px: as refined with the map.
+    """
+
+    name: str
+    model: str
+    width: int
+    height: int
+    photos: int
+    focal_before_px: float | None
+    focal_after_px: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlanView:
+    """What the picture of a map shows, all in UTM metres of one zone.
+
+    Attributes:
+        points: (n, 3) easting, northing, height.
+        cameras: (k, 3) camera centres.
+        gps: (k, 3) their GPS positions, NaN where there is none.
+        names: k names.
+        gps_used: (k,) bool.
+        convergence_deg: angle from true north to grid north, clockwise.
+        epsg: of the zone.
+    """
+
+    points: FloatArray
+    cameras: FloatArray
+    gps: FloatArray
+    names: tuple[str, ...]
+    gps_used: NDArray[np.bool_]
+    convergence_deg: float
+    epsg: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapOutcome:
+    """One connected component of the photos.
+
+    Attributes:
+        map_id: "" where it was refused.
+        status: committed, already_there (an earlier run committed it), refused.
+        reason_code, reason: the gate that refused it.
+        gates: figures of every gate, JSON-able.
+        scale: metres per unit of the reconstruction.
+        residual_rms_m: of the GPS positions that were used.
+        descriptors: observations with descriptors.
+        errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
+        plan: None where the map has no place.
+    """
+
+    map_id: str
+    name: str
+    status: MapOutcomeStatus
+    reason_code: str = ""
+    reason: str = ""
+    photos: int = 0
+    points: int = 0
+    observations: int = 0
+    descriptors: int = 0
+    epsg: int | None = None
+    height_datum: str = ""
+    scale: float | None = None
+    residual_rms_m: float | None = None
+    gates: Mapping[str, Any] = field(default_factory=dict)
+    cameras: tuple[CameraOutcome, ...] = ()
+    errors_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    track_lengths: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    plan: PlanView | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IngestReport:
+    """All of an ingest.
+
+    Attributes:
+        job_id: digest of photos and options.
+        database: address of the database, folder: of the photos.
+        started: timezone-aware.
+        options: of every stage, JSON-able; versions: of this program and the libraries.
+        pairs: tried, verified_pairs: with enough verified matches.
+        stages: in order.
+        photos: every file of the folder, sorted by name.
+        maps: largest first.
+        warnings: about the ingest as a whole.
+    """
+
+    job_id: str
+    database: str
+    folder: str
+    started: datetime
+    options: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    pairs: int = 0
+    verified_pairs: int = 0
+    stages: tuple[StageTiming, ...] = ()
+    photos: tuple[PhotoOutcome, ...] = ()
+    maps: tuple[MapOutcome, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.started.tzinfo is None:
+            raise InvalidValueError("IngestReport.started: expected a time with its zone, found none")
+        names = [photo.name for photo in self.photos]
+        if len(set(names)) != len(names):
+            raise InvalidValueError("IngestReport.photos: a file occurs twice")
+
+    def count(self, status: FileStatus) -> int:
+        """Number of files with that status."""
+        return sum(photo.status == status for photo in self.photos)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all stages."""
+        return sum(stage.seconds for stage in self.stages)
+
+
+def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
+    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
+    from ingest.report_html import report_page  # matplotlib loads when a report is written, not before
+
+    json_path, html_path = folder / REPORT_JSON, folder / REPORT_HTML
+    write_json(json_path, report_json(report))
+    with atomic_file(html_path) as temporary:
+        temporary.write_text(report_page(report), encoding="utf-8")
+    return json_path, html_path
+
+
+def report_json(report: IngestReport) -> dict[str, Any]:
+    """The report as JSON of `schemas/ingest/report.json`; NaN and infinity become null."""
+    document: dict[str, Any] = _plain(
+        {
+            "schema": SCHEMA_ID,
+            "job_id": report.job_id,
+            "database": report.database,
+            "folder": report.folder,
+            "started": report.started.isoformat(),
+            "seconds": report.seconds,
+            "options": report.options,
+            "versions": report.versions,
+            "warnings": report.warnings,
+            "pairs": {"tried": report.pairs, "verified": report.verified_pairs},
+            "files": {
+                "all": len(report.photos),
+                "registered": report.count("registered"),
+                "not_registered": report.count("not_registered"),
+                "skipped": report.count("skipped"),
+            },
+            "stages": [
+                {"name": s.name, "seconds": s.seconds, "reused": s.reused, "total": s.total}
+                for s in report.stages
+            ],
+            "maps": [_map_json(outcome) for outcome in report.maps],
+            "photos": [_photo_json(photo) for photo in report.photos],
+        }
+    )
+    return document
+
+
+def _photo_json(photo: PhotoOutcome) -> dict[str, Any]:
+    return {
+        "name": photo.name,
+        "status": photo.status,
+        "reason_code": photo.reason_code,
+        "reason": photo.reason,
+        "width": photo.width,
+        "height": photo.height,
+        "camera_key": photo.camera_key,
+        "capture_time": photo.capture_time.isoformat() if photo.capture_time else None,
+        "has_gps": photo.has_gps,
+        "features": photo.features,
+        "matches": photo.matches,
+        "observations": photo.observations,
+        "map_id": photo.map_id,
+        "reprojection_px": photo.reprojection_px,
+        "gps_residual_m": photo.gps_residual_m,
+        "gps_used": photo.gps_used,
+        "warnings": photo.warnings,
+    }
+
+
+def _map_json(outcome: MapOutcome) -> dict[str, Any]:
+    errors, tracks = outcome.errors_px, outcome.track_lengths
+    edges = [*_TRACK_BINS, 1 << 30]
+    counts: list[int] = np.histogram(tracks, bins=edges)[0].tolist() if len(tracks) else []
+    return {
+        "map_id": outcome.map_id,
+        "name": outcome.name,
+        "status": outcome.status,
+        "reason_code": outcome.reason_code,
+        "reason": outcome.reason,
+        "photos": outcome.photos,
+        "points": outcome.points,
+        "observations": outcome.observations,
+        "descriptors": outcome.descriptors,
+        "epsg": outcome.epsg,
+        "height_datum": outcome.height_datum,
+        "scale": outcome.scale,
+        "residual_rms_m": outcome.residual_rms_m,
+        "gates": outcome.gates,
+        "cameras": [
+            {
+                "name": c.name,
+                "model": c.model,
+                "width": c.width,
+                "height": c.height,
+                "photos": c.photos,
+                "focal_before_px": c.focal_before_px,
+                "focal_after_px": c.focal_after_px,
+            }
+            for c in outcome.cameras
+        ],
+        "reprojection_px": _percentiles(errors),
+        "track_lengths": [{"from": low, "points": n} for low, n in zip(_TRACK_BINS, counts, strict=False)],
+    }
+
+
+def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
+    return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}
+
+
+def _plain(value: Any) -> Any:
+    """`value` with only what JSON has."""
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if value is None or isinstance(value, (str, int, float, bool)):
+        return value
+    return str(value)
