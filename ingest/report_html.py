@@ -53,7 +53,8 @@ def report_page(report: IngestReport) -> str:
     parts = [
         f"<h1>{escape(title)}</h1>",
         f'<p class="soft">from <code>{escape(report.folder)}</code> '
-        f"into <code>{escape(report.database)}</code>, started {report.started:%Y-%m-%d %H:%M:%S %Z}, job <code>{escape(report.job_id[:16])}</code></p>",
+        f"into <code>{escape(report.database)}</code>, "
+        f"started {report.started:%Y-%m-%d %H:%M:%S %Z}, job <code>{escape(report.job_id[:16])}</code></p>",
         _cards(report),
         *(_note(warning) for warning in report.warnings),
         *(_map(outcome) for outcome in report.maps),
@@ -98,13 +99,14 @@ def _map(outcome: MapOutcome) -> str:
         ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
         ("map id", outcome.map_id or "none"),
     ]
+    notes = "".join(_note(warning) for warning in outcome.warnings)
     pictures = ""
     if outcome.plan is not None:
         pictures += _picture(plan_png(outcome.plan), "Plan view and side view of the map")
     if len(outcome.errors_px):
         pictures += _picture(histograms_png(outcome), "Reprojection errors and track lengths")
     return (
-        f"<h2>Map {escape(outcome.name)} {_pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}"
+        f"<h2>Map {escape(outcome.name)} {_pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + _table((), facts, names=(0,))
         + pictures
         + _cameras(outcome)
@@ -161,7 +163,7 @@ def _files(report: IngestReport) -> str:
         "matches",
         "observations",
         "error, px",
-        "GPS residual, m (horizontal, up)",
+        "GPS off by, m",
     )
     numbers = (4, 5, 6, 7, 8)
     cells = "".join(f'<th class="{"n" if i in numbers else ""}">{h}</th>' for i, h in enumerate(head))
@@ -178,7 +180,7 @@ def _file_row(photo: PhotoOutcome) -> str:
     residual = ""
     if photo.gps_residual_m:
         east, north, up = photo.gps_residual_m
-        residual = f"{math.hypot(east, north):.2f}" + (f", {up:+.2f}" if math.isfinite(up) else "")
+        residual = f"{math.hypot(east, north):.2f}" + (f"<br>{up:+.2f} up" if math.isfinite(up) else "")
         if photo.gps_used is False:
             remarks.append("its GPS was not used: it contradicts the others'")
     elif photo.status != "skipped" and not photo.has_gps:
