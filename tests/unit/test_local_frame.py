@@ -219,3 +219,13 @@ def test_poles_are_finite() -> None:
     frame = LocalFrame(latitude_deg=90.0, longitude_deg=0.0, height_m=0.0)
     enu = np.array([[0.0, 0.0, 10.0], [100.0, 50.0, 0.0]])
     np.testing.assert_allclose(frame.enu_from_geodetic(frame.geodetic_from_enu(enu)), enu, atol=1e-8)
+
+
+@pytest.mark.parametrize("latitude", [0.0, 60.0, 89.99])
+def test_longitudes_stay_in_range_at_the_antimeridian(latitude: float) -> None:
+    # On the meridian itself rounding decides the side; what comes out must be fit to go in again.
+    frame = LocalFrame(latitude_deg=latitude, longitude_deg=180.0, height_m=0.0)
+    enu = points_around(6, 5000.0, n=3000) * [1e-9, 1.0, 1.0]
+    geodetic = frame.geodetic_from_enu(enu)
+    assert np.abs(geodetic[:, 1]).max() <= 180.0
+    np.testing.assert_allclose(frame.enu_from_geodetic(geodetic), enu, rtol=0, atol=2e-8)
