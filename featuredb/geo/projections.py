@@ -43,21 +43,17 @@ def geodetic_from_ecef(ecef: FloatArray) -> FloatArray:
     """Latitude, longitude (degrees) and ellipsoidal height (m), (n, 3), of geocentric points (n, 3) in m.
 
     PROJ inverts in one step of Bowring's method, which is wrong by a micrometre 10 km above the ellipsoid and
-    by millimetres in orbit; one Newton step on its result brings the error down to float64's resolution.
+    by millimetres in orbit; one Newton step on its latitude and height brings the error down to float64's
+    resolution. Longitude needs none: it is the arc tangent of y over x.
     """
     geodetic = _transform(_GEOCENTRIC, ecef, inverse=True)[:, [1, 0, 2]]
     residual = ecef - ecef_from_geodetic(geodetic)
     latitude, longitude = np.radians(geodetic[:, 0]), np.radians(geodetic[:, 1])
-    east, north, up = np.einsum("nij,nj->in", enu_from_ecef_rotation(latitude, longitude), residual)
+    _, north, up = np.einsum("nij,nj->in", enu_from_ecef_rotation(latitude, longitude), residual)
     w_squared = 1.0 - _ECCENTRICITY_SQUARED * np.sin(latitude) ** 2
     prime_vertical = WGS84_SEMI_MAJOR_M / np.sqrt(w_squared)
     meridional = prime_vertical * (1.0 - _ECCENTRICITY_SQUARED) / w_squared
-    parallel_radius = (prime_vertical + geodetic[:, 2]) * np.cos(latitude)
-    # On the axis of the Earth longitude has no meaning, and its correction none either.
-    off_axis = np.abs(parallel_radius) > 1e-3
-    d_longitude = np.divide(east, parallel_radius, out=np.zeros_like(east), where=off_axis)
     geodetic[:, 0] = np.clip(geodetic[:, 0] + np.degrees(north / (meridional + geodetic[:, 2])), -90.0, 90.0)
-    geodetic[:, 1] = _wrapped(geodetic[:, 1] + np.degrees(d_longitude))
     geodetic[:, 2] += up
     return geodetic
 
@@ -119,12 +115,6 @@ def utm_factors(latitude_deg: float, longitude_deg: float, zone: int, south: boo
             f"{longitude_deg}: too far from the zone's central meridian; use the place's own zone"
         )
     return convergence, scale
-
-
-def _wrapped(longitude_deg: FloatArray) -> FloatArray:
-    """Longitudes brought back into [-180, 180]; those within it stay bit for bit."""
-    turns = np.where(longitude_deg > 180.0, -360.0, np.where(longitude_deg < -180.0, 360.0, 0.0))
-    return np.asarray(longitude_deg + turns, dtype=np.float64)
 
 
 def _utm_definition(zone: int, south: bool) -> str:
