@@ -216,13 +216,21 @@ def _with_evidence(
     pixels, points = _pairs(features, area, matches)
     inliers = np.flatnonzero(pose.inliers)
     longer = max(pose.camera.width, pose.camera.height)
+    # A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
+    seen = visible_points(area, matches.point[inliers], pose.camera, pose.cam_from_local)
+    inliers = inliers[np.isin(matches.point[inliers], seen)]
     own = inliers[independent_inliers(pixels[inliers], points[inliers], 0.002 * longer)]
     tolerance_px = options.pose.tolerance_rel * longer
     sample = 4 if pose.focal_is_free else 3
     evidence = Evidence(
         inliers=len(own),
         log_nfa=log_nfa(
-            unguided, unguided_inliers, tolerance_px, pose.camera.width, pose.camera.height, sample
+            unguided,
+            min(unguided_inliers, len(inliers)),
+            tolerance_px,
+            pose.camera.width,
+            pose.camera.height,
+            sample,
         ),
         coverage=coverage(pixels[own], pose.camera.width, pose.camera.height),
         visible_share=len(own) / max(visible, 1),
