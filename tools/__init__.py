@@ -1,0 +1,1 @@
+"""Evaluation, benchmark and check programs. Nothing imports them."""
