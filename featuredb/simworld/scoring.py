@@ -1,0 +1,93 @@
+"""How far an answer is from the truth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
+from featuredb.simworld.truth import Truth
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseError:
+    """Distance of an answered pose from the true one.
+
+    Attributes:
+        east_m, north_m, up_m: answer minus truth along the axes of the truth's local frame.
+        angle_deg: between the orientations.
+    """
+
+    east_m: float
+    north_m: float
+    up_m: float
+    angle_deg: float
+
+    @property
+    def horizontal_m(self) -> float:
+        return float(np.hypot(self.east_m, self.north_m))
+
+    @property
+    def position_m(self) -> float:
+        return float(np.hypot(self.horizontal_m, self.up_m))
+
+
+def pose_error(truth: Truth, name: str, epsg: int, utm: ArrayLike, cam_from_utm_xyzw: ArrayLike) -> PoseError:
+    """Error of an answer given in UTM.
+
+    Args:
+        name: the photo's name in the truth.
+        utm: (3,) easting, northing, ellipsoidal height in the zone `epsg`.
+        cam_from_utm_xyzw: (4,) rotation of grid axes into camera axes.
+    """
+    true = truth.images[name]
+    center = truth.frame.enu_from_utm(np.asarray(utm, dtype=np.float64), epsg)
+    offset = center - true.cam_from_local.center
+    grid_from_local = truth.frame.grid_from_enu(center, epsg)
+    rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ grid_from_local
+    return PoseError(
+        east_m=float(offset[0]),
+        north_m=float(offset[1]),
+        up_m=float(offset[2]),
+        angle_deg=float(np.degrees(rotation_angle(rotation @ true.cam_from_local.rotation.T))),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """What a group of queries came to.
+
+    Attributes:
+        queries, localised: counts.
+        position_m, angle_deg: (median, 95th percentile) over the localised ones; NaN where there are none.
+        within: share of all queries within 0.25 m and 0.3 degrees.
+        wrong: answers more than 5 m off.
+    """
+
+    queries: int
+    localised: int
+    position_m: tuple[float, float]
+    angle_deg: tuple[float, float]
+    within: float
+    wrong: int
+
+
+def summarise(errors: Sequence[PoseError | None]) -> Summary:
+    """Summary of errors, None standing for "not localised"."""
+    found = [e for e in errors if e is not None]
+    close = sum(e.position_m <= 0.25 and e.angle_deg <= 0.3 for e in found)
+    return Summary(
+        queries=len(errors),
+        localised=len(found),
+        position_m=_median_and_95([e.position_m for e in found]),
+        angle_deg=_median_and_95([e.angle_deg for e in found]),
+        within=close / len(errors) if errors else float("nan"),
+        wrong=sum(e.position_m > 5.0 for e in found),
+    )
+
+
+def _median_and_95(values: list[float]) -> tuple[float, float]:
+    if not values:
+        return float("nan"), float("nan")
+    return float(np.median(values)), float(np.percentile(values, 95))
