@@ -167,7 +167,8 @@ class MapOutcome:
     def warnings(self) -> tuple[str, ...]:
         """What a person should know before relying on the map."""
         return tuple(
-            f"The focal length of {c.name} became {c.focal_after_px:.0f} px, EXIF says {c.focal_before_px:.0f}. "
+            f"The focal length of {c.name} became {c.focal_after_px:.0f} px, "
+            f"EXIF says {c.focal_before_px:.0f}. "
             "Photos that all look the same way from one height cannot tell focal length from height, so "
             "heights above the ground may be wrong by the same share; add photos from other heights or "
             "directions, or keep the focal length fixed."
