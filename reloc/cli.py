@@ -175,7 +175,6 @@ def _answer_all(
     other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
 ) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
-    from reloc.overlay import write_overlay
     from reloc.wording import describe
 
     codes = {0}
@@ -188,6 +187,8 @@ def _answer_all(
             if reply.status != "localised":
                 codes.add(_NOT_LOCALISED)
             elif args.overlay is not None:
+                from reloc.overlay import write_overlay
+
                 target = _overlay_path(args.overlay, path, args.image)
                 write_overlay(target, data, reply, other_points(reply))
                 sys.stderr.write(f"wrote {target}\n")

@@ -23,7 +23,7 @@ def describe(name: str, reply: LocaliseReply) -> str:
         advice = ADVICE.get(reply.reason or "", "")
         return (
             f"{name}: not localised: {reply.reason} ({reply.detail})\n"
-            f"  {reply.inliers} of {reply.matches} matches agree, {reply.features} features, {total:.0f} ms\n"
+            f"  {reply.inliers} inliers, {reply.matches} matches, {reply.features} features, {total:.0f} ms\n"
             f"  try: {advice}\n"
         )
     utm, position, accuracy = reply.utm, reply.position, reply.accuracy
@@ -34,7 +34,7 @@ def describe(name: str, reply: LocaliseReply) -> str:
         f"  WGS84     {position.lat:.8f}, {position.lon:.8f}  h {position.h:.3f} m\n"
         f"  68 %      {accuracy.horizontal_68_m:.3f} m horizontally, "
         f"{accuracy.vertical_68_m:.3f} m vertically, {accuracy.orientation_68_deg:.3f} deg\n"
-        f"  evidence  {reply.inliers} of {reply.matches} matches agree, residual "
+        f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
         f"{reply.residual_rms_px or 0.0:.2f} px, camera from {reply.camera.source}, "
         f"maps {', '.join(reply.maps)}\n"
         f"  time      {total:.0f} ms, snapshot {reply.snapshot}\n"

@@ -32,3 +32,4 @@ def log_to(stream: TextIO, level: int = logging.INFO) -> None:
         logger = logging.getLogger(name)
         logger.addHandler(handler)
         logger.setLevel(level)
+        logger.propagate = False  # or each line comes a second time, in the program's own format

@@ -10,12 +10,11 @@ from typing import Self
 
 import zenoh
 
-from featuredb.errors import FeatureDbError
 from reloc.service.metrics import Metrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue
-from reloc.service.session import Keys, bind_free_port, open_server_session
+from reloc.service.session import Keys, ServiceStartError, bind_free_port, open_server_session
 from reloc.service.source import AreaSource, ServedArea
 from reloc.service.watcher import AreaWatcher
 from reloc.service.worker import WorkerPool
@@ -54,7 +53,6 @@ class Server:
         *,
         source: AreaSource,
         area: ServedArea,
-        served_version: int,
         session: zenoh.Session,
         endpoints: tuple[str, ...],
         database: str,
@@ -76,7 +74,7 @@ class Server:
         self._workers = WorkerPool(self._queue, self._watch, lambda: self._area, options)
         self._watcher = AreaWatcher(
             source,
-            served_version=served_version,
+            served_version=area.snapshot,
             poll_interval_s=options.poll_interval_s,
             on_area=self._swap,
             on_failure=self._reload_failed,
@@ -94,7 +92,6 @@ class Server:
             ServiceStartError: cannot listen.
             FeatureDbError: the area cannot be loaded.
         """
-        served_version = source.version()
         area = source.load()
         endpoints = tuple(bind_free_port(endpoint) for endpoint in options.listen)
         session = open_server_session(
@@ -103,13 +100,16 @@ class Server:
         server = cls(
             source=source,
             area=area,
-            served_version=served_version,
             session=session,
             endpoints=endpoints,
             database=database,
             options=options,
         )
-        server._declare()
+        try:
+            server._declare()
+        except zenoh.ZError as error:
+            session.close()
+            raise ServiceStartError(f"cannot declare the keys of {database!r}: {error}") from error
         return server
 
     def _declare(self) -> None:
@@ -265,8 +265,10 @@ class Server:
                 encoding=_JSON,
                 congestion_control=zenoh.CongestionControl.BLOCK,
             )
-        except zenoh.ZError as error:
-            raise FeatureDbError(f"event {kind} could not be published: {error}") from error
+        except zenoh.ZError:  # nobody's answer hangs on it
+            logger.warning(
+                "event could not be published", exc_info=True, extra={"fields": event.model_dump()}
+            )
 
     def _log(self, event: str, **fields: object) -> None:
         logger.info(

@@ -8,8 +8,19 @@ from threadpoolctl import threadpool_limits
 
 
 @contextmanager
-def capped_threads(count: int) -> Iterator[None]:
-    """Within the block OpenCV (the process) and BLAS and OpenMP (this thread) use at most `count` threads."""
+def capped_process(count: int) -> Iterator[None]:
+    """Within the block OpenCV and BLAS use at most `count` threads, in all threads of the process."""
+    before = cv2.getNumThreads()
     cv2.setNumThreads(count)
-    with threadpool_limits(limits=count):
+    try:
+        with threadpool_limits(limits=count):
+            yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+@contextmanager
+def capped_thread(count: int) -> Iterator[None]:
+    """Within the block OpenMP regions that this thread enters use at most `count` threads."""
+    with threadpool_limits(limits=count, user_api="openmp"):
         yield

@@ -4,7 +4,6 @@ import logging
 import threading
 from collections.abc import Callable
 
-from featuredb.errors import FeatureDbError
 from reloc.service.source import AreaSource, ServedArea
 
 logger = logging.getLogger(__name__)
@@ -53,8 +52,8 @@ class AreaWatcher:
             if version == self._served:
                 return True
             area = self._source.load()
-        except (FeatureDbError, OSError, ValueError, RuntimeError, MemoryError) as error:
-            # A store may break in any of these ways; the area in service is whole and stays.
+        except Exception as error:
+            # A store may break in many ways; the area in service is whole and stays.
             logger.exception(
                 "reload failed; the running snapshot stays in service",
                 extra={"fields": {"event": "reload_failed", "snapshot": version}},
@@ -63,6 +62,6 @@ class AreaWatcher:
             return False
         if self._stop.is_set():
             return True
-        self._served = version
+        self._served = area.snapshot
         self._on_area(area)
         return True

@@ -4,13 +4,14 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 from reloc.service.handler import StageClock, answer_query
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.source import ServedArea
-from reloc.service.threads import capped_threads
+from reloc.service.threads import capped_process, capped_thread
 from reloc.wire import ErrorCode, RequestError, parse_request
 
 logger = logging.getLogger(__name__)
@@ -32,6 +33,7 @@ class WorkerPool:
         self._options = options
         self._busy: set[PendingQuery] = set()
         self._lock = threading.Lock()
+        self._caps = ExitStack()
         self._threads = [
             threading.Thread(target=self._run, name=f"localise-{i}", daemon=True)
             for i in range(options.workers)
@@ -42,6 +44,7 @@ class WorkerPool:
         return len(self._busy)
 
     def start(self) -> None:
+        self._caps.enter_context(capped_process(self._options.threads_per_worker))
         for thread in self._threads:
             thread.start()
 
@@ -50,11 +53,12 @@ class WorkerPool:
         end = time.perf_counter() + timeout_s
         for thread in self._threads:
             thread.join(max(0.0, end - time.perf_counter()))
+        self._caps.close()
         with self._lock:
             return list(self._busy)
 
     def _run(self) -> None:
-        with capped_threads(self._options.threads_per_worker):
+        with capped_thread(self._options.threads_per_worker):
             while (item := self._queue.get()) is not None:
                 with self._lock:
                     self._busy.add(item)

@@ -8,7 +8,15 @@ from pydantic import ValidationError
 
 from featuredb.features.decode import DecodeLimits
 from reloc.service.options import ServeOptions
-from reloc.wire import ErrorCode, LocaliseReply, LocaliseWireRequest, MapsReply, RequestError, StatusReply, parse_request
+from reloc.wire import (
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    MapsReply,
+    RequestError,
+    StatusReply,
+    parse_request,
+)
 from schemas import load_schema
 from tests.support.service import (
     MemorySource,
@@ -62,7 +70,9 @@ def messages():
             "featuredb/town/events", lambda s: found["event"].append(s.payload.to_bytes())
         ):
             for attachment in (b"", b'{"options": {"inliers": true}}', b'{"request_id": "r1"}'):
-                found["localise_reply"].append(raw(session, "localise", payload=photo(), attachment=attachment))
+                found["localise_reply"].append(
+                    raw(session, "localise", payload=photo(), attachment=attachment)
+                )
             for payload, attachment in ((b"x", b""), (photo(), b"{"), (bytes(200_000), b"")):
                 found["error"].append(raw(session, "localise", payload=payload, attachment=attachment))
             found["status"].append(raw(session, "status"))
@@ -99,7 +109,9 @@ def test_a_localised_reply_is_a_geopose_and_readers_that_know_only_that_can_read
     assert reply["body_axes"] == BODY_AXES
 
 
-@pytest.mark.parametrize("field", ["position", "utm", "covariance", "accuracy", "camera", "snapshot", "timings_ms"])
+@pytest.mark.parametrize(
+    "field", ["position", "utm", "covariance", "accuracy", "camera", "snapshot", "timings_ms"]
+)
 def test_schema_and_reader_both_refuse_a_localised_reply_without(messages, field):
     reply = json.loads(messages["localise_reply"][0])
     del reply[field]
@@ -130,7 +142,14 @@ GOOD_REQUESTS = [
     {"prior": {"lat": -90, "lon": 180, "sigma_m": 0.01}},
     {"prior": {"lat": 1.5, "lon": 2, "sigma_m": 5, "h": None}},
     {"prior": {"lat": 1.5, "lon": 2, "sigma_m": 5, "h": -100.5, "sigma_vertical_m": 3}},
-    {"camera": {"model": "SIMPLE_RADIAL", "width": 4000, "height": 3000, "params": [3000, 2000, 1500, -0.01]}},
+    {
+        "camera": {
+            "model": "SIMPLE_RADIAL",
+            "width": 4000,
+            "height": 3000,
+            "params": [3000, 2000, 1500, -0.01],
+        }
+    },
     {"camera": None, "prior": None, "request_id": None, "contribute": True, "options": {}},
     {"options": {"inliers": True, "exif_prior": False, "maps": ["a", "b"], "deadline_ms": 250}},
 ]

@@ -45,9 +45,7 @@ def view(east: float, north: float, up: float, tilt_deg: float, heading_deg: flo
 
 def render(texture: NDArray[np.uint8], cam_from_local: Rigid3, seed: int = 0) -> NDArray[np.uint8]:
     """Photo (480, 640) uint8 of the field by CAMERA, with a little noise."""
-    local_from_texel = np.array(
-        [[_TEXEL_M, 0, -_SIDE_M / 2], [0, -_TEXEL_M, _SIDE_M / 2], [0, 0, 1.0]]
-    )
+    local_from_texel = np.array([[_TEXEL_M, 0, -_SIDE_M / 2], [0, -_TEXEL_M, _SIDE_M / 2], [0, 0, 1.0]])
     k = np.array([[600.0, 0, 320.0], [0, 600.0, 240.0], [0, 0, 1]])
     r, t = cam_from_local.rotation, cam_from_local.translation
     image_from_texel = k @ np.column_stack([r[:, 0], r[:, 1], t]) @ local_from_texel
@@ -78,7 +76,7 @@ def planar_map(
     found = [extract(render(texture, pose, seed=i), options) for i, pose in enumerate(poses)]
     ground = [_on_ground(f.xy, pose) for f, pose in zip(found, poses, strict=True)]
     points, rows = _tracks(ground, [f.scale for f in found])
-    point_index = np.concatenate([r for r in rows])
+    point_index = np.concatenate(rows)
     image_id = np.concatenate([np.full(len(r), i) for i, r in enumerate(rows)])
     keep = point_index >= 0
     length = np.bincount(point_index[keep], minlength=len(points))
@@ -144,9 +142,9 @@ def _tracks(
             distance, nearest = cKDTree(points).query(places)
             fits = (distance < 0.05) & (np.abs(np.log(scale / sizes[nearest])) < 0.3)
             # One keypoint of a view per point: the closest.
-            for i in np.flatnonzero(fits)[np.argsort(distance[fits])]:
-                if nearest[i] not in row:
-                    row[i] = nearest[i]
+            order = np.flatnonzero(fits)[np.argsort(distance[fits])]
+            _, first = np.unique(nearest[order], return_index=True)
+            row[order[first]] = nearest[order[first]]
         new = np.flatnonzero(row < 0)
         row[new] = len(points) + np.arange(len(new))
         points = np.concatenate([points, places[new]])

@@ -1,0 +1,312 @@
+"""The commands on a real database and a real map with exact truth: serve, query, localise, hot reload."""
+
+import io
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from importlib.metadata import EntryPoint
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from featuredb.cli.main import build_parser, run_command
+from featuredb.errors import ServiceError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import geodetic_from_utm
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import matrix_from_quaternion
+from featuredb.store import Database
+from reloc.client import CameraRequest, Client, PriorRequest
+from reloc.overlay import project_utm
+from reloc.wire import LocaliseReply
+from tests.support.planar_map import (
+    CAMERA,
+    EASTING,
+    EPSG,
+    HEIGHT,
+    NORTHING,
+    field_texture,
+    planar_map,
+    render,
+    view,
+)
+
+pytestmark = pytest.mark.slow
+
+CAMERA_TEXT = "PINHOLE,640,480,600,600,320,240"
+CAMERA_REQUEST = CameraRequest(model="PINHOLE", width=640, height=480, params=CAMERA.params)
+HELD_OUT = {"a.png": view(4, -6, 40, 10, 33), "b.png": view(-7, 8, 50, 20, 200)}
+# The map's points are exact, so what remains is half a pixel of keypoint noise at 40 to 50 m.
+TOLERANCE_M, TOLERANCE_DEG = 0.05, 0.1
+
+
+def png(gray) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(gray).save(out, "PNG")
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def field():
+    return planar_map(1)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    texture = field_texture(1)
+    for i, (name, pose) in enumerate(HELD_OUT.items()):
+        (folder / name).write_bytes(png(render(texture, pose, seed=50 + i)))
+    (folder / "elsewhere.png").write_bytes(png(render(field_texture(9), HELD_OUT["a.png"])))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def database(tmp_path_factory, field):
+    path = tmp_path_factory.mktemp("store") / "Field maps"
+    Database.create(path).commit_map(field)
+    return path
+
+
+def parse(*argv: str):
+    entry = EntryPoint(name="reloc", value="reloc.cli:register", group="featuredb.commands")
+    return build_parser([entry]).parse_args([str(a) for a in argv])
+
+
+def run(*argv: str) -> int:
+    args = parse(*argv)
+    return run_command(args.run, args)
+
+
+_PROGRAM = """
+import sys
+from importlib.metadata import EntryPoint
+from featuredb.cli.main import build_parser, run_command
+entry = EntryPoint(name="reloc", value="reloc.cli:register", group="featuredb.commands")
+args = build_parser([entry]).parse_args(sys.argv[1:])
+sys.exit(run_command(args.run, args))
+"""
+
+
+class ServeProcess:
+    """`featuredb serve` as a process of its own on a free port."""
+
+    def __init__(self, *argv: object) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM, "serve", *map(str, argv), "--listen", "tcp/127.0.0.1:0"],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        self.errors: list[str] = []
+        # Read both pipes to their ends, so that the server never waits for us.
+        self._reader = threading.Thread(target=lambda: self.errors.extend(self.process.stderr))
+        self._reader.start()
+        self.announced = self.process.stdout.readline()
+        assert " on tcp/" in self.announced, (self.announced, self.stop())
+        self.endpoint = self.announced.split(" on ")[1].split(";")[0]
+
+    def stop(self, number: int = signal.SIGTERM) -> int:
+        self.process.send_signal(number)
+        code = self.process.wait(30)
+        self._reader.join(10)
+        self.process.stdout.close()
+        self.process.stderr.close()
+        return code
+
+    def log(self) -> list[dict]:
+        return [json.loads(line) for line in self.errors if line.startswith("{")]
+
+
+@pytest.fixture(scope="module")
+def server(database):
+    process = ServeProcess(database)
+    yield process
+    assert process.stop() == 0
+
+
+def assert_pose(reply: LocaliseReply, truth: Rigid3, east_m: float = 0.0) -> None:
+    """Against the truth by UTM and rotation, independently of the GeoPose."""
+    frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
+    utm = frame.utm_from_enu(truth.center, EPSG)
+    found = (reply.utm.easting, reply.utm.northing, reply.utm.height)
+    assert np.linalg.norm(utm - found) < TOLERANCE_M
+    cam_from_grid = matrix_from_quaternion(reply.utm.cam_from_utm_xyzw)
+    expected = truth.rotation @ frame.grid_from_enu(truth.center, EPSG).T
+    angle = np.degrees(np.arccos(np.clip((np.trace(cam_from_grid @ expected.T) - 1) / 2, -1, 1)))
+    assert angle < TOLERANCE_DEG
+
+
+def test_query_command_prints_json_with_the_true_pose(server, photos, capsys):
+    images = [str(photos / name) for name in HELD_OUT]
+    assert run("query", *images, "--connect", server.endpoint, "--camera", CAMERA_TEXT, "--json") == 0
+    lines = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [line.pop("image") for line in lines] == images
+    for line, truth in zip(lines, HELD_OUT.values(), strict=True):
+        reply = LocaliseReply.model_validate_json(json.dumps(line))
+        assert reply.maps == ("field",)
+        assert reply.lineage[0].method == "gcp"
+        assert_pose(reply, truth)
+        stages = [ms for name, ms in reply.timings_ms.items() if name != "total"]
+        assert sum(stages) == pytest.approx(reply.timings_ms["total"], abs=0.01)
+
+
+def test_localise_command_gives_the_same_answer_without_a_server(server, database, photos, capsys):
+    image = str(photos / "a.png")
+    run("query", image, "--connect", server.endpoint, "--camera", CAMERA_TEXT, "--json")
+    over_the_wire = json.loads(capsys.readouterr().out)
+    assert run("localise", str(database), image, "--camera", CAMERA_TEXT, "--json") == 0
+    here = json.loads(capsys.readouterr().out)
+    assert {**over_the_wire, "timings_ms": 0, "request_id": 0} == {**here, "timings_ms": 0, "request_id": 0}
+
+
+def test_people_read_utm_degrees_accuracy_and_what_to_try(server, photos, capsys):
+    code = run(
+        "query",
+        str(photos / "a.png"),
+        str(photos / "elsewhere.png"),
+        "--connect",
+        server.endpoint,
+        "--camera",
+        CAMERA_TEXT,
+    )
+    out = capsys.readouterr().out
+    assert code == 1
+    frame = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
+    easting, northing, _ = frame.utm_from_enu(HELD_OUT["a.png"].center, EPSG)
+    assert float(re.search(rf"EPSG:{EPSG}  E (\S+)", out)[1]) == pytest.approx(easting, abs=TOLERANCE_M)
+    lat, lon, _ = geodetic_from_utm((easting, northing, HEIGHT), EPSG)
+    said = re.search(r"WGS84 +(\S+), (\S+) +h", out)
+    assert (float(said[1]), float(said[2])) == pytest.approx((lat, lon), abs=1e-6)  # 0.1 m
+    assert "68 %" in out
+    assert "not localised: TOO_FEW_" in out
+    assert "try:" in out
+
+
+def test_overlay_projects_the_inliers_onto_their_keypoints(server, database, photos, tmp_path, capsys):
+    targets = tmp_path / "query.png", tmp_path / "here.png"
+    common = [str(photos / "a.png"), "--camera", CAMERA_TEXT, "--json", "--overlay"]
+    assert run("query", *common, str(targets[0]), "--connect", server.endpoint) == 0
+    reply_json = json.loads(capsys.readouterr().out)
+    reply_json.pop("image")
+    reply = LocaliseReply.model_validate_json(json.dumps(reply_json))
+    assert run("localise", str(database), *common, str(targets[1])) == 0
+    keypoints = np.array(reply.inlier_points.pixels)
+    projected = project_utm(reply, np.array(reply.inlier_points.utm))
+    residual = np.linalg.norm(keypoints - projected, axis=1)
+    assert len(residual) == reply.inliers
+    # The drawing's own projection agrees with the pose estimator's residual.
+    assert np.sqrt((residual**2).mean()) == pytest.approx(reply.residual_rms_px, rel=0.5)
+    assert residual.max() < 4.0
+    photo = cv2.imread(str(photos / "a.png"))
+    query, here = (cv2.imread(str(t)) for t in targets)
+    assert query.shape == here.shape == photo.shape
+    green = (query[:, :, 1].astype(int) - query[:, :, 0] > 60).sum()
+    blue = [(p[:, :, 0].astype(int) - p[:, :, 2] > 60).sum() for p in (query, here)]
+    assert green > 1000
+    assert blue[0] == 0, "a client knows no other points"
+    assert blue[1] > 300, "the database does"
+
+
+def test_several_overlays_get_names_of_their_own(database, photos, tmp_path, capsys):
+    images = [str(photos / name) for name in HELD_OUT]
+    run("localise", str(database), *images, "--camera", CAMERA_TEXT, "--overlay", str(tmp_path / "o.png"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["o-a.png", "o-b.png"]
+
+
+def test_priors_select_and_contradict(server, photos, capsys):
+    lat, lon, _ = geodetic_from_utm((EASTING, NORTHING, HEIGHT), EPSG)
+    image = (photos / "a.png").read_bytes()
+    with Client(server.endpoint) as client:
+        assert client.database == "Field-maps"
+        near = client.localise(image, PriorRequest(lat=lat, lon=lon, sigma_m=20), CAMERA_REQUEST)
+        assert_pose(near, HELD_OUT["a.png"])
+        far = client.localise(image, PriorRequest(lat=lat + 1, lon=lon, sigma_m=20), CAMERA_REQUEST)
+        assert (far.status, far.reason) == ("not_localised", "NO_COVERAGE")
+        pole = client.localise(image, PriorRequest(lat=90, lon=0, sigma_m=20), CAMERA_REQUEST)
+        assert (pole.status, pole.reason) == ("not_localised", "NO_COVERAGE")
+        with pytest.raises(ServiceError, match="nowhere") as caught:
+            client.localise(image, camera=CAMERA_REQUEST, maps=("nowhere",))
+        assert caught.value.code == "BAD_REQUEST"
+
+
+def test_bad_arguments_are_explained(photos, tmp_path, capsys):
+    image = str(photos / "a.png")
+    assert run("query", image, "--prior", "91,0,5") == 2
+    assert "LAT,LON,SIGMA_M" in capsys.readouterr().err
+    assert run("query", image, "--camera", "PINHOLE,640") == 2
+    assert "MODEL,WIDTH,HEIGHT" in capsys.readouterr().err
+    assert run("query", image, "--connect", "tcp/127.0.0.1:9") == 2
+    assert "nobody answers at tcp/127.0.0.1:9" in capsys.readouterr().err
+    assert run("serve", str(tmp_path / "none")) == 2
+    assert "create the database with `featuredb init`" in capsys.readouterr().err
+
+
+def test_an_unreadable_image_does_not_stop_the_others(server, photos, tmp_path, capsys):
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"\xff\xd8\xff\xe0 not much")
+    images = [str(broken), str(tmp_path / "missing.jpg"), str(photos / "a.png")]
+    assert run("query", *images, "--connect", server.endpoint, "--camera", CAMERA_TEXT) == 2
+    captured = capsys.readouterr()
+    assert "BAD_IMAGE" in captured.err
+    assert "missing.jpg: No such file" in captured.err
+    assert "a.png: localised" in captured.out
+
+
+def test_a_map_of_another_extractor_is_refused_not_answered_wrongly(tmp_path, photos):
+    database = Database.create(tmp_path / "other")
+    database.commit_map(planar_map(1, fingerprint="another-extractor"))
+    process = ServeProcess(tmp_path / "other")
+    with Client(process.endpoint) as client, pytest.raises(ServiceError, match="another-extractor") as caught:
+        client.localise((photos / "a.png").read_bytes(), camera=CAMERA_REQUEST)
+    assert caught.value.code == "INCOMPATIBLE_EXTRACTOR"
+    assert process.stop() == 0
+
+
+def test_hot_reload_commit_retire_and_a_clean_end(tmp_path, field, photos):
+    """A map committed while the server runs answers within seconds, a retired one no more."""
+    database = Database.create(tmp_path / "growing")
+    process = ServeProcess(tmp_path / "growing", "--name", "growing")
+    image = (photos / "a.png").read_bytes()
+    with Client(process.endpoint) as client, client.watch_events() as events:
+
+        def wait_for_reload() -> list[str]:
+            seen = []
+            while (event := events.next(timeout_s=20)) is not None:
+                seen.append(event.type)
+                if event.type == "reloaded":
+                    return seen
+            raise AssertionError(f"no reload within 20 s, only {seen}; log: {process.errors}")
+
+        before = client.localise(image, camera=CAMERA_REQUEST)
+        assert (before.status, before.reason) == ("not_localised", "NO_COVERAGE")
+        assert client.maps().maps == ()
+        database.commit_map(field)
+        assert wait_for_reload() == ["map_committed", "reloaded"]
+        after = client.localise(image, camera=CAMERA_REQUEST)
+        assert_pose(after, HELD_OUT["a.png"])
+        assert after.snapshot == database.poll_version() > before.snapshot
+        (info,) = client.maps().maps
+        assert (info.map_id, info.points, info.images) == ("field", len(field.points), 9)
+        assert info.tiles
+        south_west = geodetic_from_utm(field.points.utm.min(axis=0), EPSG)
+        assert (info.bounds.south, info.bounds.west) == pytest.approx(south_west[:2], abs=1e-4)
+        database.retire("field", "test")
+        assert wait_for_reload() == ["map_retired", "reloaded"]
+        assert client.localise(image, camera=CAMERA_REQUEST).reason == "NO_COVERAGE"
+    assert process.stop(signal.SIGTERM) == 0
+    log = process.log()
+    assert [line["event"] for line in log if line.get("event") in ("serving", "stopped")] == [
+        "serving",
+        "stopped",
+    ]
+    answered = [line for line in log if line.get("event") == "answered"]
+    assert [line["status"] for line in answered] == ["not_localised", "localised", "not_localised"]
+    assert len({line["request_id"] for line in answered}) == 3

@@ -1,0 +1,143 @@
+"""Parts of the service that need no network."""
+
+import threading
+import time
+
+import cv2
+import pytest
+from threadpoolctl import threadpool_info
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.geopose import BODY_AXES
+from featuredb.geometry.camera import Camera
+from reloc.reply import reply_from_result
+from reloc.result import REASONS
+from reloc.service.handler import StageClock
+from reloc.service.metrics import Metrics
+from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
+from reloc.service.session import Keys, bind_free_port
+from reloc.service.threads import capped_process
+from reloc.wire import encode, parse_request
+from reloc.wording import ADVICE, describe
+from tests.support.service import localised, not_localised
+
+
+@pytest.mark.parametrize(
+    ("url", "name"),
+    [
+        ("/data/My town.db", "My-town.db"),
+        ("maps", "maps"),
+        ("/data/maps/", "maps"),
+        ("s3://bucket/prefix/oslo_2", "oslo_2"),
+        ("/data/Zürich", "Z-rich"),
+        ("/data/**", "default"),
+        ("/data/" + "x" * 200, "x" * 64),
+    ],
+)
+def test_the_wire_name_of_a_database(url, name):
+    assert wire_name_of(url) == name
+    assert Keys(database=name).of("localise") == f"featuredb/{name}/localise"
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "-x", "a" * 65, "a?", "$x"])
+def test_names_that_are_no_zenoh_chunk_are_refused(name):
+    with pytest.raises(InvalidValueError, match="--name"):
+        check_wire_name(name)
+
+
+@pytest.mark.parametrize(
+    "field", ["workers", "max_queue", "deadline_s", "poll_interval_s", "max_queued_bytes"]
+)
+def test_options_must_be_positive(field):
+    with pytest.raises(InvalidValueError, match=field):
+        ServeOptions(**{field: 0})
+
+
+def test_a_server_must_listen_somewhere():
+    with pytest.raises(InvalidValueError, match="listen"):
+        ServeOptions(listen=())
+
+
+def test_port_zero_becomes_a_free_port_and_others_stay():
+    first, second = (bind_free_port("tcp/127.0.0.1:0") for _ in range(2))
+    for endpoint in (first, second):
+        kind, address = endpoint.split("/")
+        host, port = address.rsplit(":", 1)
+        assert (kind, host) == ("tcp", "127.0.0.1")
+        assert 1024 <= int(port) <= 65535
+    assert bind_free_port("tcp/127.0.0.1:7447") == "tcp/127.0.0.1:7447"
+    assert bind_free_port("tcp/[::1]:0").startswith("tcp/[::1]:")
+
+
+def test_stages_sum_to_the_total_and_to_the_wall_time():
+    start = time.perf_counter()
+    clock = StageClock(last=start)
+    time.sleep(0.002)
+    clock.end("queue")
+    time.sleep(0.004)
+    clock.split({"features": 1.0, "total": 3.0, "matching": 2.0}, "rest")
+    wall_ms = (time.perf_counter() - start) * 1e3
+    timings = clock.finished()
+    assert list(timings) == ["queue", "features", "matching", "rest", "total"]
+    assert timings["total"] == pytest.approx(sum(list(timings.values())[:-1]), abs=1e-3)
+    assert timings["total"] == pytest.approx(wall_ms, abs=0.5)
+    assert timings["queue"] >= 2.0
+    assert timings["rest"] >= 1.0
+
+
+def test_percentiles_of_the_latency():
+    metrics = Metrics()
+    for ms in range(1, 101):
+        metrics.answered(None if ms % 2 else "AMBIGUOUS", float(ms))
+    latency = metrics.latency()
+    assert (latency.count, latency.p50, latency.max) == (100, 50.5, 100.0)
+    assert latency.p90 == pytest.approx(90.1)
+    counts = metrics.counts()
+    assert (counts.localised, counts.not_localised) == (50, {"AMBIGUOUS": 50})
+
+
+def test_threads_are_capped_within_the_block_and_restored_after_it():
+    before = cv2.getNumThreads()
+    with capped_process(1):
+        assert cv2.getNumThreads() == 1
+        seen = []
+        thread = threading.Thread(
+            target=lambda: seen.extend(p["num_threads"] for p in threadpool_info() if p["user_api"] == "blas")
+        )
+        thread.start()
+        thread.join()
+        assert seen
+        assert set(seen) == {1}
+    assert cv2.getNumThreads() == before
+
+
+def test_every_reason_has_advice():
+    assert set(ADVICE) == set(REASONS)
+
+
+def test_people_read_the_reason_and_what_to_try():
+    reply = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
+    text = describe("photo.jpg", reply)
+    assert text.startswith("photo.jpg: not localised: TOO_FEW_INLIERS (7 of 12 needed)")
+    assert ADVICE["TOO_FEW_INLIERS"] in text
+
+
+def test_a_reply_keeps_every_digit_of_the_pose():
+    camera = Camera(model="PINHOLE", width=160, height=120, params=(150.0, 151.0, 80.5, 60.25))
+    result = localised(3, camera, want_inliers=True)
+    reply = reply_from_result(result, request_id="r", timings_ms={"total": 1.0})
+    again = type(reply).model_validate_json(encode(reply))
+    assert again == reply
+    assert reply.body_axes == BODY_AXES
+    assert (reply.utm.easting, reply.utm.northing, reply.utm.height) == tuple(result.pose.utm)
+    assert reply.utm.cam_from_utm_xyzw == tuple(result.pose.cam_from_utm_xyzw)
+    assert reply.covariance[3][3] == result.pose.covariance[3, 3]
+    assert reply.camera.params == camera.params
+    assert (reply.runner_up.lat, reply.runner_up.lon) == (49.0, 8.4)
+
+
+def test_no_attachment_means_all_defaults():
+    request = parse_request(None)
+    assert request == parse_request(b"") == parse_request(b"{}")
+    assert request.prior is None
+    assert not request.options.inliers
