@@ -49,7 +49,7 @@ class FlightOptions:
 def drone_device(width: int) -> Device:
     """The survey drone: 4:3, 24 mm equivalent, a little barrel distortion, the axis off the centre."""
     f = 0.749 * width
-    params = (f, 1.0007 * f, 0.5034 * width, 0.3727 * width, -0.052, 0.021, 0.0004, -0.0003)
+    params = (f, 1.0007 * f, 0.5009 * width, 0.3744 * width, -0.052, 0.021, 0.0004, -0.0003)
     camera = Camera(model="OPENCV", width=width, height=width * 3 // 4, params=params)
     return Device(make="Simworld", model="SW-Drone 1", camera=camera, focal_mm=8.8, focal_35mm=26)
 
@@ -57,7 +57,7 @@ def drone_device(width: int) -> Device:
 def visitor_device(width: int) -> Device:
     """Another drone, for queries: longer lens, other distortion."""
     f = 0.832 * width
-    params = (f, 0.497 * width, 0.3771 * width, 0.031)
+    params = (f, 0.4992 * width, 0.3754 * width, 0.031)
     camera = Camera(model="SIMPLE_RADIAL", width=width, height=width * 3 // 4, params=params)
     return Device(make="Simworld", model="SW-Mini", camera=camera, focal_mm=6.7, focal_35mm=29)
 

@@ -11,9 +11,9 @@ from featuredb.simworld.texture import Texture, to_image
 
 # label: colour, strength of the 1/f noise, strength of the fine noise
 _KINDS = {
-    "grass": ((98, 116, 62), 0.20, 0.14),
-    "asphalt": ((98, 98, 100), 0.07, 0.09),
-    "pavement": ((156, 150, 142), 0.08, 0.07),
+    "grass": ((98, 116, 62), 0.18, 0.10),
+    "asphalt": ((98, 98, 100), 0.06, 0.055),
+    "pavement": ((156, 150, 142), 0.07, 0.05),
     "gravel": ((164, 152, 132), 0.10, 0.20),
     "soil": ((116, 92, 66), 0.22, 0.16),
     "cobbles": ((134, 122, 112), 0.10, 0.10),
@@ -84,21 +84,19 @@ def _paint_labels(p: _Painter) -> None:
 def _colours(p: _Painter) -> NDArray[np.uint8]:
     """Base colour of each label times (1 + noise)."""
     h, w = p.shape
-    tables = np.zeros((256, 3), np.float32), np.zeros((256, 2), np.float32)
+    tables = np.zeros((5, 256), np.float32)  # red, green, blue, coarse, fine of each label
     for name, (rgb, coarse, fine) in _KINDS.items():
-        tables[0][_LABEL[name]], tables[1][_LABEL[name]] = rgb, (coarse, fine)
-    low, high = fractal(h, w, p.rng, octaves=8, gain=1.35), fractal(h, w, p.rng, octaves=2, gain=0.8)
+        tables[:, _LABEL[name]] = (*rgb, coarse, fine)
+    low, high = fractal(h, w, p.rng, octaves=8, gain=1.35), p.rng.standard_normal((h, w), dtype=np.float32)
     hue = cv2.resize(fractal(h // 8 + 1, w // 8 + 1, p.rng, octaves=6, gain=1.8), (w, h))
     image = np.empty((h, w, 3), np.uint8)
-    for r in range(0, h, 512):  # in bands, for memory's sake
-        rows = slice(r, min(r + 512, h))
-        label = p.labels[rows]
-        strength = tables[1][label]
-        level = 1.0 + strength[..., 0] * low[rows] + strength[..., 1] * high[rows]
-        rgb = tables[0][label] * level[..., None]
-        rgb[..., 0] += 34.0 * strength[..., 0] * hue[rows]
-        rgb[..., 2] -= 14.0 * strength[..., 0] * hue[rows]
-        image[rows] = to_image(rgb)
+    for r in range(0, h, 256):  # in bands, for memory's sake
+        rows = slice(r, min(r + 256, h))
+        red, green, blue, coarse, fine = (cv2.LUT(p.labels[rows], table) for table in tables)
+        level = 1.0 + coarse * low[rows] + fine * high[rows]
+        cast = coarse * hue[rows]
+        for channel, (base, shift) in enumerate(((red, 34.0), (green, 0.0), (blue, -14.0))):
+            image[rows, :, channel] = cv2.convertScaleAbs(np.maximum(base * level + np.float32(shift) * cast, 0))
     return image
 
 

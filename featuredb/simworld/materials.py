@@ -53,7 +53,7 @@ def water_texture(seed: int) -> Texture:
     """Waves of one moment: another seed has nothing in common with it."""
     rng = np.random.default_rng((seed, 78))
     waves = periodic(512, rng, exponent=0.9, low=6, high=90)
-    glints = np.clip(periodic(512, rng, exponent=0.3, low=20) - 2.2, 0, 1.5)
+    glints = np.clip(waves - 2.0, 0, 1.5)
     level = 1.0 + 0.16 * waves + 0.9 * glints
     return Texture.from_image(to_image(level[..., None] * np.array([62, 82, 88], np.float32)), 0.06)
 
@@ -70,7 +70,7 @@ def _noisy(
 
 def _detail(rng: np.random.Generator) -> Texture:
     """Grey around 128, multiplied (as value / 128) over other textures: dirt, grain, scratches."""
-    level = 1.0 + 0.10 * periodic(_SIZE, rng, exponent=0.75) + 0.05 * periodic(_SIZE, rng, exponent=0.1)
+    level = 1.0 + 0.08 * periodic(_SIZE, rng, exponent=0.75) + 0.04 * periodic(_SIZE, rng, exponent=0.1)
     stains = np.clip(periodic(_SIZE, rng, exponent=1.4, low=3) - 1.2, 0, 2)
     image = _coloured((128, 128, 128), (level - 0.14 * stains).astype(np.float32))
     for _ in range(250):

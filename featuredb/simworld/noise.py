@@ -37,4 +37,6 @@ def periodic(size: int, rng: np.random.Generator, *, exponent: float = 1.0, low:
 
 def _normalised(field: Image32) -> Image32:
     mean, deviation = cv2.meanStdDev(field)
-    return np.asarray((field - np.float32(mean[0, 0])) * np.float32(1.0 / deviation[0, 0]), dtype=np.float32)
+    field -= np.float32(mean[0, 0])
+    field *= np.float32(1.0 / deviation[0, 0])
+    return field

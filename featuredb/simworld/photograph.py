@@ -11,11 +11,11 @@ from featuredb.simworld.raster import Rendered, render
 from featuredb.simworld.scene import Faces, Scene
 from featuredb.simworld.sensor import SensorOptions, expose, jpeg_bytes
 from featuredb.simworld.shot import Shot
-from featuredb.simworld.solids import car
+from featuredb.simworld.solids import car, instances
 from featuredb.simworld.texture import Image8
 
 _SUPERSAMPLE = 2  # rays per pixel and direction; with one, thin things flicker and edges are jagged
-_CAR_SPACING_M = 38.0  # moving cars along a lane, on average
+_CAR_SPACING_M = 70.0  # moving cars along a lane, on average
 _MOVING_ID = 30_000
 
 
@@ -43,17 +43,20 @@ def render_depth(scene: Scene, camera: Camera, cam_from_local: Rigid3) -> Render
 def moving_cars(scene: Scene, moment: int) -> Faces:
     """Cars on the lanes at a moment, in the local frame."""
     rng = np.random.default_rng((scene.seed, moment, 6))
-    parts = []
+    places, yaws = [], []
     for s in scene.plan.streets:
         for lane, heading in ((-0.25 * s.width, 0.0), (0.25 * s.width, 180.0)):
             for _ in range(rng.poisson((s.end - s.start) / _CAR_SPACING_M)):
                 a = float(rng.uniform(s.start + 4, s.end - 4))
                 x, y = (a, s.at + lane) if s.along == "x" else (s.at - lane, a)
                 over_water = scene.plan.river[0] - 3 < y < scene.plan.river[1] + 3
-                ground = 0.03 if over_water else float(scene.plan.height(y))
-                tint = tuple(float(c) for c in rng.uniform(0.15, 1.0) * rng.uniform(0.6, 1.0, 3))
-                parts.append(car(x, y, ground, heading + (0.0 if s.along == "x" else 90.0), tint, _MOVING_ID))
-    return Faces.concatenate(parts).shaded(scene.plan.to_sun).moved(scene.enu_from_town, np.zeros(3))
+                places.append((x, y, 0.03 if over_water else float(scene.plan.height(y))))
+                yaws.append(heading + (0.0 if s.along == "x" else 90.0))
+    n = len(places)
+    tints = rng.uniform(0.15, 1.0, (n, 1)) * rng.uniform(0.6, 1.0, (n, 3))
+    template = car(0.0, 0.0, 0.0, 0.0, (1.0, 1.0, 1.0), _MOVING_ID)
+    cars = instances(template, np.reshape(places, (n, 3)), yaws, tints)
+    return cars.shaded(scene.plan.to_sun).moved(scene.enu_from_town, np.zeros(3))
 
 
 def photo_bytes(scene: Scene, shot: Shot, sensor: SensorOptions) -> bytes:

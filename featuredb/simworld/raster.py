@@ -2,10 +2,12 @@
 
 For every face the depth and the texture coordinates of a pixel's ray are linear functions of the ray
 divided by one another, so a face costs a few array operations over its window in the image; a depth
-buffer decides between faces. The picture is drawn in tiles that fit the processor's cache, with
-`supersample` squared rays per pixel, and averaged down.
+buffer decides between faces. What is seen is decided by `supersample` squared rays per pixel, its colour
+once per pixel and primitive from textures averaged to the pixel's footprint; the rays' colours are
+averaged. The picture is drawn in tiles that fit the processor's cache.
 """
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -21,11 +23,13 @@ from featuredb.simworld.texture import Image8, Texture
 from featuredb.simworld.view import EllipsoidView, FaceView, view_ellipsoids, view_faces
 
 Float32 = NDArray[np.float32]
+Part = tuple[slice, slice]
 
-_TILE_PX = 512  # side of a tile in rays: its buffers stay in a core's second-level cache
+_TILE_PX = 256  # side of a tile in rays: its buffers stay in a core's second-level cache
 # Texture level = 0.5 log2(area of a ray's footprint) + 0.25 log2(its elongation): between blur and aliasing.
 _DEPTH_POWER = 1.75
-_SHARPNESS = 0.25  # levels; a little sharper than one texel per ray, since rays are averaged afterwards
+_DETAIL_LIMIT = -1.5  # log2 metres: beyond 0.35 m per pixel the fine detail has averaged out
+_SHARPNESS = 0.1  # levels sharper than one texel per pixel; more gives moire on roof tiles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,12 +59,14 @@ class Look:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class _Tile:
-    """One tile of the ray grid; x0, y0 in rays."""
+    """One tile of the ray grid; x0, y0 in rays, center_x and center_y are the rays of the pixels' centres."""
 
     x0: int
     y0: int
     x: Float32
     y: Float32
+    center_x: Float32
+    center_y: Float32
     inverse_depth: Float32
     object_id: NDArray[np.int32]
     rgb: Image8 | None
@@ -75,7 +81,9 @@ class _Job:
     ellipsoids: Ellipsoids
     ellipsoid_view: EllipsoidView
     look: Look | None
-    rays_per_unit: float
+    pixels_per_unit: float
+    centers: tuple[Float32, Float32]
+    scratch: Float32
     supersample: int
 
 
@@ -101,7 +109,9 @@ def render(
         ellipsoids=ellipsoids,
         ellipsoid_view=view_ellipsoids(ellipsoids, camera, cam_from_local),
         look=look,
-        rays_per_unit=camera.focal_px * supersample,
+        pixels_per_unit=camera.focal_px,
+        centers=pixel_rays(camera),
+        scratch=np.empty((4, _TILE_PX**2), np.float32),
         supersample=supersample,
     )
     x, y = pixel_rays(camera, supersample)
@@ -119,18 +129,22 @@ def render(
 
 def _draw_tile(job: _Job, x0: int, y0: int, x: Float32, y: Float32) -> _Tile:
     shape = x.shape
+    n = job.supersample
+    rows, columns = (slice(start // n, (start + size) // n) for start, size in ((y0, shape[0]), (x0, shape[1])))
     tile = _Tile(
         x0=x0,
         y0=y0,
         x=x,
         y=y,
+        center_x=job.centers[0][rows, columns],
+        center_y=job.centers[1][rows, columns],
         inverse_depth=np.zeros(shape, np.float32),
         object_id=np.full(shape, SKY_ID, np.int32),
         rgb=np.zeros((*shape, 3), np.uint8) if job.look is not None else None,
     )
     box = np.array([x0, y0, x0 + shape[1], y0 + shape[0]])
     for view, draw in ((job.face_view, _draw_face), (job.ellipsoid_view, _draw_ellipsoid)):
-        window = view.window * job.supersample
+        window = view.window * n
         low, high = np.maximum(window[:, :2], box[:2]), np.minimum(window[:, 2:], box[2:])
         for i in np.flatnonzero((low < high).all(axis=1)):
             a, b = low[i] - box[:2], high[i] - box[:2]
@@ -138,114 +152,188 @@ def _draw_tile(job: _Job, x0: int, y0: int, x: Float32, y: Float32) -> _Tile:
     return tile
 
 
-def _draw_face(job: _Job, tile: _Tile, i: int, part: tuple[slice, slice]) -> None:
+def _buffers(job: _Job, shape: tuple[int, ...]) -> list[Float32]:
+    """The job's scratch arrays, cut to a shape. Fresh ones of this size would cost more than the arithmetic."""
+    size = shape[0] * shape[1]
+    return [row[:size].reshape(shape) for row in job.scratch]
+
+
+def _linear(row: Float32, x: Float32, y: Float32, out: Float32, spare: Float32) -> None:
+    """out = row @ (x, y, 1)."""
+    np.multiply(x, row[0], out=out)
+    np.multiply(y, row[1], out=spare)
+    out += spare
+    out += row[2]
+
+
+def _draw_face(job: _Job, tile: _Tile, i: int, part: Part) -> None:
     """Draw face i of the view into its part of the tile."""
-    planes = job.face_view.planes[i].astype(np.float32)
+    if tile.inverse_depth[part].min() > job.face_view.nearest[i]:
+        return  # wholly behind what is drawn already
     x, y = tile.x[part], tile.y[part]
-    k, s, t = (x * row[0] + (y * row[1] + row[2]) for row in planes)
+    k, s, t, spare = _buffers(job, x.shape)
+    for row, out in zip(job.face_view.planes[i].astype(np.float32), (k, s, t), strict=True):
+        _linear(row, x, y, out, spare)
     index = int(job.face_view.index[i])
     mask = k > tile.inverse_depth[part]
-    mask &= s >= 0
-    mask &= t >= 0
-    if job.faces.triangle[index]:
-        mask &= (s + t) <= k
-    else:
-        mask &= s <= k
-        mask &= t <= k
-    mask8 = mask.view(np.uint8)
-    if not cv2.hasNonZero(mask8):
-        return
-    rows = np.flatnonzero(mask.any(axis=1))
-    columns = np.flatnonzero(mask.any(axis=0))
-    tight = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-    part = (
-        slice(part[0].start + rows[0], part[0].start + rows[-1] + 1),
-        slice(part[1].start + columns[0], part[1].start + columns[-1] + 1),
+    np.minimum(s, t, out=spare)
+    mask &= spare >= 0
+    (np.add if job.faces.triangle[index] else np.maximum)(s, t, out=spare)
+    mask &= spare <= k
+    tight = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.faces.object_id[index]))
+    if tight is not None and tile.rgb is not None:
+        _paint(tile, tight, _face_colour(job, tile, i, tight.pixels, tight.far_near))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Visible:
+    """Where a primitive is seen: rays of the tile, the pixels they belong to, which rays, range of 1/z."""
+
+    rays: Part
+    pixels: Part
+    mask: NDArray[np.uint8]
+    far_near: tuple[float, float]
+
+
+def _write_geometry(
+    tile: _Tile, part: Part, k: Float32, mask: NDArray[np.uint8], object_id: int
+) -> _Visible | None:
+    """Write 1/z and the id where the mask is set; None where it is set nowhere."""
+    column, row, width, height = cv2.boundingRect(mask)
+    if width == 0:
+        return None
+    n = tile.x.shape[0] // tile.center_x.shape[0]
+    # A window starts and ends at whole pixels; so must its visible part.
+    y0, x0 = row - row % n, column - column % n
+    y1, x1 = -(-(row + height) // n) * n, -(-(column + width) // n) * n
+    inner = slice(y0, y1), slice(x0, x1)
+    rays = (
+        slice(part[0].start + y0, part[0].start + y1),
+        slice(part[1].start + x0, part[1].start + x1),
     )
-    k, s, t, mask = k[tight], s[tight], t[tight], mask[tight]
-    np.copyto(tile.inverse_depth[part], k, where=mask)
-    np.copyto(tile.object_id[part], job.faces.object_id[index], where=mask)
-    if tile.rgb is not None:
-        _shade_face(job, tile.rgb[part], i, (k, s, t), mask)
+    k, mask = k[inner], mask[inner]
+    cv2.copyTo(k, mask, tile.inverse_depth[rays])
+    cv2.copyTo(np.full(k.shape, object_id, np.int32), mask, tile.object_id[rays])
+    low, high, _, _ = cv2.minMaxLoc(k, mask)
+    pixels = tuple(slice(r.start // n, r.stop // n) for r in rays)
+    return _Visible(rays=rays, pixels=(pixels[0], pixels[1]), mask=mask, far_near=(low, high))
 
 
-def _shade_face(
-    job: _Job, target: Image8, i: int, kst: tuple[Float32, Float32, Float32], mask: NDArray[np.bool_]
-) -> None:
-    """Fill the masked rays of `target` with the face's texture, detail and tint."""
+def _paint(tile: _Tile, visible: _Visible, colour: Image8) -> None:
+    """Give each visible ray its pixel's colour."""
+    assert tile.rgb is not None
+    size = visible.mask.shape[::-1]
+    spread = colour if size == colour.shape[1::-1] else cv2.resize(colour, size, interpolation=cv2.INTER_NEAREST)
+    cv2.copyTo(spread, visible.mask, tile.rgb[visible.rays])
+
+
+def _face_colour(job: _Job, tile: _Tile, i: int, pixels: Part, far_near: tuple[float, float]) -> Image8:
+    """Colours of the face's plane at the pixels' centres: texture, detail, tint."""
     assert job.look is not None
     index = int(job.face_view.index[i])
-    faces, (k, s, t) = job.faces, kst
-    texture = job.look.textures[faces.texture[index]]
-    near, far = float(k.max(where=mask, initial=0.0)), float(k.min(where=mask, initial=np.inf))
-    z = np.reciprocal(k, where=mask, out=np.ones_like(k))
+    faces, planes = job.faces, job.face_view.planes[i].astype(np.float32)
+    x, y = tile.center_x[pixels], tile.center_y[pixels]
+    k, s, t = (x * row[0] + (y * row[1] + row[2]) for row in planes)
+    # At an edge the centre may lie beside the face or past its horizon: the plane's nearest sensible depth.
+    z = 1.0 / np.maximum(k, np.float32(far_near[0]))
     s, t = s * z, t * z
     u0, v0, us, vs, ut, vt = faces.uv[index].astype(np.float32)
-    u, v = s * us + (t * ut + u0), s * vs + (t * vt + v0)
+    u, v = s * us + t * ut, s * vs + t * vt
     coefficient = _level_coefficient(job, i)
-    colour = _sample_levels(texture, u, v, k, (near, far), coefficient)
-    if not np.isnan(faces.detail_uv[index, 0]):
-        du, dv = (faces.detail_uv[index] - faces.uv[index, :2]).astype(np.float32)
-        detail = _sample_levels(job.look.detail, u + du, v + dv, k, (near, far), coefficient)
+    texture = job.look.textures[faces.texture[index]]
+    colour = _sample_levels(texture, (u, v, u0, v0), k, far_near, coefficient)
+    footprint = coefficient - _DEPTH_POWER * math.log2(far_near[1])
+    if not np.isnan(faces.detail_uv[index, 0]) and footprint < _DETAIL_LIMIT:
+        du, dv = faces.detail_uv[index].astype(np.float32)
+        detail = _sample_levels(job.look.detail, (u, v, du, dv), k, far_near, coefficient)
         colour = np.asarray(cv2.multiply(colour, detail, scale=1.0 / 128.0))
     tint = faces.tint[index]
     if np.ptp(tint) < 1e-9:
-        colour = np.asarray(cv2.convertScaleAbs(colour, alpha=float(tint[0])))
-    else:
-        colour = np.asarray(cv2.multiply(colour, (*tint.tolist(), 1.0)))
-    np.copyto(target, colour, where=mask[..., None])
+        return np.asarray(cv2.convertScaleAbs(colour, alpha=float(tint[0])))
+    return np.asarray(cv2.multiply(colour, (*tint.tolist(), 1.0)))
 
 
 def _level_coefficient(job: _Job, i: int) -> float:
-    """c such that log2(footprint in metres) = c + _DEPTH_POWER * log2(z), for face i."""
+    """c such that log2(footprint of a pixel in metres) = c + _DEPTH_POWER * log2(z), for face i."""
     index = int(job.face_view.index[i])
     us, vs, ut, vt = job.faces.uv[index, 2:]
-    area = abs(np.linalg.det(job.face_view.planes[i]) * (us * vt - vs * ut)) / job.rays_per_unit**2
+    area = abs(np.linalg.det(job.face_view.planes[i]) * (us * vt - vs * ut)) / job.pixels_per_unit**2
     return float(0.5 * np.log2(area) - 0.25 * np.log2(job.face_view.distance[i]))
 
 
 def _sample_levels(
-    texture: Texture, u: Float32, v: Float32, k: Float32, near_far: tuple[float, float], coefficient: float
+    texture: Texture,
+    uv: tuple[Float32, Float32, np.float32, np.float32],
+    k: Float32,
+    far_near: tuple[float, float],
+    coefficient: float,
 ) -> Image8:
-    """Colours at u, v, each from the level that fits its depth 1 / k."""
-    base = coefficient - np.log2(texture.texel_m) - _SHARPNESS
+    """Colours at u + u0, v + v0, each from the level that fits its depth 1 / k."""
+    # Whole repetitions are taken out first: far outside its image the sampling is slow and inexact.
+    width, height = texture.extent_m
+    u, v = uv[0] + np.float32(uv[2] % width), uv[1] + np.float32(uv[3] % height)
+    base = coefficient - math.log2(texture.texel_m) - _SHARPNESS
     top = len(texture.levels) - 1
-    first, last = (int(np.clip(np.round(base - _DEPTH_POWER * np.log2(q)), 0, top)) for q in near_far)
+    last, first = (min(max(round(base - _DEPTH_POWER * math.log2(q)), 0), top) for q in far_near)
     colour = texture.sample(u, v, first)
     for level in range(first + 1, last + 1):
         limit = np.float32(2.0 ** ((base - level + 0.5) / _DEPTH_POWER))
-        further = k < limit
-        rows = np.flatnonzero(further.any(axis=1))
-        if len(rows) == 0:
-            continue
-        band = slice(rows[0], rows[-1] + 1)
-        finer = texture.sample(u[band], v[band], level)
-        np.copyto(colour[band], finer, where=further[band, :, None])
+        further = (k < limit).view(np.uint8)
+        column, row, w, h = cv2.boundingRect(further)
+        if w:
+            band = slice(row, row + h), slice(column, column + w)
+            cv2.copyTo(texture.sample(u[band], v[band], level), further[band], colour[band])
     return colour
 
 
-def _draw_ellipsoid(job: _Job, tile: _Tile, i: int, part: tuple[slice, slice]) -> None:
+def _draw_ellipsoid(job: _Job, tile: _Tile, i: int, part: Part) -> None:
     """Draw ellipsoid i of the view into its part of the tile."""
     view = job.ellipsoid_view
-    m, w0 = view.unit_from_cam[i].astype(np.float32), view.w0[i].astype(np.float32)
     x, y = tile.x[part], tile.y[part]
-    direction = [x * row[0] + (y * row[1] + row[2]) for row in m]
-    q = direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2
-    b = direction[0] * w0[0] + direction[1] * w0[1] + direction[2] * w0[2]
-    c = np.float32(view.w0[i] @ view.w0[i] - 1.0)
-    # c k^2 + 2 b k + q = 0 for k = 1 / z; the larger root is the nearer point.
-    k = (np.sqrt(np.maximum(b * b - c * q, 0)) - b) / c
-    mask = (b * b >= c * q) & (k > tile.inverse_depth[part])
-    if not cv2.hasNonZero(mask.view(np.uint8)):
-        return
+    k, inside = _ellipsoid_depth(view, i, x, y, _buffers(job, x.shape))
+    mask = inside & (k > tile.inverse_depth[part])
     index = int(view.index[i])
-    np.copyto(tile.inverse_depth[part], k, where=mask)
-    np.copyto(tile.object_id[part], job.ellipsoids.object_id[index], where=mask)
-    if tile.rgb is not None:
-        z = np.reciprocal(k, where=mask, out=np.ones_like(k))
-        on_unit = [d * z + w for d, w in zip(direction, w0, strict=True)]
-        colour = _ellipsoid_colour(job, index, on_unit, float(view.depth[i]))
-        np.copyto(tile.rgb[part], colour, where=mask[..., None])
+    visible = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.ellipsoids.object_id[index]))
+    if visible is not None and tile.rgb is not None:
+        x, y = tile.center_x[visible.pixels], tile.center_y[visible.pixels]
+        k, _ = _ellipsoid_depth(view, i, x, y, _buffers(job, x.shape))
+        z = 1.0 / np.maximum(k, np.float32(visible.far_near[0]))
+        m = view.unit_from_cam[i].astype(np.float32)
+        w0 = view.w0[i].astype(np.float32)
+        on_unit = [(x * row[0] + (y * row[1] + row[2])) * z + w for row, w in zip(m, w0, strict=True)]
+        _paint(tile, visible, _ellipsoid_colour(job, index, on_unit, float(view.depth[i])))
+
+
+def _ellipsoid_depth(
+    view: EllipsoidView, i: int, x: Float32, y: Float32, buffers: list[Float32]
+) -> tuple[Float32, NDArray[np.bool_]]:
+    """1/z of the nearer point of an ellipsoid, and where there is one.
+
+    With c k^2 + 2 b k + q = 0 for k = 1/z, where b is linear and q quadratic in the ray, the discriminant
+    b^2 - c q is a quadratic form of the ray.
+    """
+    m, w0 = view.unit_from_cam[i], view.w0[i]
+    c = float(w0 @ w0 - 1.0)
+    linear = m.T @ w0
+    form = (np.outer(linear, linear) - c * m.T @ m) / c**2
+    linear32, f = (-linear / c).astype(np.float32), form.astype(np.float32)
+    d, k, spare, _ = buffers
+    np.multiply(x, f[0, 0], out=d)
+    np.multiply(y, 2 * f[0, 1], out=spare)
+    d += spare
+    d += 2 * f[0, 2]
+    d *= x
+    np.multiply(y, f[1, 1], out=spare)
+    spare += 2 * f[1, 2]
+    spare *= y
+    d += spare
+    d += f[2, 2]
+    inside = d >= 0
+    np.maximum(d, 0, out=d)
+    np.sqrt(d, out=d)
+    _linear(linear32, x, y, k, spare)
+    k += d
+    return k, inside
 
 
 def _ellipsoid_colour(job: _Job, index: int, on_unit: list[Float32], depth: float) -> Image8:
@@ -258,8 +346,8 @@ def _ellipsoid_colour(job: _Job, index: int, on_unit: list[Float32], depth: floa
     # The octahedral map: little stretch anywhere, no pole that a drone would look down on.
     fold = np.float32(2.0) / (np.abs(wx) + np.abs(wy) + np.abs(wz))
     u, v = wx * fold * rx + u0, wy * fold * ry + np.sign(wz) * rz + v0
-    footprint = max(depth, 0.1) / job.rays_per_unit
-    level = int(np.clip(np.round(np.log2(footprint / texture.texel_m)), 0, len(texture.levels) - 1))
+    footprint = max(depth, 0.1) / job.pixels_per_unit
+    level = min(max(round(math.log2(footprint / texture.texel_m)), 0), len(texture.levels) - 1)
     colour = texture.sample(u, v, level)
     sun = job.look.to_sun.astype(np.float32)
     light = np.clip((wx * sun[0] + wy * sun[1] + wz * sun[2]) * np.float32(0.55) + np.float32(0.6), 0.2, 1.2)
@@ -281,7 +369,7 @@ def _finish(
         return
     empty = tile.inverse_depth == 0
     if empty.any():
-        np.copyto(tile.rgb, _sky(tile, up), where=empty[..., None])
+        cv2.copyTo(_sky(tile, up), empty.view(np.uint8), tile.rgb)
     size = (tile.x.shape[1] // n, tile.x.shape[0] // n)
     rgb[rows, columns] = cv2.resize(tile.rgb, size, interpolation=cv2.INTER_AREA) if n > 1 else tile.rgb
 

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -52,6 +53,7 @@ def expose(rgb: Image8, rng: np.random.Generator, options: SensorOptions) -> Ima
     return np.clip(photo + 0.5, 0, 255).astype(np.uint8)
 
 
+@lru_cache(maxsize=8)
 def _vignette(height: int, width: int, loss: float) -> NDArray[np.float32]:
     """Gain (height, width), 1 in the centre, 1 - loss in the corner, falling with r^2."""
     y = (np.arange(height, dtype=np.float32) + 0.5 - 0.5 * height)[:, None]

@@ -37,6 +37,12 @@ class Texture:
             levels.append(np.asarray(half, dtype=np.uint8))
         return cls(levels=tuple(levels), texel_m=texel_m)
 
+    @property
+    def extent_m(self) -> tuple[float, float]:
+        """Width (u) and height (v) of the image, metres."""
+        height, width = self.levels[0].shape[:2]
+        return width * self.texel_m, height * self.texel_m
+
     def sample(self, u: NDArray[np.float32], v: NDArray[np.float32], level: int) -> Image8:
         """Bilinear colours (..., 3) uint8 at u, v (2-D arrays, metres), of one level; the texture repeats."""
         scale = np.float32(1.0 / (self.texel_m * 2**level))

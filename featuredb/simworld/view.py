@@ -27,12 +27,14 @@ class FaceView:
         planes: (m, 3, 3) float64.
         window: (m, 4) int, x0, y0, x1, y1 in pixels, end exclusive.
         distance: (m,) distance of the camera centre from each face's plane, metres.
+        nearest: (m,) 1/z of the nearest corner, infinity where one is behind the camera.
     """
 
     index: NDArray[np.intp]
     planes: FloatArray
     window: NDArray[np.int64]
     distance: FloatArray
+    nearest: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,10 +68,11 @@ def view_faces(faces: Faces, camera: Camera, cam_from_local: Rigid3) -> FaceView
     numerators = np.stack([normal, np.cross(edge_t, origin), np.cross(origin, edge_s)], axis=1)
     planes = numerators / offset[:, None, None]
     distance = -offset / np.linalg.norm(normal, axis=1)
-    nearest = corners[..., 2].min(axis=1)[seen]
-    order = seen[np.argsort(nearest, kind="stable")]
+    nearest = corners[..., 2].min(axis=1)
+    order = seen[np.argsort(nearest[seen], kind="stable")]
+    inverse = np.where(nearest > _NEAR_M, 1.0 / np.maximum(nearest, _NEAR_M), np.inf)
     return FaceView(
-        index=front[order], planes=planes[order], window=window[order], distance=distance[order]
+        index=front[order], planes=planes[order], window=window[order], distance=distance[order], nearest=inverse[order]
     )
 
 
