@@ -1,0 +1,73 @@
+"""The command that writes a simulated world: photos of a town that does not exist, with exact truth."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from featuredb.simworld.world import World, WorldOptions, write_world
+
+
+def register(subparsers: Any) -> None:
+    """Add `simworld` to the parser of `featuredb`."""
+    parser = subparsers.add_parser(
+        "simworld",
+        help="write photos of a simulated town, with exact truth",
+        description="Write photos of a simulated town (drone survey, held-out queries, street photos, negatives) "
+        "and truth.json with every camera's true pose.",
+    )
+    parser.add_argument("out", metavar="OUT", type=Path, help="folder to write, made if missing")
+    parser.add_argument("--size", choices=("short", "full"), default="short", help="default: short")
+    parser.add_argument("--seed", type=int, default=1, help="another seed is another town; default: 1")
+    parser.add_argument(
+        "--gps-error",
+        choices=("realistic", "none"),
+        default="realistic",
+        help="none: EXIF positions are the truth; default: realistic",
+    )
+    parser.add_argument("--workers", type=int, default=0, help="processes; default: one per core")
+    parser.set_defaults(run=run_simworld)
+
+
+def run_simworld(args: argparse.Namespace) -> int:
+    """Write the world and say what is in it."""
+    options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
+    options = replace(
+        options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error)
+    )
+    world = _write_with_progress(args.out, options)
+    Console().print(_summary(world))
+    return 0
+
+
+def _write_with_progress(folder: Path, options: WorldOptions) -> World:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("photos", total=None)
+        return write_world(folder, options, lambda done, total: bar.update(task, completed=done, total=total))
+
+
+def _summary(world: World) -> str:
+    counts = {
+        "survey photos": len(world.images("drone")),
+        "queries": len(world.images("queries")),
+        "street photos": len(world.images("street")),
+        "negatives": len(world.negatives()),
+    }
+    return f"{world.folder}: " + ", ".join(f"{n} {what}" for what, n in counts.items()) + ", truth.json"
