@@ -29,7 +29,7 @@ def plan_png(plan: PlanView) -> bytes:
     side_low, side_high = _heights(plan)
     plan_inches = min(max(7.4 * height_m / width_m, 3.0), 9.0)
     side_inches = min(max(7.4 * (side_high - side_low) / width_m, 1.1), 3.0)
-    total = plan_inches + side_inches + 1.3
+    total = plan_inches + side_inches + 1.5
     figure = Figure(figsize=(9.2, total), dpi=_DPI, facecolor="white")
     grid = figure.add_gridspec(
         2,
@@ -38,7 +38,7 @@ def plan_png(plan: PlanView) -> bytes:
         width_ratios=(40, 1),
         left=0.105,
         right=0.925,
-        top=1 - 0.35 / total,
+        top=1 - 0.55 / total,
         bottom=0.5 / total,
         hspace=0.45 / (total / 2),
         wspace=0.03,
@@ -118,12 +118,13 @@ def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize,
     _draw_tiles(axes, box)
     axes.scatter(shown[:, 0], shown[:, 1], c=shown[:, 2], cmap="viridis", norm=colours, s=3, lw=0, zorder=2)
     residuals = (plan.gps - plan.cameras)[:, :2]
-    factor = residual_exaggeration(residuals, float(max(box[1] - box[0], box[3] - box[2])))
-    tips = plan.cameras[:, :2] + factor * residuals
+    factor = residual_exaggeration(residuals[plan.gps_used], float(max(box[1] - box[0], box[3] - box[2])))
+    # Outliers are long enough as they are.
+    tips = plan.cameras[:, :2] + np.where(plan.gps_used, factor, 1)[:, None] * residuals
     for used, colour, word in ((True, _GPS, "GPS"), (False, _BAD, "GPS, not used")):
         rows = np.isfinite(tips[:, 0]) & (plan.gps_used == used)
         if rows.any():
-            times = f" (residuals drawn {factor} times longer)" if factor > 1 else ""
+            times = f" (residuals drawn {factor} times longer)" if used and factor > 1 else ""
             x, y = plan.cameras[rows, :2].T, tips[rows].T
             axes.plot([x[0], y[0]], [x[1], y[1]], color=colour, lw=1.5, zorder=4)
             axes.plot(*y, "x", color=colour, ms=6, mew=1.6, zorder=5, label=word + times)
@@ -145,7 +146,7 @@ def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize,
     )
     _draw_north(axes, plan.convergence_deg)
     _draw_scale_bar(axes, box)
-    axes.set_title(f"EPSG:{plan.epsg}, {_tile_words(box)}", fontsize=9, color=_INK, loc="left")
+    axes.set_title(f"EPSG:{plan.epsg}, {_tile_words(box)}", fontsize=9, color=_INK, loc="left", pad=22)
     axes.set_xlabel("easting, m", fontsize=8)
     axes.set_ylabel("northing, m", fontsize=8)
     _tidy(axes)

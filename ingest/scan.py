@@ -9,10 +9,11 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from featuredb.errors import ImageError, IngestError
-from featuredb.features.decode import DecodeLimits, decode_gray, probe, read_image_bytes
+from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, probe, read_image_bytes
 from featuredb.features.exif import read_exif
 from featuredb.features.image_header import check_signature
 from featuredb.maps.exif_prior import prior_from_exif
@@ -34,19 +35,18 @@ class ScanOptions:
     """What is taken from a folder.
 
     Attributes:
-        limits: sizes that are refused. Ingest takes larger files than a server does, and asks for 240
-            pixels at least: smaller pictures are thumbnails, with too few features to hold in a map.
+        limits: sizes that are refused.
         duplicates: when two photos are copies.
         recursive: folders in the folder are entered.
+        exclude: shell patterns; a file whose name, with or without its folder, fits one is left out.
         workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
         owner, licence: attribution of photos that do not name their own.
     """
 
-    limits: DecodeLimits = field(
-        default_factory=lambda: DecodeLimits(max_bytes=256 << 20, max_pixels=200_000_000, min_side_px=240)
-    )
+    limits: DecodeLimits = INGEST_LIMITS
     duplicates: DuplicateOptions = field(default_factory=DuplicateOptions)
     recursive: bool = True
+    exclude: tuple[str, ...] = ()
     workers: int = 0
     owner: str = ""
     licence: str = ""
@@ -97,7 +97,7 @@ def scan_folder(
         IngestError: the folder cannot be listed.
     """
     options = options or ScanOptions()
-    files = walk(folder, options.recursive)
+    files = [_excluded(file, options.exclude) for file in walk(folder, options.recursive)]
     key = f"{_VERSION}:{options_fingerprint(options.limits)}"
     known = read_cache(cache_file, key) if cache_file else {}
     examined, read = _examine_all(files, known, options, progress, cache_file, key)
@@ -105,6 +105,14 @@ def scan_folder(
     photos = _mark_exact(photos)
     photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()}, options.duplicates)
     return ScanResult(photos=tuple(photos), read=read)
+
+
+def _excluded(file: FoundFile, patterns: Sequence[str]) -> FoundFile:
+    """The file, refused if a pattern fits it."""
+    for pattern in patterns:
+        if fnmatchcase(file.name, pattern) or fnmatchcase(file.name.rsplit("/", 1)[-1], pattern):
+            return replace(file, reason_code="excluded", reason=f"left out by the pattern {pattern!r}")
+    return file
 
 
 def _examine_all(

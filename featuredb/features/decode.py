@@ -43,6 +43,9 @@ class DecodeLimits:
 
 
 DEFAULT_LIMITS = DecodeLimits()
+# A person's own files may be larger than a stranger's query; smaller pictures are thumbnails, with too few
+# features to hold in a map.
+INGEST_LIMITS = DecodeLimits(max_bytes=256 << 20, max_pixels=200_000_000, min_side_px=240)
 
 
 def probe(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> ImageHeader:
