@@ -3,7 +3,8 @@
 In come photos as values, out go reconstructions as plain arrays.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -69,8 +70,8 @@ class Model:
         camera_of: (k,) index into cameras.
         cam_from_sfm: k poses.
         xyz: (n, 3) points.
-        point_of, photo_of, keypoint_of: (m,) int64: observations as index into xyz, index into rows, and row of the
-            photo's keypoints; sorted by point, then photo.
+        point_of, photo_of, keypoint_of: (m,) int64: observations as index into xyz, index into rows, and
+            row of the photo's keypoints; sorted by point, then photo.
     """
 
     cameras: tuple[Camera, ...]
@@ -196,9 +197,21 @@ def run_incremental(
         for parent in parents:
             target = getattr(target, parent)
         setattr(target, last, value)
-    pycolmap.incremental_mapping(
-        str(database), str(images), str(output), options, next_image_callback=on_image
-    )
+    with _quiet():
+        pycolmap.incremental_mapping(
+            str(database), str(images), str(output), options, next_image_callback=on_image
+        )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """COLMAP narrates every image on stderr; only its errors are of use to a person."""
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
 
 
 def read_models(output: Path) -> list[Model]:
@@ -213,7 +226,10 @@ def read_model(folder: Path) -> Model:
     image_ids = sorted(reconstruction.reg_image_ids())
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
     index_of_image = {image_id: k for k, image_id in enumerate(image_ids)}
-    xyz, point_of, photo_of, keypoint_of = [], [], [], []
+    xyz: list[FloatArray] = []
+    point_of: list[int] = []
+    photo_of: list[int] = []
+    keypoint_of: list[int] = []
     for point_id in sorted(reconstruction.point3D_ids()):
         point = reconstruction.point3D(point_id)
         elements = sorted((index_of_image[e.image_id], e.point2D_idx) for e in point.track.elements)

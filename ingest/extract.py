@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
-from featuredb.features.decode import decode_gray
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from ingest.executor import Executor, Progress, no_progress
@@ -45,18 +45,27 @@ class PhotoFeatures:
     rgb: NDArray[np.uint8]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extracted:
+    """What the stage did.
+
+    Attributes:
+        unreadable: photos by name whose pixels could not be read after all, with the reason.
+        reused: photos whose features were there already.
+    """
+
+    unreadable: dict[str, str]
+    reused: int
+
+
 def extract_photos(
     photos: list[Photo],
     workspace: Workspace,
     options: ExtractorOptions,
     executor: Executor,
     progress: Progress = no_progress,
-) -> dict[str, str]:
-    """Write the features of every photo that has none yet.
-
-    Returns:
-        Photos by name whose pixels could not be read after all, with the reason.
-    """
+) -> Extracted:
+    """Write the features of every photo that has none yet."""
     fingerprint = options_fingerprint(options)
     tasks: dict[str, ExtractTask] = {}
     for photo in photos:
@@ -64,7 +73,10 @@ def extract_photos(
         if not target.exists():
             tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
     outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
-    return {name: reason for name, reason in zip(tasks, outcomes, strict=True) if reason}
+    return Extracted(
+        unreadable={name: reason for name, reason in zip(tasks, outcomes, strict=True) if reason},
+        reused=len(photos) - len(tasks),
+    )
 
 
 def load_features(workspace: Workspace, options: ExtractorOptions, photo: Photo) -> PhotoFeatures:
@@ -89,7 +101,7 @@ def _extract_one(task: ExtractTask) -> str:
     """Extract one photo; the reason for people if its pixels cannot be used, else ""."""
     try:
         data = task.photo.read_bytes()
-        features = extract(decode_gray(data), task.options)
+        features = extract(decode_gray(data, INGEST_LIMITS), task.options)
     except (ImageError, OSError) as error:
         return str(error)
     write_arrays(

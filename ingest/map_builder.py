@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IngestError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
@@ -62,8 +61,8 @@ def build_map(
     features: Sequence[PhotoFeatures],
     identity: MapIdentity,
     options: MapOptions,
-) -> FeatureMap:
-    """The map of one placed model.
+) -> FeatureMap | None:
+    """The map of one placed model; None if no point is placed well enough.
 
     Args:
         photos, features: of the model's registered photos, in the order of `model.rows`.
@@ -71,15 +70,13 @@ def build_map(
     poses = [placement.local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
     enu = placement.local_from_sfm.act(model.xyz)
     xy = _gather(features, model, "xy").astype(np.float64)
-    linear = linearise(
-        model.cameras, model.camera_of, poses, enu, model.point_of, model.photo_of, xy
-    )
+    linear = linearise(model.cameras, model.camera_of, poses, enu, model.point_of, model.photo_of, xy)
     variance = residual_variance(linear, len(poses), len(enu))
     covariances = point_covariances(linear, len(enu), variance)
     pose_spread = pose_covariances(linear, len(poses), covariances, variance)
     kept = _well_placed(enu, poses, covariances, model, options)
     if not kept.any():
-        raise IngestError(f"map {identity.name}: none of {len(enu)} points is placed well enough to be used")
+        return None
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     fingerprints = {f.features.fingerprint for f in features}
     return FeatureMap(

@@ -65,6 +65,19 @@ class PhotoView:
     focal_known: bool
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Matched:
+    """What the stage did.
+
+    Attributes:
+        geometries: two-view geometries of the pairs with enough verified matches.
+        reused: pairs that were matched already.
+    """
+
+    geometries: dict[Pair, TwoView]
+    reused: int
+
+
 def match_pairs(
     views: list[PhotoView],
     pairs: list[Pair],
@@ -72,8 +85,8 @@ def match_pairs(
     options: MatchOptions,
     executor: Executor,
     progress: Progress = no_progress,
-) -> dict[Pair, TwoView]:
-    """Match and verify every pair that is not done yet; the two-view geometries with enough inliers."""
+) -> Matched:
+    """Match and verify every pair that is not done yet."""
     files = {pair: _match_file(views[pair[0]], views[pair[1]], workspace, options) for pair in pairs}
     tasks = [
         MatchTask(
@@ -90,7 +103,10 @@ def match_pairs(
     ]
     executor.map("match", _match_one, tasks, progress)
     loaded = {pair: TwoView(**read_arrays(path)) for pair, path in files.items()}
-    return {pair: view for pair, view in loaded.items() if len(view.inliers) >= options.min_inliers}
+    return Matched(
+        geometries={p: view for p, view in loaded.items() if len(view.inliers) >= options.min_inliers},
+        reused=len(files) - len(tasks),
+    )
 
 
 def mutual_matches(

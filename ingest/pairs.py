@@ -96,7 +96,7 @@ def _gps_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterable[Pair]:
     distances, neighbours = cKDTree(plan).query(
         plan, k=min(options.gps_neighbours + 1, len(rows)), distance_upper_bound=options.gps_radius_m
     )
-    for i, (found, near) in enumerate(zip(distances, neighbours, strict=True)):
+    for i, (found, near) in enumerate(zip(np.atleast_2d(distances), np.atleast_2d(neighbours), strict=True)):
         for distance, j in zip(found, near, strict=True):
             if np.isfinite(distance) and j != i:
                 yield _ordered(rows[i], rows[int(j)])
@@ -105,7 +105,11 @@ def _gps_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterable[Pair]:
 def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
     """East, north, up (n, 3) in metres of photos with GPS; height 0 where the photo has none."""
     geodetic = np.array(
-        [[p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0] for p in photos if p.gps is not None]
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
     )
     if frame is None:
         frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
@@ -115,8 +119,11 @@ def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> F
 def _time_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterable[Pair]:
     """Each photo with those taken next. Without any time, by name: cameras number their files."""
     # Times with and without offset do not compare; the camera's own clock is what orders photos.
-    timed = [(p.camera_key, p.capture_time.replace(tzinfo=None), p.name, i)
-             for i, p in enumerate(photos) if p.capture_time is not None]
+    timed = [
+        (p.camera_key, p.capture_time.replace(tzinfo=None), p.name, i)
+        for i, p in enumerate(photos)
+        if p.capture_time is not None
+    ]
     order = [i for *_, i in sorted(timed)]
     for place, i in enumerate(order):
         for j in order[place + 1 : place + 1 + options.time_neighbours]:

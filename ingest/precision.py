@@ -53,9 +53,7 @@ def linearise(
     """
     rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
     translations = np.array([p.translation for p in poses]).reshape(-1, 3)
-    in_camera = (
-        np.einsum("mij,mj->mi", rotations[photo_of], points[point_of]) + translations[photo_of]
-    )
+    in_camera = np.einsum("mij,mj->mi", rotations[photo_of], points[point_of]) + translations[photo_of]
     projected = np.full((len(xy), 2), np.nan)
     by_camera_point = np.zeros((len(xy), 2, 3))
     for index, camera in enumerate(cameras):

@@ -19,13 +19,14 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import PhotoFeatures, extract_photos, load_features
-from ingest.fingerprint import digest, options_fingerprint
+from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapIdentity, MapOptions, build_map
-from ingest.matching import MatchOptions, PhotoView, match_pairs
+from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
 from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions
 from ingest.photo import Photo
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.sfm import SfmOptions, reconstruct
+from ingest.sfm import SfmOptions, SfmTask, reconstruct
+from ingest.stage_clock import StageClock
 from ingest.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -69,7 +70,7 @@ class Component:
         photos: its registered photos, in the order of model.rows.
         with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
         placement: accepted or refused with a reason.
-        feature_map: None where the placement was refused.
+        feature_map: None where there is none, for `reason_code` and `reason`.
     """
 
     model: Model
@@ -77,6 +78,8 @@ class Component:
     with_gps: tuple[int, ...]
     placement: GpsPlacement
     feature_map: FeatureMap | None
+    reason_code: str = ""
+    reason: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,6 +112,7 @@ def make_maps(
     *,
     identity: Callable[[int], MapIdentity],
     progress: Progress = no_progress,
+    clock: StageClock | None = None,
     stop_after: Stage | None = None,
 ) -> Reconstructed:
     """Reconstruct and place photos.
@@ -118,35 +122,45 @@ def make_maps(
         identity: of the map of the component with that number.
         stop_after: end there; what is done is kept for the next run.
     """
-    unreadable = extract_photos(list(photos), workspace, options.extractor, executor, progress)
-    usable = [p for p in photos if p.name not in unreadable]
+    clock = clock or StageClock()
+    with clock.stage("extract") as counts:
+        extracted = extract_photos(list(photos), workspace, options.extractor, executor, progress)
+        counts |= {"reused": extracted.reused, "total": len(photos)}
+    usable = [p for p in photos if p.name not in extracted.unreadable]
     if stop_after == "extract":
-        return Reconstructed(unreadable=unreadable, stopped_after="extract")
+        return Reconstructed(unreadable=extracted.unreadable, stopped_after="extract")
 
     features = [load_features(workspace, options.extractor, p) for p in usable]
     cameras, camera_rows = photo_cameras(usable, options)
-    pairs = choose_pairs(usable, [f.features.descriptors for f in features], options.pairs)
-    geometries = _match(usable, cameras, camera_rows, pairs, workspace, options, executor, progress)
+    with clock.stage("pairs"):
+        pairs = choose_pairs(usable, [f.features.descriptors for f in features], options.pairs)
+    with clock.stage("match") as counts:
+        matched = _match(usable, cameras, camera_rows, pairs, workspace, options, executor, progress)
+        counts |= {"reused": matched.reused, "total": len(pairs)}
     done = Reconstructed(
-        unreadable=unreadable,
+        unreadable=extracted.unreadable,
         features_per_photo={p.name: len(f.features) for p, f in zip(usable, features, strict=True)},
         pairs=len(pairs),
-        verified_pairs=len(geometries),
-        matches_per_photo=_matches_per_photo(usable, geometries),
+        verified_pairs=len(matched.geometries),
+        matches_per_photo=_matches_per_photo(usable, matched.geometries),
     )
     if stop_after == "match":
         return replace(done, stopped_after="match")
 
     frame = local_frame_of(usable)
-    models = _reconstruct(
-        usable, features, cameras, camera_rows, geometries, frame, workspace, options, progress
-    )
+    with clock.stage("reconstruct") as counts:
+        task = _sfm_task(usable, features, cameras, camera_rows, matched.geometries, frame)
+        folder = workspace.job / f"models-{task.key(options.sfm)}"
+        counts |= {"reused": int(folder.is_dir()), "total": 1}
+        models = reconstruct(task, folder, options.sfm, progress)
     if stop_after == "reconstruct":
         return replace(done, stopped_after="reconstruct")
-    components = [
-        _component(model, frame, usable, features, identity(number), options)
-        for number, model in enumerate(models)
-    ]
+
+    with clock.stage("build"):
+        components = [
+            _component(model, frame, usable, features, identity(number), options)
+            for number, model in enumerate(models)
+        ]
     progress("build", len(components), len(components))
     return replace(done, components=tuple(components))
 
@@ -159,7 +173,7 @@ def photo_cameras(
     cameras: list[tuple[Camera, bool]] = []
     of_photo: list[int] = []
     for photo in photos:
-        key = photo.name if options.cameras == "per-image" or not photo.camera_key else photo.camera_key
+        key = camera_key(photo, options)
         if key not in rows:
             rows[key] = len(cameras)
             known = photo.focal_px is not None
@@ -170,10 +184,20 @@ def photo_cameras(
     return cameras, of_photo
 
 
+def camera_key(photo: Photo, options: MapMakingOptions) -> str:
+    """Photos with equal keys share intrinsics."""
+    alone = options.cameras == "per-image" or not photo.camera_key
+    return photo.name if alone else photo.camera_key
+
+
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
     gps = np.array(
-        [[p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0] for p in photos if p.gps is not None]
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
     )
     if not len(gps):
         return None
@@ -194,7 +218,7 @@ def _match(
     options: MapMakingOptions,
     executor: Executor,
     progress: Progress,
-) -> dict[Pair, TwoView]:
+) -> Matched:
     fingerprint = options_fingerprint(options.extractor)
     views = [
         PhotoView(
@@ -208,17 +232,14 @@ def _match(
     return match_pairs(views, pairs, workspace, options.matching, executor, progress)
 
 
-def _reconstruct(
+def _sfm_task(
     photos: Sequence[Photo],
     features: Sequence[PhotoFeatures],
     cameras: Sequence[tuple[Camera, bool]],
     camera_rows: Sequence[int],
     geometries: dict[Pair, TwoView],
     frame: LocalFrame | None,
-    workspace: Workspace,
-    options: MapMakingOptions,
-    progress: Progress,
-) -> list[Model]:
+) -> SfmTask:
     positions, sigmas = _priors(photos, frame)
     sfm_photos = [
         SfmPhoto(
@@ -230,17 +251,7 @@ def _reconstruct(
         )
         for i, photo in enumerate(photos)
     ]
-    registered = 2  # COLMAP tells of each photo after the first pair
-
-    def on_photo() -> None:
-        nonlocal registered
-        registered = min(registered + 1, len(photos))
-        progress("reconstruct", registered, len(photos))
-
-    folder = workspace.job / "models"
-    models = reconstruct(cameras, sfm_photos, geometries, folder, options.sfm, on_photo)
-    progress("reconstruct", len(photos), len(photos))
-    return models
+    return SfmTask(cameras=tuple(cameras), photos=tuple(sfm_photos), geometries=geometries)
 
 
 def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
@@ -270,26 +281,39 @@ def _component(
     positions, sigmas = _priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
     placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
-    feature_map = None
-    if placed.reason is None:
-        assert frame is not None and placed.local_from_sfm is not None and placed.covariance is not None
-        placement = Placement(
-            method="gps",
-            local_from_sfm=placed.local_from_sfm,
-            covariance=placed.covariance,
-            residual_rms_m=placed.residual_rms_m,
-            evidence=_evidence(placed, [chosen[i] for i in with_gps]),
-        )
-        feature_map = build_map(
-            model, placement, frame, chosen, [features[r] for r in model.rows], identity, options.maps
-        )
-    return Component(
+    component = Component(
         model=model,
         photos=tuple(chosen),
         with_gps=tuple(int(i) for i in with_gps),
         placement=placed,
-        feature_map=feature_map,
+        feature_map=None,
+        reason_code=placed.reason or "",
+        reason=placed.message,
     )
+    if (
+        placed.reason is not None
+        or frame is None
+        or placed.local_from_sfm is None
+        or placed.covariance is None
+    ):
+        return component
+    placement = Placement(
+        method="gps",
+        local_from_sfm=placed.local_from_sfm,
+        covariance=placed.covariance,
+        residual_rms_m=placed.residual_rms_m,
+        evidence=_evidence(placed, [chosen[i] for i in with_gps]),
+    )
+    feature_map = build_map(
+        model, placement, frame, chosen, [features[r] for r in model.rows], identity, options.maps
+    )
+    if feature_map is None:
+        return replace(
+            component,
+            reason_code="NO_POINTS",
+            reason="no point is placed well enough: the photos' rays are parallel",
+        )
+    return replace(component, feature_map=feature_map, reason="")
 
 
 def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
@@ -307,8 +331,3 @@ def _matches_per_photo(photos: Sequence[Photo], geometries: dict[Pair, TwoView])
         totals[photos[i].name] += len(view.inliers)
         totals[photos[j].name] += len(view.inliers)
     return totals
-
-
-def job_digest(photos: Sequence[Photo], fingerprint: str) -> str:
-    """Names the job: equal photos under equal options are the same job."""
-    return digest(fingerprint, *sorted(p.sha256 for p in photos))

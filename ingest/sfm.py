@@ -1,13 +1,15 @@
 """Stage: structure from motion of matched photos; each connected component becomes a model."""
 
+import hashlib
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from featuredb.geometry.camera import Camera
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, read_models, run_incremental, write_database
+from ingest.executor import Progress, no_progress
 from ingest.workspace import atomic_folder
 
 PriorUse = Literal["none", "bundle"]
@@ -21,6 +23,7 @@ class SfmOptions:
         camera_model: COLMAP's model of every camera whose EXIF gives no better one.
         position_priors: "bundle" puts GPS positions into the bundle adjustment, "none" keeps them for
             the placement afterwards.
+        refine_focal: focal lengths of EXIF are a start; kept as they are otherwise.
         min_model_photos: smaller models are dropped; three photos are the least that a placement by
             positions needs.
         min_inliers: verified matches of a pair that mapping may use.
@@ -34,6 +37,7 @@ class SfmOptions:
 
     camera_model: str = "SIMPLE_RADIAL"
     position_priors: PriorUse = "none"
+    refine_focal: bool = True
     min_model_photos: int = 3
     min_inliers: int = 20
     filter_max_error_px: float = 4.0
@@ -43,43 +47,62 @@ class SfmOptions:
     threads: int = 1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SfmTask:
+    """All that structure from motion needs.
+
+    Attributes:
+        cameras: with whether the focal length is known from EXIF.
+        photos: their keypoints, cameras and priors.
+        geometries: two-view geometries of pairs of rows of `photos`.
+    """
+
+    cameras: tuple[tuple[Camera, bool], ...]
+    photos: tuple[SfmPhoto, ...]
+    geometries: Mapping[tuple[int, int], TwoView]
+
+    def key(self, options: SfmOptions) -> str:
+        """Digest (16 characters) of the content: equal keys give equal models."""
+        content = hashlib.sha256(repr((self.cameras, options)).encode())
+        for photo in self.photos:
+            content.update(repr((photo.name, photo.camera_row)).encode())
+            content.update(photo.keypoints.tobytes())
+            if photo.prior_position is not None and photo.prior_covariance is not None:
+                content.update(photo.prior_position.tobytes() + photo.prior_covariance.tobytes())
+        for pair, view in sorted(self.geometries.items()):
+            content.update(repr(pair).encode() + view.inliers.tobytes())
+        return content.hexdigest()[:16]
+
+
 def reconstruct(
-    cameras: Sequence[tuple[Camera, bool]],
-    photos: Sequence[SfmPhoto],
-    geometries: Mapping[tuple[int, int], TwoView],
-    folder: Path,
-    options: SfmOptions,
-    on_photo: Callable[[], None] = lambda: None,
+    task: SfmTask, folder: Path, options: SfmOptions, progress: Progress = no_progress
 ) -> list[Model]:
     """Reconstruct, or read what an earlier run left in `folder`.
-
-    Args:
-        cameras: with whether the focal length is known from EXIF.
-        geometries: of pairs of rows of `photos`.
 
     Returns:
         Models with at least `min_model_photos` photos, largest first. A photo is in one model only.
     """
     if not folder.is_dir():
         with atomic_folder(folder) as temporary:
-            _map(cameras, photos, geometries, temporary, options, on_photo)
+            _map(task, temporary, options, progress)
+    progress("reconstruct", len(task.photos), len(task.photos))
     return _disjoint(read_models(folder), options.min_model_photos)
 
 
-def _map(
-    cameras: Sequence[tuple[Camera, bool]],
-    photos: Sequence[SfmPhoto],
-    geometries: Mapping[tuple[int, int], TwoView],
-    folder: Path,
-    options: SfmOptions,
-    on_photo: Callable[[], None],
-) -> None:
-    if not geometries:
+def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -> None:
+    if not task.geometries:
         return
-    side = max(max(camera.width, camera.height) for camera, _ in cameras)
+    side = max(max(camera.width, camera.height) for camera, _ in task.cameras)
+    registered = 2  # COLMAP tells of each photo after the first pair
+
+    def on_photo() -> None:
+        nonlocal registered
+        registered = min(registered + 1, len(task.photos) - 1)
+        progress("reconstruct", registered, len(task.photos))
+
     with tempfile.TemporaryDirectory(prefix="featuredb-sfm-") as scratch:
         database = Path(scratch) / "colmap.db"
-        write_database(database, cameras, photos, geometries)
+        write_database(database, task.cameras, task.photos, task.geometries)
         run_incremental(database, Path(scratch), folder, _settings(options, side), on_photo)
 
 
@@ -90,6 +113,7 @@ def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
         "random_seed": options.seed,
         "num_threads": options.threads,
         "extract_colors": False,
+        "ba_refine_focal_length": options.refine_focal,
         "min_num_matches": options.min_inliers,
         "min_model_size": options.min_model_photos,
         "use_prior_position": options.position_priors == "bundle",

@@ -112,9 +112,13 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise IngestError(f"{path}: expected a stage's JSON record, {error}; delete it and run again") from error
+        raise IngestError(
+            f"{path}: expected a stage's JSON record, {error}; delete it and run again"
+        ) from error
     if not isinstance(value, dict):
-        raise IngestError(f"{path}: expected a JSON object, found {type(value).__name__}; delete it, run again")
+        raise IngestError(
+            f"{path}: expected a JSON object, found {type(value).__name__}; delete it, run again"
+        )
     return value
 
 

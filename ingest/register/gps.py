@@ -1,8 +1,9 @@
 """Placement by GPS: the similarity that carries camera centres to the photos' positions.
 
-Equation: gps_i = S center_i + bias + noise_i, with S = local_from_sfm, noise_i ~ N(0, diag(sh, sh, sv)^2) independent for
-each photo, and one bias that all photos of a flight share (atmosphere, ephemeris, barometer). The
-residuals tell of the noise, never of the bias: its covariance is added by assumption.
+Equation: gps_i = S center_i + bias + noise_i, with S = local_from_sfm. The sigma of a position is that of
+its whole error, bias + noise. Noise is independent for each photo and shows in the residuals; the bias is
+shared by all photos of a flight (atmosphere, ephemeris, barometer) and never does. What the sigmas claim
+and the residuals do not show is therefore taken for bias: it goes into the covariance of the translation.
 """
 
 import itertools
@@ -34,10 +35,8 @@ class GpsOptions:
         max_variance_factor: of weighted residuals over their expectation; 9 means that GPS is three
             times worse than it says.
         max_scale_sigma: relative standard deviation of the scale; beyond, a map is no measure.
-        bias_horizontal_m, bias_vertical_m: one sigma of the error that all positions share, where the
-            priors are ordinary GPS.
-        bias_over_sigma: the shared error is no larger than this times the priors' own sigma, so that
-            exact priors stay exact.
+        noise_confidence: small residuals of few photos may be luck; the noise is taken as large as it
+            can be at this confidence, up to what the sigmas claim.
         max_ransac_samples: of three positions; fewer photos are tried exhaustively.
         seed: of the samples.
     """
@@ -48,9 +47,7 @@ class GpsOptions:
     min_rotation_sigma_ratio: float = 2.0
     max_variance_factor: float = 9.0
     max_scale_sigma: float = 0.1
-    bias_horizontal_m: float = 2.0
-    bias_vertical_m: float = 5.0
-    bias_over_sigma: float = 0.6
+    noise_confidence: float = 0.95
     max_ransac_samples: int = 500
     seed: int = 0
 
@@ -169,36 +166,44 @@ def _judge(
     if share > options.max_outlier_share or factor > options.max_variance_factor:
         return outcome(
             "RESIDUALS",
-            f"the photos' GPS does not fit the reconstruction: {share:.0%} outliers, the rest {factor**0.5:.1f} "
-            f"times their sigma (limits {options.max_outlier_share:.0%} and {options.max_variance_factor**0.5:g})",
+            f"the photos' GPS does not fit the reconstruction: {share:.0%} outliers, the rest "
+            f"{factor**0.5:.1f} times their sigma (limits {options.max_outlier_share:.0%} and "
+            f"{options.max_variance_factor**0.5:g})",
             None,
         )
-    covariance = _covariance(sim, centers[inliers], sigmas[inliers], factor, options)
+    noise = noise_variance_factor(weighted, freedom, options.noise_confidence)
+    covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise)
+    figures["noise_variance_factor"] = noise
+    figures["bias_sigma_m"] = (np.median(sigmas[inliers], axis=0) * max(0.0, 1.0 - noise) ** 0.5).tolist()
     figures["scale_sigma"] = float(np.sqrt(covariance[0, 0]))
     if figures["scale_sigma"] > options.max_scale_sigma:
         return outcome(
             "SCALE",
-            f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} is needed: "
-            "the photos are too close together for their GPS",
+            f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} is "
+            "needed: the photos are too close together for their GPS",
             None,
         )
     return outcome(None, "placed by GPS", covariance)
 
 
-def _covariance(
-    sim: Sim3, centers: FloatArray, sigmas: FloatArray, factor: float, options: GpsOptions
-) -> FloatArray:
-    """(7, 7): noise by the normal equations, scaled up by the residuals, plus the shared bias.
-
-    The factor is never taken below 1: with few photos small residuals are luck.
-    """
+def _covariance(sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise_factor: float) -> FloatArray:
+    """(7, 7): noise by the normal equations, plus the shared bias in the translation."""
     jacobian = point_jacobian(sim.act(centers)) / sigmas[:, :, None]
     normal = np.einsum("nij,nik->jk", jacobian, jacobian)
-    covariance = np.linalg.inv(normal) * max(factor, 1.0)
-    typical = np.median(sigmas, axis=0) * options.bias_over_sigma
-    limits = np.array([options.bias_horizontal_m, options.bias_horizontal_m, options.bias_vertical_m])
-    covariance[4:, 4:] += np.diag(np.minimum(typical, limits) ** 2)
+    covariance = np.linalg.inv(normal) * noise_factor
+    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2) * max(0.0, 1.0 - noise_factor)
     return np.asarray((covariance + covariance.T) / 2)
+
+
+def noise_variance_factor(weighted: float, freedom: int, confidence: float) -> float:
+    """Variance of the noise over the square of the sigmas, from the weighted sum of squared residuals.
+
+    Where the residuals are larger than the sigmas say: as measured. Where they are smaller: the upper end
+    of the confidence interval, at most 1.
+    """
+    measured = weighted / freedom
+    upper = weighted / float(chi2.ppf(1.0 - confidence, freedom))
+    return max(measured, min(1.0, upper))
 
 
 def _ransac(

@@ -1,0 +1,189 @@
+"""`featuredb ingest photos DB FOLDER`: arguments in, report out."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ingest.pipeline import IngestOptions
+    from ingest.report import IngestReport
+
+_STAGES = ("scan", "extract", "match", "reconstruct", "build")
+
+
+def register(subparsers: Any) -> None:
+    """Add `ingest` to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    ingest = subparsers.add_parser("ingest", help="make maps of photos")
+    kinds = ingest.add_subparsers(title="what to ingest", metavar="KIND", required=True)
+    photos = kinds.add_parser(
+        "photos",
+        help="a folder of photos with GPS",
+        description="Reconstruct a folder of photos, place it by their GPS and commit the maps. A killed "
+        "ingest goes on where it was when the same command runs again.",
+    )
+    add_database_argument(photos)
+    photos.add_argument("folder", metavar="FOLDER", type=Path, help="folder of photos, searched through")
+    _add_selection(photos)
+    _add_making(photos)
+    _add_running(photos)
+    photos.set_defaults(run=run_photos)
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which photos, and whose")
+    group.add_argument(
+        "--exclude",
+        action="append",
+        default=[],
+        metavar="GLOB",
+        help="leave out files whose name fits; may be repeated",
+    )
+    group.add_argument("--name", default="", help="name of the map; default: the folder's name")
+    group.add_argument("--owner", default="", help="of photos that do not name their own")
+    group.add_argument("--licence", default="", help="of the photos, e.g. CC-BY-4.0")
+
+
+def _add_making(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how maps are made")
+    group.add_argument(
+        "--cameras",
+        choices=("shared", "per-image"),
+        default="shared",
+        help="whether photos of one make, model and size share their intrinsics; default: shared",
+    )
+    group.add_argument("--camera-model", default=None, help="COLMAP's name; default: SIMPLE_RADIAL")
+    group.add_argument(
+        "--keep-focal",
+        action="store_true",
+        help="do not refine focal lengths: for nadir flights, whose photos cannot tell focal length from "
+        "height, with a camera that is known well",
+    )
+    group.add_argument("--max-features", type=int, default=None, help="per photo; default: 6000")
+    group.add_argument("--max-side", type=int, default=None, metavar="PX", help="default: 1600")
+    group.add_argument(
+        "--min-track-length",
+        type=int,
+        default=None,
+        metavar="N",
+        help="points seen by at least N photos carry descriptors; default: see the README",
+    )
+    group.add_argument(
+        "--height-datum",
+        default="unknown",
+        help="of the photos' heights: ellipsoidal, egm96, egm2008, navd88 or unknown (default)",
+    )
+    group.add_argument(
+        "--gps-sigma",
+        type=_sigmas,
+        default=None,
+        metavar="M[,M]",
+        help="standard deviation of the photos' positions in metres, horizontal and vertical, instead of "
+        "what EXIF suggests",
+    )
+
+
+def _add_running(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how the job runs")
+    group.add_argument("--workers", type=int, default=None, help="processes; default: one per core")
+    group.add_argument(
+        "--work",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help="where unfinished work is kept; default: DB/_work, or a cache folder for object stores",
+    )
+    group.add_argument(
+        "--report", type=Path, default=None, metavar="DIR", help="write report.json and report.html there"
+    )
+    group.add_argument(
+        "--stop-after", choices=_STAGES, default=None, help="end after that stage; the next run goes on"
+    )
+    group.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def run_photos(args: argparse.Namespace) -> int:
+    """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made."""
+    from featuredb.cli.common import storage_options
+    from featuredb.store import Database
+    from ingest.pipeline import ingest_photos
+    from ingest.progress_bars import progress_bars
+    from ingest.report import write_report
+
+    options = _options(args)
+    database = Database.create(args.db, storage_options=storage_options(args))
+    with progress_bars(args.quiet) as progress:
+        report = ingest_photos(database, args.folder, options, progress)
+    if args.report is not None:
+        write_report(args.report, report)
+    sys.stdout.write(summary(report))
+    made = any(outcome.status != "refused" for outcome in report.maps)
+    return 0 if made or args.stop_after else 1
+
+
+def summary(report: "IngestReport") -> str:
+    """A few lines for the terminal; the report has the rest."""
+    lines = [
+        f"{report.count('registered')} of {len(report.photos)} files registered, "
+        f"{report.count('not_registered')} not, {report.count('skipped')} skipped, {report.seconds:.1f} s"
+    ]
+    for outcome in report.maps:
+        if outcome.status == "refused":
+            lines.append(f"refused: {outcome.name}: {outcome.reason_code}: {outcome.reason}")
+        else:
+            lines.append(
+                f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
+                f"{outcome.photos} photos, {outcome.points} points, EPSG:{outcome.epsg}, "
+                f"GPS residual {outcome.residual_rms_m or 0.0:.2f} m"
+            )
+    for photo in report.photos:
+        if photo.status != "registered":
+            lines.append(f"  {photo.name}: {photo.reason_code}: {photo.reason}")
+    lines.extend(f"warning: {warning}" for outcome in report.maps for warning in outcome.warnings)
+    lines.extend(f"warning: {warning}" for warning in report.warnings)
+    return "\n".join(lines) + "\n"
+
+
+def _options(args: argparse.Namespace) -> "IngestOptions":
+    """The pipeline's options; what the command line leaves open keeps its default."""
+    from featuredb.features.extractor import ExtractorOptions
+    from ingest.map_builder import MapOptions
+    from ingest.pipeline import IngestOptions
+    from ingest.reconstruction import MapMakingOptions
+    from ingest.scan import ScanOptions
+    from ingest.sfm import SfmOptions
+
+    making = MapMakingOptions(
+        extractor=ExtractorOptions(**_given(max_features=args.max_features, max_side_px=args.max_side)),
+        sfm=SfmOptions(refine_focal=not args.keep_focal, **_given(camera_model=args.camera_model)),
+        maps=MapOptions(height_datum=args.height_datum, **_given(min_track_length=args.min_track_length)),
+        cameras=args.cameras,
+    )
+    scan = ScanOptions(exclude=tuple(args.exclude), owner=args.owner, licence=args.licence)
+    return IngestOptions(
+        scan=scan,
+        making=making,
+        gps_sigma_m=args.gps_sigma,
+        name=args.name,
+        work=args.work,
+        stop_after=args.stop_after,
+        **_given(workers=args.workers),
+    )
+
+
+def _given(**values: Any) -> dict[str, Any]:
+    """The arguments that the user gave."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _sigmas(text: str) -> tuple[float, float]:
+    """One or two numbers of metres."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected metres such as 3 or 3,5, found {text!r}") from error
+    if len(values) not in (1, 2) or not all(0 < v < 1e6 for v in values):
+        raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
+    return values[0], values[-1]

@@ -1,0 +1,75 @@
+"""Progress bars with remaining time for the terminal; one line per stage elsewhere."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from ingest.executor import Progress as ProgressCallback
+
+_TITLES = {
+    "scan": "Reading files",
+    "extract": "Extracting features",
+    "match": "Matching pairs",
+    "reconstruct": "Reconstructing",
+    "build": "Building maps",
+}
+
+
+@contextmanager
+def progress_bars(quiet: bool = False) -> Iterator[ProgressCallback]:
+    """Yields a callback progress(stage, done, total) that draws on stderr."""
+    console = Console(stderr=True)
+    if quiet:
+        yield lambda stage, done, total: None
+    elif console.is_terminal:
+        with _bars(console) as bars:
+            yield _drawn(bars)
+    else:
+        yield _logged()
+
+
+def _bars(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def _drawn(bars: Progress) -> ProgressCallback:
+    tasks: dict[str, TaskID] = {}
+
+    def draw(stage: str, done: int, total: int) -> None:
+        if stage not in tasks:
+            tasks[stage] = bars.add_task(_TITLES.get(stage, stage), total=total)
+        bars.update(tasks[stage], completed=done, total=total)
+
+    return draw
+
+
+def _logged() -> ProgressCallback:
+    """A finished stage is one line: files and pipes want no redrawing."""
+    start = time.monotonic()
+    told: set[str] = set()
+
+    def log(stage: str, done: int, total: int) -> None:
+        if done >= total and stage not in told:
+            told.add(stage)
+            sys.stderr.write(f"{_TITLES.get(stage, stage)}: {total} ({time.monotonic() - start:.1f} s)\n")
+
+    return log
