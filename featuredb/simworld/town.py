@@ -193,7 +193,7 @@ def _chimney(b: Building, object_id: int) -> Faces:
     along, across = 0.27 * b.width, -0.12 * b.depth
     x = b.x + along * np.cos(a) - across * np.sin(a)
     y = b.y + along * np.sin(a) + across * np.cos(a)
-    look: dict[str, object] = {"texture": "facade_brick", "top": "plain", "detail": (b.roof_u, 1.0)}
+    look: dict[str, object] = {"texture": "roof_brown", "top": "plain", "detail": (b.roof_u, 1.0)}
     return box(x, y, b.eaves + 0.4 * b.ridge, (0.7, 0.7, 0.6 * b.ridge + 0.8), object_id, yaw_deg=b.yaw_deg, **look)  # type: ignore[arg-type]
 
 
