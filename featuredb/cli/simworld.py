@@ -23,8 +23,8 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "simworld",
         help="write photos of a simulated town, with exact truth",
-        description="Write photos of a simulated town (drone survey, held-out queries, street photos, negatives) "
-        "and truth.json with every camera's true pose.",
+        description="Write photos of a simulated town (drone survey, held-out queries, street photos, "
+        "negatives) and truth.json with every camera's true pose.",
     )
     parser.add_argument("out", metavar="OUT", type=Path, help="folder to write, made if missing")
     parser.add_argument("--size", choices=("short", "full"), default="short", help="default: short")
@@ -42,9 +42,7 @@ def register(subparsers: Any) -> None:
 def run_simworld(args: argparse.Namespace) -> int:
     """Write the world and say what is in it."""
     options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
-    options = replace(
-        options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error)
-    )
+    options = replace(options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error))
     world = _write_with_progress(args.out, options)
     Console().print(_summary(world))
     return 0

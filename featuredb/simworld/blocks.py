@@ -12,7 +12,14 @@ from featuredb.simworld.solids import box, car
 Rect = tuple[float, float, float, float]
 Height = Callable[[float, float], float]
 
-_CAR_COLOURS = ((0.95, 0.95, 0.95), (0.25, 0.25, 0.27), (0.6, 0.6, 0.62), (0.75, 0.15, 0.12), (0.15, 0.25, 0.6), (0.2, 0.4, 0.25))
+_CAR_COLOURS = (
+    (0.95, 0.95, 0.95),
+    (0.25, 0.25, 0.27),
+    (0.6, 0.6, 0.62),
+    (0.75, 0.15, 0.12),
+    (0.15, 0.25, 0.6),
+    (0.2, 0.4, 0.25),
+)
 _HOUSE_FACADES = ("facade_brick", "facade_plaster", "facade_ochre", "facade_stone")
 _TILED_ROOFS = ("roof_red", "roof_brown", "roof_slate")
 _FREE_GROUND_M = 0.35  # parked cars and clutter keep this distance
@@ -63,15 +70,38 @@ class Layout:
             bay = BAY_M * float(self.rng.integers(0, int(FACADE_LENGTH_M / BAY_M)))
             look = (bay, float(self.rng.uniform(0, 500)), float(self.rng.uniform(0, 500)))
         probe = Building(
-            x=x, y=y, yaw_deg=yaw_deg, width=size[0], depth=size[1], base=0, eaves=1, ridge=ridge,
-            facade=facade, roof=roof, facade_u=look[0], detail_u=look[1], roof_u=look[2], tint=tint,
-        )  # fmt: skip
+            x=x,
+            y=y,
+            yaw_deg=yaw_deg,
+            width=size[0],
+            depth=size[1],
+            base=0,
+            eaves=1,
+            ridge=ridge,
+            facade=facade,
+            roof=roof,
+            facade_u=look[0],
+            detail_u=look[1],
+            roof_u=look[2],
+            tint=tint,
+        )
         grounds = [self.height(float(corner[1])) for corner in probe.footprint()]
         building = Building(
-            x=x, y=y, yaw_deg=yaw_deg, width=size[0], depth=size[1], base=min(grounds) - 0.3,
-            eaves=max(grounds) + storeys * STOREY_M, ridge=ridge, facade=facade, roof=roof,
-            facade_u=look[0], detail_u=look[1], roof_u=look[2], tint=tint,
-        )  # fmt: skip
+            x=x,
+            y=y,
+            yaw_deg=yaw_deg,
+            width=size[0],
+            depth=size[1],
+            base=min(grounds) - 0.3,
+            eaves=max(grounds) + storeys * STOREY_M,
+            ridge=ridge,
+            facade=facade,
+            roof=roof,
+            facade_u=look[0],
+            detail_u=look[1],
+            roof_u=look[2],
+            tint=tint,
+        )
         self.buildings.append(building)
         return building
 
@@ -88,15 +118,29 @@ def terraces(layout: Layout, rect: Rect) -> None:
     for row_y, yaw in ((y0 + 5.5, 0.0), (y1 - 5.5, 180.0)):
         for i in range(n):
             layout.add_building(
-                start + 6.0 * (i + 0.5), row_y, (6.0, 9.0), 2, yaw_deg=yaw, ridge=3.4, facade=facade, roof=roof, look=look
+                start + 6.0 * (i + 0.5),
+                row_y,
+                (6.0, 9.0),
+                2,
+                yaw_deg=yaw,
+                ridge=3.4,
+                facade=facade,
+                roof=roof,
+                look=look,
             )
     for i in range(n):  # sheds and fences between the gardens
         x = start + 6.0 * i
-        layout.add_box(x, 0.5 * (y0 + y1), (0.12, max(2.0, y1 - y0 - 21), 1.5), texture="wood", detail=(x, y0))
+        layout.add_box(
+            x, 0.5 * (y0 + y1), (0.12, max(2.0, y1 - y0 - 21), 1.5), texture="wood", detail=(x, y0)
+        )
         if rng.random() < 0.6:
-            layout.add_box(x + 1.6, 0.5 * (y0 + y1) + rng.uniform(-3, 3), (2.2, 1.8, 2.1), texture="wood", detail=(x, 0))
+            layout.add_box(
+                x + 1.6, 0.5 * (y0 + y1) + rng.uniform(-3, 3), (2.2, 1.8, 2.1), texture="wood", detail=(x, 0)
+            )
         if rng.random() < 0.4:
-            layout.trees.append((x + 4.2, 0.5 * (y0 + y1) + float(rng.uniform(-2, 2)), float(rng.uniform(1.0, 1.9))))
+            layout.trees.append(
+                (x + 4.2, 0.5 * (y0 + y1) + float(rng.uniform(-2, 2)), float(rng.uniform(1.0, 1.9)))
+            )
 
 
 def detached(layout: Layout, rect: Rect) -> None:
@@ -147,9 +191,14 @@ def market(layout: Layout, rect: Rect) -> None:
     rng = layout.rng
     middle = y0 + 0.52 * (y1 - y0)
     b = layout.add_building(
-        0.5 * (x0 + x1), 0.5 * (middle + y1), (BAY_M * int((x1 - x0 - 6) // BAY_M), y1 - middle - 5), 2.2,
-        facade="facade_panel", roof="roof_metal", tint=(0.95, 0.9, 0.75),
-    )  # fmt: skip
+        0.5 * (x0 + x1),
+        0.5 * (middle + y1),
+        (BAY_M * int((x1 - x0 - 6) // BAY_M), y1 - middle - 5),
+        2.2,
+        facade="facade_panel",
+        roof="roof_metal",
+        tint=(0.95, 0.9, 0.75),
+    )
     _roof_machines(layout, b, 4)
     park = (x0 + 1, y0 + 1, x1 - 1, middle - 1.5)
     layout.car_parks.append(park)
@@ -173,7 +222,14 @@ def park(layout: Layout, rect: Rect) -> None:
     for x in np.arange(x0 + 4, x1 - 3, 7.0):
         layout.add_box(x, 0.5 * (y0 + y1) + 2.0, (1.8, 0.6, 0.6), texture="wood", detail=(x, 0.0))
     layout.add_building(
-        0.5 * (x0 + x1) + 8, 0.5 * (y0 + y1) + 8, (6, 6), 1.2, yaw_deg=20, ridge=2.0, facade="facade_stone", roof="roof_slate"
+        0.5 * (x0 + x1) + 8,
+        0.5 * (y0 + y1) + 8,
+        (6, 6),
+        1.2,
+        yaw_deg=20,
+        ridge=2.0,
+        facade="facade_stone",
+        roof="roof_slate",
     )
 
 
@@ -187,20 +243,41 @@ def square(layout: Layout, rect: Rect) -> None:
     layout.add_building(cx - 9.2, cy + 5, (6, 6), 6.5, ridge=5.0, facade="facade_stone", roof="roof_slate")
     for x in np.arange(x0 + 7, x1 - 6, 12.2):
         layout.add_building(
-            x, y1 - 5.0, (12.0, 8.0), float(rng.choice([3, 4])), ridge=float(rng.uniform(2.5, 4)),
-            facade=str(rng.choice(_HOUSE_FACADES)), roof=str(rng.choice(_TILED_ROOFS)), tint=_paint(rng),
-        )  # fmt: skip
+            x,
+            y1 - 5.0,
+            (12.0, 8.0),
+            float(rng.choice([3, 4])),
+            ridge=float(rng.uniform(2.5, 4)),
+            facade=str(rng.choice(_HOUSE_FACADES)),
+            roof=str(rng.choice(_TILED_ROOFS)),
+            tint=_paint(rng),
+        )
     for x in np.arange(x0 + 4, x1 - 3, 5.0):
         for y in (y0 + 4.0, y0 + 9.5):
             if rng.random() < 0.75:
                 colour = tuple(float(c) for c in rng.uniform(0.35, 1.1, 3))
                 layout.add_box(
-                    x + float(rng.uniform(-0.6, 0.6)), y, (2.6, 2.0, 2.3), yaw_deg=float(rng.uniform(-12, 12)),
-                    texture="wood", top="plain", detail=(x, y), tint=colour,
-                )  # fmt: skip
+                    x + float(rng.uniform(-0.6, 0.6)),
+                    y,
+                    (2.6, 2.0, 2.3),
+                    yaw_deg=float(rng.uniform(-12, 12)),
+                    texture="wood",
+                    top="plain",
+                    detail=(x, y),
+                    tint=colour,
+                )
 
 
-FILLINGS: tuple[Callable[[Layout, Rect], None], ...] = (terraces, square, flats, detached, market, park, terraces, detached)
+FILLINGS: tuple[Callable[[Layout, Rect], None], ...] = (
+    terraces,
+    square,
+    flats,
+    detached,
+    market,
+    park,
+    terraces,
+    detached,
+)
 
 
 def _paint(rng: np.random.Generator) -> tuple[float, float, float]:
@@ -213,5 +290,11 @@ def _roof_machines(layout: Layout, b: Building, n: int) -> None:
     for _ in range(n):
         x = b.x + float(layout.rng.uniform(-0.42, 0.42)) * b.width
         y = b.y + float(layout.rng.uniform(-0.36, 0.36)) * b.depth
-        size = (float(layout.rng.uniform(0.8, 2.6)), float(layout.rng.uniform(0.8, 2.0)), float(layout.rng.uniform(0.5, 1.6)))
-        layout.small.append(box(x, y, b.eaves, size, layout.new_id(), texture="plain", detail=(x, y), tint=(0.8,) * 3))
+        size = (
+            float(layout.rng.uniform(0.8, 2.6)),
+            float(layout.rng.uniform(0.8, 2.0)),
+            float(layout.rng.uniform(0.5, 1.6)),
+        )
+        layout.small.append(
+            box(x, y, b.eaves, size, layout.new_id(), texture="plain", detail=(x, y), tint=(0.8,) * 3)
+        )

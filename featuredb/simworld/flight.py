@@ -41,8 +41,15 @@ class FlightOptions:
 
     def __post_init__(self) -> None:
         if self.gps_error not in ("realistic", "none"):
-            raise InvalidValueError(f"FlightOptions.gps_error: expected realistic or none, found {self.gps_error!r}")
-        if not (self.lines > 0 and self.per_line > 0 and 0 < self.forward_overlap < 1 and 0 < self.side_overlap < 1):
+            raise InvalidValueError(
+                f"FlightOptions.gps_error: expected realistic or none, found {self.gps_error!r}"
+            )
+        if not (
+            self.lines > 0
+            and self.per_line > 0
+            and 0 < self.forward_overlap < 1
+            and 0 < self.side_overlap < 1
+        ):
             raise InvalidValueError(f"FlightOptions: value out of range in {self}")
 
 
@@ -72,8 +79,8 @@ def street_devices(width: int) -> tuple[Device, ...]:
     )
     devices = []
     for name, share, aspect, focal, k, equivalent, millimetres in plans:
-        w = int(round(share * width / 4)) * 4
-        h = int(round(w * aspect / 4)) * 4
+        w = round(share * width / 4) * 4
+        h = round(w * aspect / 4) * 4
         camera = Camera(model="SIMPLE_RADIAL", width=w, height=h, params=(focal * w, 0.5 * w, 0.5 * h, k))
         devices.append(
             Device(make="Simworld", model=name, camera=camera, focal_mm=millimetres, focal_35mm=equivalent)
@@ -121,8 +128,10 @@ def survey(scene: Scene, options: FlightOptions, seed: int) -> list[Shot]:
 
 
 def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, width: int) -> list[Shot]:
-    """Held-out drone photos: the survey's drone and another one, by turns, from anywhere over the survey's area,
-    any heading, height within 25 %, pitch from straight down to 55 degrees below the horizon."""
+    """Held-out drone photos over the survey's area, by the survey's drone and another one in turn.
+
+    Any heading, height within 25 %, pitch from straight down to about 52 degrees below the horizon.
+    """
     rng = np.random.default_rng((seed, 12))
     devices = drone_device(width), visitor_device(width)
     half_x, half_y = survey_half_extent(flight)
@@ -148,7 +157,9 @@ def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, widt
     return shots
 
 
-def pedestrians(scene: Scene, count: int, seed: int, *, width: int, extent_m: tuple[float, float]) -> list[Shot]:
+def pedestrians(
+    scene: Scene, count: int, seed: int, *, width: int, extent_m: tuple[float, float]
+) -> list[Shot]:
     """Street-level photos from pavements within `extent_m` (half sizes, town axes); half have a poor GPS."""
     rng = np.random.default_rng((seed, 13))
     devices = street_devices(width)
@@ -160,7 +171,9 @@ def pedestrians(scene: Scene, count: int, seed: int, *, width: int, extent_m: tu
         side = float(rng.choice([-1.0, 1.0]))
         b = s.at + side * (0.5 * s.width + 0.2)
         x, y = (a, b) if s.along == "x" else (b, a)
-        position = scene.enu_from_town @ np.array([x, y, max(float(scene.plan.height(y)), 0.0) + rng.uniform(1.5, 1.75)])
+        position = scene.enu_from_town @ np.array(
+            [x, y, max(float(scene.plan.height(y)), 0.0) + rng.uniform(1.5, 1.75)]
+        )
         # Across the street, turned towards one end of it, as people photograph house fronts.
         across = (0.0 if side < 0 else 180.0) if s.along == "x" else (90.0 if side < 0 else 270.0)
         heading = across + _town_heading(scene) + float(rng.choice([-1, 1]) * rng.uniform(15, 70))
@@ -169,7 +182,9 @@ def pedestrians(scene: Scene, count: int, seed: int, *, width: int, extent_m: tu
             Shot(
                 name=f"street/street_{i + 1:04d}.jpg",
                 device=devices[i % len(devices)],
-                cam_from_local=look_pose(position, heading, float(rng.normal(4, 3)), float(rng.normal(0, 1.5))),
+                cam_from_local=look_pose(
+                    position, heading, float(rng.normal(4, 3)), float(rng.normal(0, 1.5))
+                ),
                 time=_START + timedelta(days=35, seconds=90 * i),
                 seed=_shot_seed(seed, 3, i),
                 gps_enu=None if error is None else position + error,

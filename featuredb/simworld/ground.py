@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.noise import fractal
 from featuredb.simworld.scene import Building, GroundPlan
-from featuredb.simworld.texture import Texture, to_image
+from featuredb.simworld.texture import Texture
 
 # label: colour, strength of the 1/f noise, strength of the fine noise
 _KINDS = {
@@ -29,7 +29,7 @@ class _Painter:
 
     def __init__(self, plan: GroundPlan, texel_m: float) -> None:
         self.plan, self.texel = plan, texel_m
-        self.shape = tuple(int(round(s / texel_m)) for s in reversed(plan.size))
+        self.shape = tuple(round(s / texel_m) for s in reversed(plan.size))
         self.labels: NDArray[np.uint8] = np.zeros(self.shape, np.uint8)
         self.rng = np.random.default_rng((plan.seed, 31))
 
@@ -38,13 +38,18 @@ class _Painter:
         centred = (np.asarray(points) + 0.5 * np.array(self.plan.size)) / self.texel - 0.5
         return np.round(centred * 16).astype(np.int32)
 
-    def polygon(self, image: NDArray[np.uint8], points: FloatArray, value: int | tuple[int, int, int]) -> None:
+    def polygon(
+        self, image: NDArray[np.uint8], points: FloatArray, value: int | tuple[int, int, int]
+    ) -> None:
         colour = value if isinstance(value, tuple) else (value,)
         line = cv2.LINE_AA if isinstance(value, tuple) else cv2.LINE_8
         cv2.fillPoly(image, [self.pixels(points)], colour, line, 4)
 
     def rectangle(
-        self, image: NDArray[np.uint8], box: tuple[float, float, float, float], value: int | tuple[int, int, int]
+        self,
+        image: NDArray[np.uint8],
+        box: tuple[float, float, float, float],
+        value: int | tuple[int, int, int],
     ) -> None:
         x0, y0, x1, y1 = box
         self.polygon(image, np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]]), value)
@@ -78,7 +83,11 @@ def _paint_labels(p: _Painter) -> None:
     for i, b in enumerate(plan.buildings):  # a strip of paving or gravel around each house
         c = b.footprint()
         kind = ("gravel", "pavement", "soil")[i % 3]
-        p.polygon(p.labels, c + (c - c.mean(0)) * (1.2 / np.linalg.norm(c - c.mean(0), axis=1))[:, None], _LABEL[kind])
+        p.polygon(
+            p.labels,
+            c + (c - c.mean(0)) * (1.2 / np.linalg.norm(c - c.mean(0), axis=1))[:, None],
+            _LABEL[kind],
+        )
 
 
 def _colours(p: _Painter) -> NDArray[np.uint8]:
@@ -96,7 +105,9 @@ def _colours(p: _Painter) -> NDArray[np.uint8]:
         level = 1.0 + coarse * low[rows] + fine * high[rows]
         cast = coarse * hue[rows]
         for channel, (base, shift) in enumerate(((red, 34.0), (green, 0.0), (blue, -14.0))):
-            image[rows, :, channel] = cv2.convertScaleAbs(np.maximum(base * level + np.float32(shift) * cast, 0))
+            image[rows, :, channel] = cv2.convertScaleAbs(
+                np.maximum(base * level + np.float32(shift) * cast, 0)
+            )
     return image
 
 

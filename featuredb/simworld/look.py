@@ -6,8 +6,8 @@ import numpy as np
 
 from featuredb.simworld.ground import paint_ground
 from featuredb.simworld.materials import town_textures, water_texture
-from featuredb.simworld.raster import Look
 from featuredb.simworld.scene import TEXTURES, GroundPlan, Scene
+from featuredb.simworld.shading import Look
 from featuredb.simworld.texture import Texture
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.simworld.noise import periodic
-from featuredb.simworld.texture import Image8, Texture, to_image
+from featuredb.simworld.texture import Texture, to_image
 
 Canvas = NDArray[np.float32]
 
@@ -45,7 +45,8 @@ def town_textures(seed: int) -> dict[str, Texture]:
         "detail": _detail,
     }
     return {
-        name: painter(np.random.default_rng((seed, 77, i))) for i, (name, painter) in enumerate(painters.items())
+        name: painter(np.random.default_rng((seed, 77, i)))
+        for i, (name, painter) in enumerate(painters.items())
     }
 
 
@@ -65,7 +66,9 @@ def _coloured(base: tuple[int, int, int], level: Canvas) -> Canvas:
 def _noisy(
     rng: np.random.Generator, base: tuple[int, int, int], strength: float, exponent: float = 0.8
 ) -> Texture:
-    return Texture.from_image(to_image(_coloured(base, 1 + strength * periodic(512, rng, exponent=exponent))), 0.03)
+    return Texture.from_image(
+        to_image(_coloured(base, 1 + strength * periodic(512, rng, exponent=exponent))), 0.03
+    )
 
 
 def _detail(rng: np.random.Generator) -> Texture:
@@ -81,7 +84,7 @@ def _detail(rng: np.random.Generator) -> Texture:
 
 def _masonry(rng: np.random.Generator, texel_m: float, course: tuple[float, float]) -> Canvas:
     """Factor (size, size): stones of course (length, height) metres with joints, each of its own shade."""
-    columns, rows = (int(round(_SIZE * texel_m / m)) for m in course)
+    columns, rows = (round(_SIZE * texel_m / m) for m in course)
     shade = rng.normal(1.0, 0.10, (rows, columns)).astype(np.float32)
     y = (np.arange(_SIZE) * rows / _SIZE)[:, None]
     x = (np.arange(_SIZE) * columns / _SIZE)[None] + 0.5 * (y.astype(int) % 2)
@@ -148,7 +151,7 @@ def _tiles(rng: np.random.Generator, base: tuple[int, int, int]) -> Texture:
     """Roof tiles with odd ones, moss and weather."""
     texel = 0.025
     level = _masonry(rng, texel, (0.30, 0.34)) * (1.0 + 0.09 * periodic(_SIZE, rng, exponent=1.0))
-    rows = int(round(_SIZE * texel / 0.34))
+    rows = round(_SIZE * texel / 0.34)
     lap = 1.12 - 0.3 * ((np.arange(_SIZE) * rows / _SIZE) % 1.0)
     image = _coloured(base, (level * lap[:, None]).astype(np.float32))
     moss = np.clip(periodic(_SIZE, rng, exponent=1.2, low=4) - 1.0, 0, 1)[..., None]

@@ -11,10 +11,33 @@ from featuredb.simworld.texture import Image8, to_image
 NegativeKind = Literal["other_town", "blank", "noise", "text", "mirrored", "blurred"]
 NEGATIVE_KINDS: tuple[NegativeKind, ...] = ("other_town", "blank", "noise", "text", "mirrored", "blurred")
 
-_WORDS = (
-    "bridge river market street house stone window garden tower signal north east height record "
-    "camera survey harbour station letter number morning evening window yellow copper"
-).split()
+_WORDS = [
+    "bridge",
+    "river",
+    "market",
+    "street",
+    "house",
+    "stone",
+    "window",
+    "garden",
+    "tower",
+    "signal",
+    "north",
+    "east",
+    "height",
+    "record",
+    "camera",
+    "survey",
+    "harbour",
+    "station",
+    "letter",
+    "number",
+    "morning",
+    "evening",
+    "window",
+    "yellow",
+    "copper",
+]
 _BLUR_SHARE = 0.035  # of the width: nothing smaller than a house front survives
 
 
@@ -43,8 +66,15 @@ def text(rng: np.random.Generator, width: int, height: int) -> Image8:
     for y in range(line, height - line // 2, max(line, 8)):
         words = " ".join(str(w) for w in rng.choice(_WORDS, 40))
         cv2.putText(
-            page, words, (int(0.05 * width), y), cv2.FONT_HERSHEY_COMPLEX, scale, (20, 20, 28), max(1, int(2 * scale)), cv2.LINE_AA
-        )  # fmt: skip
+            page,
+            words,
+            (int(0.05 * width), y),
+            cv2.FONT_HERSHEY_COMPLEX,
+            scale,
+            (20, 20, 28),
+            max(1, int(2 * scale)),
+            cv2.LINE_AA,
+        )
     turn = cv2.getRotationMatrix2D((width / 2, height / 2), float(rng.normal(0, 5)), 1.0)
     turned = cv2.warpAffine(page, turn, (width, height), borderValue=(120, 100, 80))
     return to_image(turned + rng.normal(0, 2.0, page.shape).astype(np.float32))

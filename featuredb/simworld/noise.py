@@ -7,7 +7,9 @@ from numpy.typing import NDArray
 Image32 = NDArray[np.float32]
 
 
-def fractal(height: int, width: int, rng: np.random.Generator, *, octaves: int = 7, gain: float = 1.5) -> Image32:
+def fractal(
+    height: int, width: int, rng: np.random.Generator, *, octaves: int = 7, gain: float = 1.5
+) -> Image32:
     """Noise (height, width) float32 with zero mean and unit standard deviation; each coarser octave is `gain`
     times as strong (gain 2 is close to a 1/f^2 spectrum, 1 is white). Not periodic."""
     field: Image32 | None = None
@@ -23,7 +25,9 @@ def fractal(height: int, width: int, rng: np.random.Generator, *, octaves: int =
     return _normalised(field)
 
 
-def periodic(size: int, rng: np.random.Generator, *, exponent: float = 1.0, low: float = 1.0, high: float = 1e9) -> Image32:
+def periodic(
+    size: int, rng: np.random.Generator, *, exponent: float = 1.0, low: float = 1.0, high: float = 1e9
+) -> Image32:
     """Noise (size, size) float32 that tiles without a seam, zero mean, unit standard deviation.
 
     Amplitude falls with 1 / f^exponent between `low` and `high` cycles per tile and is zero outside.

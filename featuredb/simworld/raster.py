@@ -7,7 +7,6 @@ once per pixel and primitive from textures averaged to the pixel's footprint; th
 averaged. The picture is drawn in tiles that fit the processor's cache.
 """
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -18,18 +17,14 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.rays import pixel_rays
-from featuredb.simworld.scene import SKY_ID, TEXTURES, Ellipsoids, Faces
-from featuredb.simworld.texture import Image8, Texture
+from featuredb.simworld.scene import SKY_ID, Ellipsoids, Faces
+from featuredb.simworld.shading import Float32, Look, ellipsoid_colour, face_colour, sky_colour
+from featuredb.simworld.texture import Image8
 from featuredb.simworld.view import EllipsoidView, FaceView, view_ellipsoids, view_faces
 
-Float32 = NDArray[np.float32]
 Part = tuple[slice, slice]
 
 _TILE_PX = 256  # side of a tile in rays: its buffers stay in a core's second-level cache
-# Texture level = 0.5 log2(area of a ray's footprint) + 0.25 log2(its elongation): between blur and aliasing.
-_DEPTH_POWER = 1.75
-_DETAIL_LIMIT = -1.5  # log2 metres: beyond 0.35 m per pixel the fine detail has averaged out
-_SHARPNESS = 0.1  # levels sharper than one texel per pixel; more gives moire on roof tiles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,15 +41,6 @@ class Rendered:
     rgb: Image8 | None
     depth: Float32
     object_id: NDArray[np.int32]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Look:
-    """Textures in the order of TEXTURES, the fine-detail texture, and the sun."""
-
-    textures: tuple[Texture, ...]
-    detail: Texture
-    to_sun: FloatArray
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -122,7 +108,9 @@ def render(
     up = cam_from_local.rotation[:, 2]
     for y0 in range(0, h * supersample, step):
         for x0 in range(0, w * supersample, step):
-            tile = _draw_tile(job, x0, y0, x[y0 : y0 + step, x0 : x0 + step], y[y0 : y0 + step, x0 : x0 + step])
+            tile = _draw_tile(
+                job, x0, y0, x[y0 : y0 + step, x0 : x0 + step], y[y0 : y0 + step, x0 : x0 + step]
+            )
             _finish(job, tile, up, rgb, depth, object_id)
     return Rendered(rgb=rgb, depth=depth, object_id=object_id)
 
@@ -130,7 +118,9 @@ def render(
 def _draw_tile(job: _Job, x0: int, y0: int, x: Float32, y: Float32) -> _Tile:
     shape = x.shape
     n = job.supersample
-    rows, columns = (slice(start // n, (start + size) // n) for start, size in ((y0, shape[0]), (x0, shape[1])))
+    rows, columns = (
+        slice(start // n, (start + size) // n) for start, size in ((y0, shape[0]), (x0, shape[1]))
+    )
     tile = _Tile(
         x0=x0,
         y0=y0,
@@ -153,7 +143,7 @@ def _draw_tile(job: _Job, x0: int, y0: int, x: Float32, y: Float32) -> _Tile:
 
 
 def _buffers(job: _Job, shape: tuple[int, ...]) -> list[Float32]:
-    """The job's scratch arrays, cut to a shape. Fresh ones of this size would cost more than the arithmetic."""
+    """The job's scratch arrays, cut to a shape; fresh ones would cost more than the arithmetic."""
     size = shape[0] * shape[1]
     return [row[:size].reshape(shape) for row in job.scratch]
 
@@ -181,8 +171,10 @@ def _draw_face(job: _Job, tile: _Tile, i: int, part: Part) -> None:
     (np.add if job.faces.triangle[index] else np.maximum)(s, t, out=spare)
     mask &= spare <= k
     tight = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.faces.object_id[index]))
-    if tight is not None and tile.rgb is not None:
-        _paint(tile, tight, _face_colour(job, tile, i, tight.pixels, tight.far_near))
+    if tight is not None and job.look is not None:
+        rays = tile.center_x[tight.pixels], tile.center_y[tight.pixels]
+        colour = face_colour(job.look, job.faces, job.face_view, i, rays, tight.far_near, job.pixels_per_unit)
+        _paint(tile, tight, colour)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -223,67 +215,10 @@ def _paint(tile: _Tile, visible: _Visible, colour: Image8) -> None:
     """Give each visible ray its pixel's colour."""
     assert tile.rgb is not None
     size = visible.mask.shape[::-1]
-    spread = colour if size == colour.shape[1::-1] else cv2.resize(colour, size, interpolation=cv2.INTER_NEAREST)
+    spread = (
+        colour if size == colour.shape[1::-1] else cv2.resize(colour, size, interpolation=cv2.INTER_NEAREST)
+    )
     cv2.copyTo(spread, visible.mask, tile.rgb[visible.rays])
-
-
-def _face_colour(job: _Job, tile: _Tile, i: int, pixels: Part, far_near: tuple[float, float]) -> Image8:
-    """Colours of the face's plane at the pixels' centres: texture, detail, tint."""
-    assert job.look is not None
-    index = int(job.face_view.index[i])
-    faces, planes = job.faces, job.face_view.planes[i].astype(np.float32)
-    x, y = tile.center_x[pixels], tile.center_y[pixels]
-    k, s, t = (x * row[0] + (y * row[1] + row[2]) for row in planes)
-    # At an edge the centre may lie beside the face or past its horizon: the plane's nearest sensible depth.
-    z = 1.0 / np.maximum(k, np.float32(far_near[0]))
-    s, t = s * z, t * z
-    u0, v0, us, vs, ut, vt = faces.uv[index].astype(np.float32)
-    u, v = s * us + t * ut, s * vs + t * vt
-    coefficient = _level_coefficient(job, i)
-    texture = job.look.textures[faces.texture[index]]
-    colour = _sample_levels(texture, (u, v, u0, v0), k, far_near, coefficient)
-    footprint = coefficient - _DEPTH_POWER * math.log2(far_near[1])
-    if not np.isnan(faces.detail_uv[index, 0]) and footprint < _DETAIL_LIMIT:
-        du, dv = faces.detail_uv[index].astype(np.float32)
-        detail = _sample_levels(job.look.detail, (u, v, du, dv), k, far_near, coefficient)
-        colour = np.asarray(cv2.multiply(colour, detail, scale=1.0 / 128.0))
-    tint = faces.tint[index]
-    if np.ptp(tint) < 1e-9:
-        return np.asarray(cv2.convertScaleAbs(colour, alpha=float(tint[0])))
-    return np.asarray(cv2.multiply(colour, (*tint.tolist(), 1.0)))
-
-
-def _level_coefficient(job: _Job, i: int) -> float:
-    """c such that log2(footprint of a pixel in metres) = c + _DEPTH_POWER * log2(z), for face i."""
-    index = int(job.face_view.index[i])
-    us, vs, ut, vt = job.faces.uv[index, 2:]
-    area = abs(np.linalg.det(job.face_view.planes[i]) * (us * vt - vs * ut)) / job.pixels_per_unit**2
-    return float(0.5 * np.log2(area) - 0.25 * np.log2(job.face_view.distance[i]))
-
-
-def _sample_levels(
-    texture: Texture,
-    uv: tuple[Float32, Float32, np.float32, np.float32],
-    k: Float32,
-    far_near: tuple[float, float],
-    coefficient: float,
-) -> Image8:
-    """Colours at u + u0, v + v0, each from the level that fits its depth 1 / k."""
-    # Whole repetitions are taken out first: far outside its image the sampling is slow and inexact.
-    width, height = texture.extent_m
-    u, v = uv[0] + np.float32(uv[2] % width), uv[1] + np.float32(uv[3] % height)
-    base = coefficient - math.log2(texture.texel_m) - _SHARPNESS
-    top = len(texture.levels) - 1
-    last, first = (min(max(round(base - _DEPTH_POWER * math.log2(q)), 0), top) for q in far_near)
-    colour = texture.sample(u, v, first)
-    for level in range(first + 1, last + 1):
-        limit = np.float32(2.0 ** ((base - level + 0.5) / _DEPTH_POWER))
-        further = (k < limit).view(np.uint8)
-        column, row, w, h = cv2.boundingRect(further)
-        if w:
-            band = slice(row, row + h), slice(column, column + w)
-            cv2.copyTo(texture.sample(u[band], v[band], level), further[band], colour[band])
-    return colour
 
 
 def _draw_ellipsoid(job: _Job, tile: _Tile, i: int, part: Part) -> None:
@@ -294,14 +229,15 @@ def _draw_ellipsoid(job: _Job, tile: _Tile, i: int, part: Part) -> None:
     mask = inside & (k > tile.inverse_depth[part])
     index = int(view.index[i])
     visible = _write_geometry(tile, part, k, mask.view(np.uint8), int(job.ellipsoids.object_id[index]))
-    if visible is not None and tile.rgb is not None:
+    if visible is not None and job.look is not None:
         x, y = tile.center_x[visible.pixels], tile.center_y[visible.pixels]
         k, _ = _ellipsoid_depth(view, i, x, y, _buffers(job, x.shape))
         z = 1.0 / np.maximum(k, np.float32(visible.far_near[0]))
         m = view.unit_from_cam[i].astype(np.float32)
         w0 = view.w0[i].astype(np.float32)
         on_unit = [(x * row[0] + (y * row[1] + row[2])) * z + w for row, w in zip(m, w0, strict=True)]
-        _paint(tile, visible, _ellipsoid_colour(job, index, on_unit, float(view.depth[i])))
+        footprint = max(float(view.depth[i]), 0.1) / job.pixels_per_unit
+        _paint(tile, visible, ellipsoid_colour(job.look, job.ellipsoids, index, on_unit, footprint))
 
 
 def _ellipsoid_depth(
@@ -336,25 +272,6 @@ def _ellipsoid_depth(
     return k, inside
 
 
-def _ellipsoid_colour(job: _Job, index: int, on_unit: list[Float32], depth: float) -> Image8:
-    assert job.look is not None
-    ellipsoids = job.ellipsoids
-    texture = job.look.textures[TEXTURES.index("leaves")]
-    rx, ry, rz = ellipsoids.radii[index].astype(np.float32)
-    u0, v0 = ellipsoids.texture_uv[index].astype(np.float32)
-    wx, wy, wz = on_unit
-    # The octahedral map: little stretch anywhere, no pole that a drone would look down on.
-    fold = np.float32(2.0) / (np.abs(wx) + np.abs(wy) + np.abs(wz))
-    u, v = wx * fold * rx + u0, wy * fold * ry + np.sign(wz) * rz + v0
-    footprint = max(depth, 0.1) / job.pixels_per_unit
-    level = min(max(round(math.log2(footprint / texture.texel_m)), 0), len(texture.levels) - 1)
-    colour = texture.sample(u, v, level)
-    sun = job.look.to_sun.astype(np.float32)
-    light = np.clip((wx * sun[0] + wy * sun[1] + wz * sun[2]) * np.float32(0.55) + np.float32(0.6), 0.2, 1.2)
-    shaded = cv2.multiply(colour, cv2.merge([light] * 3), dtype=cv2.CV_8U)
-    return np.asarray(cv2.multiply(shaded, (*ellipsoids.tint[index].tolist(), 1.0)), dtype=np.uint8)
-
-
 def _finish(
     job: _Job, tile: _Tile, up: FloatArray, rgb: Image8 | None, depth: Float32, object_id: NDArray[np.int32]
 ) -> None:
@@ -369,15 +286,6 @@ def _finish(
         return
     empty = tile.inverse_depth == 0
     if empty.any():
-        cv2.copyTo(_sky(tile, up), empty.view(np.uint8), tile.rgb)
+        cv2.copyTo(sky_colour((tile.x, tile.y), up), empty.view(np.uint8), tile.rgb)
     size = (tile.x.shape[1] // n, tile.x.shape[0] // n)
     rgb[rows, columns] = cv2.resize(tile.rgb, size, interpolation=cv2.INTER_AREA) if n > 1 else tile.rgb
-
-
-def _sky(tile: _Tile, up: FloatArray) -> Image8:
-    """A clear sky: darker blue with elevation."""
-    x, y = tile.x, tile.y
-    a, b, c = up.astype(np.float32)
-    elevation = np.clip((x * a + y * b + c) / np.sqrt(x * x + y * y + 1), 0, 1)[..., None]
-    low, high = np.array([206, 218, 230], np.float32), np.array([96, 142, 204], np.float32)
-    return np.asarray(low + (high - low) * np.sqrt(elevation), dtype=np.uint8)

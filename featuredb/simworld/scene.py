@@ -192,7 +192,7 @@ class Building:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Street:
-    """A straight street in town axes: along x or y, at `at` on the other axis, from `start` to `end`, metres."""
+    """A straight street along x or y, at `at` on the other axis, from `start` to `end`; town axes, metres."""
 
     along: str
     at: float

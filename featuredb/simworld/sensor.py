@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.texture import Image8
+from featuredb.simworld.texture import Image8, to_image
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +50,7 @@ def expose(rgb: Image8, rng: np.random.Generator, options: SensorOptions) -> Ima
     photo *= _vignette(rgb.shape[0], rgb.shape[1], options.vignetting)[..., None]
     variance = photo * np.float32(options.shot_noise**2 / 128.0) + np.float32(options.read_noise**2)
     photo += np.sqrt(variance) * rng.standard_normal(photo.shape, dtype=np.float32)
-    return np.clip(photo + 0.5, 0, 255).astype(np.uint8)
+    return to_image(photo)
 
 
 @lru_cache(maxsize=8)

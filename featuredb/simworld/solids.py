@@ -85,11 +85,9 @@ def house(building: Building, ground: float, object_id: int) -> Faces:
         uv = (u, b.base - ground, length, 0.0, 0.0, height)
         detail = (b.detail_u + 14.3 * i, 0.37 * b.detail_u)
         parts.append(
-            face(
-                corners[i], edge, (0, 0, height), b.facade, object_id, uv=uv, detail=detail, tint=b.tint
-            )
+            face(corners[i], edge, (0, 0, height), b.facade, object_id, uv=uv, detail=detail, tint=b.tint)
         )
-    top = corners + [0.0, 0.0, b.eaves - b.base]
+    top = corners + np.array([0.0, 0.0, b.eaves - b.base])
     parts.append(_flat_roof(b, top, object_id) if b.ridge <= 0 else _gabled_roof(b, top, ground, object_id))
     return Faces.concatenate(parts)
 
@@ -105,7 +103,10 @@ def _gabled_roof(b: Building, top: FloatArray, ground: float, object_id: int) ->
     ridge0, ridge1 = 0.5 * (top[0] + top[3]) + up, 0.5 * (top[1] + top[2]) + up
     along = top[1] - top[0]
     parts = []
-    for start, edge, rise, shift in ((top[0], along, ridge0 - top[0], 0.0), (top[2], -along, ridge1 - top[2], 7.7)):
+    for start, edge, rise, shift in (
+        (top[0], along, ridge0 - top[0], 0.0),
+        (top[2], -along, ridge1 - top[2], 7.7),
+    ):
         detail = (b.roof_u + shift, 0.43 * b.roof_u + shift)
         parts.append(face(start, edge, rise, b.roof, object_id, detail=detail))
     for start, end, apex, shift in ((top[1], top[2], ridge1, 1), (top[3], top[0], ridge0, 3)):
@@ -130,7 +131,17 @@ def _gabled_roof(b: Building, top: FloatArray, ground: float, object_id: int) ->
 
 def car(x: float, y: float, base: float, yaw_deg: float, tint: Sequence[float], object_id: int) -> Faces:
     """A car of 4.4 x 1.8 x 1.45 m: body and cabin."""
-    body = box(x, y, base + 0.2, (4.4, 1.8, 0.65), object_id, yaw_deg=yaw_deg, texture="car", tint=tint, detail=(0, 0))
+    body = box(
+        x,
+        y,
+        base + 0.2,
+        (4.4, 1.8, 0.65),
+        object_id,
+        yaw_deg=yaw_deg,
+        texture="car",
+        tint=tint,
+        detail=(0, 0),
+    )
     dark = tuple(0.35 * t for t in tint)
     cabin = box(x, y, base + 0.85, (2.3, 1.6, 0.6), object_id, yaw_deg=yaw_deg, texture="car", tint=dark)
     a = np.radians(yaw_deg)

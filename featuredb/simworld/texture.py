@@ -60,4 +60,5 @@ class Texture:
 
 def to_image(rgb: NDArray[np.float32]) -> Image8:
     """Colours in 0..255 as float to uint8."""
-    return np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+    image: Image8 = np.clip(rgb + 0.5, 0, 255).astype(np.uint8)
+    return image

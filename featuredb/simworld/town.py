@@ -1,13 +1,13 @@
 """Lays out a town by seed and places it on Earth."""
 
-from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.blocks import FILLINGS, Layout, Rect
+from featuredb.simworld.blocks import FILLINGS, Layout
 from featuredb.simworld.ground import SIDEWALK_M
 from featuredb.simworld.scene import (
     Building,
@@ -90,28 +90,43 @@ def _lay_out(seed: int, rng: np.random.Generator, size: tuple[float, float]) -> 
     layout = Layout(rng=rng, height=height)
     edge = 0.5 * _ROAD_M + SIDEWALK_M + 0.5
     k = int(rng.integers(len(FILLINGS)))
-    for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+    for y0, y1 in pairwise(ys):
         if y1 - y0 < 36:  # the river, or a strip too narrow
             continue
-        for x0, x1 in zip(xs[:-1], xs[1:], strict=True):
+        for x0, x1 in pairwise(xs):
             FILLINGS[k % len(FILLINGS)](layout, (x0 + edge, y0 + edge, x1 - edge, y1 - edge))
             k += 1
         k += 3
     _along_streets(layout, streets, xs, ys)
     plan = GroundPlan(
-        seed=seed, size=size, streets=tuple(streets), buildings=tuple(layout.buildings),
-        plazas=tuple(layout.plazas), car_parks=tuple(layout.car_parks), gardens=tuple(layout.gardens),
-        trees=tuple(layout.trees), profile=profile, river=river, to_sun=(-0.42, -0.52, 0.744),
-    )  # fmt: skip
+        seed=seed,
+        size=size,
+        streets=tuple(streets),
+        buildings=tuple(layout.buildings),
+        plazas=tuple(layout.plazas),
+        car_parks=tuple(layout.car_parks),
+        gardens=tuple(layout.gardens),
+        trees=tuple(layout.trees),
+        profile=profile,
+        river=river,
+        to_sun=(-0.42, -0.52, 0.744),
+    )
     return plan, layout
 
 
 def _terrain(h: float, river: tuple[float, float]) -> tuple[tuple[float, float], ...]:
     """Knots (y, height): flat, a river bed, then two slopes."""
     return (
-        (-_LAND_M, 0.0), (river[0], 0.0), (river[0] + 4, -3.0), (river[1] - 4, -3.0), (river[1], 0.0),
-        (0.0, 1.5), (0.25 * h, 6.5), (0.5 * h, 7.5), (_LAND_M, 8.5),
-    )  # fmt: skip
+        (-_LAND_M, 0.0),
+        (river[0], 0.0),
+        (river[0] + 4, -3.0),
+        (river[1] - 4, -3.0),
+        (river[1], 0.0),
+        (0.0, 1.5),
+        (0.25 * h, 6.5),
+        (0.5 * h, 7.5),
+        (_LAND_M, 8.5),
+    )
 
 
 def _cuts(rng: np.random.Generator, low: float, high: float, step: tuple[float, float]) -> list[float]:
@@ -128,11 +143,15 @@ def _along_streets(layout: Layout, streets: list[Street], xs: list[float], ys: l
         crossings = ys if s.along == "y" else xs
         half = 0.5 * s.width
         for a in np.arange(s.start + 8, s.end - 8, 6.2):
-            if min(abs(a - c) for c in crossings) < 9 or (s.along == "y" and abs(a - 0.5 * (ys[1] + ys[2])) < 18):
+            if min(abs(a - c) for c in crossings) < 9 or (
+                s.along == "y" and abs(a - 0.5 * (ys[1] + ys[2])) < 18
+            ):
                 continue
             kind, side = rng.random(), float(rng.choice([-1, 1]))
 
-            def put(offset: float, a: float = float(a), side: float = side, s: Street = s) -> tuple[float, float]:
+            def put(
+                offset: float, a: float = float(a), side: float = side, s: Street = s
+            ) -> tuple[float, float]:
                 return (a, s.at + side * offset) if s.along == "x" else (s.at + side * offset, a)
 
             if kind < 0.33:
@@ -151,7 +170,7 @@ def _ground_faces(plan: GroundPlan) -> Faces:
     w, h = plan.size
     ys = sorted({y for y, _ in plan.profile} | {-0.5 * h, 0.5 * h})
     parts = []
-    for y0, y1 in zip(ys[:-1], ys[1:], strict=True):
+    for y0, y1 in pairwise(ys):
         inside = y0 >= -0.5 * h and y1 <= 0.5 * h
         for x0, x1 in ((-_LAND_M, -0.5 * w), (-0.5 * w, 0.5 * w), (0.5 * w, _LAND_M)):
             painted = inside and x0 == -0.5 * w
@@ -159,10 +178,15 @@ def _ground_faces(plan: GroundPlan) -> Faces:
             u, v = (x0 + 0.5 * w, y0 + 0.5 * h) if painted else (x0 + _LAND_M, y0 + _LAND_M)
             parts.append(
                 face(
-                    (x0, y0, z0), (x1 - x0, 0, 0), (0, y1 - y0, z1 - z0), "ground" if painted else "fields", GROUND_ID,
-                    uv=(u, v, x1 - x0, 0.0, 0.0, y1 - y0), detail=(u, v),
+                    (x0, y0, z0),
+                    (x1 - x0, 0, 0),
+                    (0, y1 - y0, z1 - z0),
+                    "ground" if painted else "fields",
+                    GROUND_ID,
+                    uv=(u, v, x1 - x0, 0.0, 0.0, y1 - y0),
+                    detail=(u, v),
                 )
-            )  # fmt: skip
+            )
     return Faces.concatenate(parts)
 
 
@@ -171,7 +195,14 @@ def _water_and_bridges(plan: GroundPlan) -> Faces:
     y0, y1 = plan.river
     level = -1.9
     parts = [
-        face((-_LAND_M, y0, level), (2 * _LAND_M, 0, 0), (0, y1 - y0, 0), "water", WATER_ID, uv=(0, 0, 2 * _LAND_M, 0, 0, y1 - y0))
+        face(
+            (-_LAND_M, y0, level),
+            (2 * _LAND_M, 0, 0),
+            (0, y1 - y0, 0),
+            "water",
+            WATER_ID,
+            uv=(0, 0, 2 * _LAND_M, 0, 0, y1 - y0),
+        )
     ]
     for s in plan.streets:
         if s.along != "y":
@@ -179,7 +210,15 @@ def _water_and_bridges(plan: GroundPlan) -> Faces:
         x0, x1 = s.at - 0.5 * s.width - SIDEWALK_M, s.at + 0.5 * s.width + SIDEWALK_M
         uv = (x0 + 0.5 * w, y0 - 1 + 0.5 * h, x1 - x0, 0.0, 0.0, y1 - y0 + 2)
         parts.append(
-            face((x0, y0 - 1, 0.03), (x1 - x0, 0, 0), (0, y1 - y0 + 2, 0), "ground", BRIDGE_ID, uv=uv, detail=uv[:2])
+            face(
+                (x0, y0 - 1, 0.03),
+                (x1 - x0, 0, 0),
+                (0, y1 - y0 + 2, 0),
+                "ground",
+                BRIDGE_ID,
+                uv=uv,
+                detail=uv[:2],
+            )
         )
         for x in (x0, x1):
             look = {"texture": "facade_stone", "top": "plain", "detail": (x, 0.0), "tint": (0.9, 0.88, 0.85)}
@@ -193,8 +232,17 @@ def _chimney(b: Building, object_id: int) -> Faces:
     along, across = 0.27 * b.width, -0.12 * b.depth
     x = b.x + along * np.cos(a) - across * np.sin(a)
     y = b.y + along * np.sin(a) + across * np.cos(a)
-    look: dict[str, object] = {"texture": "roof_brown", "top": "plain", "detail": (b.roof_u, 1.0)}
-    return box(x, y, b.eaves + 0.4 * b.ridge, (0.7, 0.7, 0.6 * b.ridge + 0.8), object_id, yaw_deg=b.yaw_deg, **look)  # type: ignore[arg-type]
+    return box(
+        x,
+        y,
+        b.eaves + 0.4 * b.ridge,
+        (0.7, 0.7, 0.6 * b.ridge + 0.8),
+        object_id,
+        yaw_deg=b.yaw_deg,
+        texture="roof_brown",
+        top="plain",
+        detail=(b.roof_u, 1.0),
+    )
 
 
 def _trees(plan: GroundPlan, rng: np.random.Generator, enu_from_town: FloatArray) -> tuple[Faces, Ellipsoids]:
@@ -202,7 +250,9 @@ def _trees(plan: GroundPlan, rng: np.random.Generator, enu_from_town: FloatArray
     trunks, centres, radii, tints, ids = [], [], [], [], []
     for i, (x, y, radius) in enumerate(plan.trees):
         ground = float(plan.height(y))
-        trunks.append(box(x, y, ground - 0.1, (0.3, 0.3, 1.6 * radius), _TREE_ID + i, texture="wood", detail=(x, y)))
+        trunks.append(
+            box(x, y, ground - 0.1, (0.3, 0.3, 1.6 * radius), _TREE_ID + i, texture="wood", detail=(x, y))
+        )
         tint = rng.uniform(0.7, 1.15) * np.array([rng.uniform(0.8, 1.25), 1.0, rng.uniform(0.7, 1.0)])
         for _ in range(3):
             offset = rng.normal(0, 0.33, 3) * radius * [1, 1, 0.8]
@@ -212,7 +262,10 @@ def _trees(plan: GroundPlan, rng: np.random.Generator, enu_from_town: FloatArray
             ids.append(_TREE_ID + i)
     n = len(centres)
     crowns = Ellipsoids(
-        center=np.reshape(centres, (n, 3)), radii=np.reshape(radii, (n, 3)), tint=np.reshape(tints, (n, 3)),
-        texture_uv=rng.uniform(0, 500, (n, 2)), object_id=np.array(ids, dtype=np.int32),
-    )  # fmt: skip
+        center=np.reshape(centres, (n, 3)),
+        radii=np.reshape(radii, (n, 3)),
+        tint=np.reshape(tints, (n, 3)),
+        texture_uv=rng.uniform(0, 500, (n, 2)),
+        object_id=np.array(ids, dtype=np.int32),
+    )
     return Faces.concatenate(trunks), crowns

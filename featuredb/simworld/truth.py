@@ -111,7 +111,8 @@ def read_truth(folder: Path) -> Truth:
         )
     except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
         raise InvalidValueError(
-            f"{path}: expected the truth of a simulated world, found {error!r}; make one with featuredb simworld"
+            f"{path}: expected the truth of a simulated world, found {error!r}; "
+            "make one with featuredb simworld"
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""A scene as one camera meets it: primitives in camera coordinates, culled, with their windows in the image."""
+"""A scene as one camera meets it: primitives in camera axes, culled, with their windows in the image."""
 
 from dataclasses import dataclass
 
@@ -39,7 +39,7 @@ class FaceView:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class EllipsoidView:
-    """m ellipsoids that may be seen: a point of the ray r at depth z is unit-sphere w0 + z * unit_from_cam @ r.
+    """m ellipsoids that may be seen; the ray r at depth z is w0 + z * unit_from_cam @ r for the unit sphere.
 
     Attributes:
         index: (m,), w0: (m, 3), unit_from_cam: (m, 3, 3), window: (m, 4), depth: (m,) of the centre.
@@ -72,7 +72,11 @@ def view_faces(faces: Faces, camera: Camera, cam_from_local: Rigid3) -> FaceView
     order = seen[np.argsort(nearest[seen], kind="stable")]
     inverse = np.where(nearest > _NEAR_M, 1.0 / np.maximum(nearest, _NEAR_M), np.inf)
     return FaceView(
-        index=front[order], planes=planes[order], window=window[order], distance=distance[order], nearest=inverse[order]
+        index=front[order],
+        planes=planes[order],
+        window=window[order],
+        distance=distance[order],
+        nearest=inverse[order],
     )
 
 
@@ -89,7 +93,11 @@ def view_ellipsoids(ellipsoids: Ellipsoids, camera: Camera, cam_from_local: Rigi
     order = seen[outside[seen]]
     order = order[np.argsort(depth[order], kind="stable")]
     return EllipsoidView(
-        index=order, w0=w0[order], unit_from_cam=unit_from_cam[order], window=window[order], depth=depth[order]
+        index=order,
+        w0=w0[order],
+        unit_from_cam=unit_from_cam[order],
+        window=window[order],
+        depth=depth[order],
     )
 
 
@@ -117,7 +125,9 @@ def _windows(
     seen = np.flatnonzero(candidate)
     window = np.zeros((len(corners), 4), dtype=np.int64)
     if len(seen):
-        window[seen] = _pixel_windows(np.clip(bounds[seen], limits[[0, 1, 0, 1]], limits[[2, 3, 2, 3]]), camera)
+        window[seen] = _pixel_windows(
+            np.clip(bounds[seen], limits[[0, 1, 0, 1]], limits[[2, 3, 2, 3]]), camera
+        )
         seen = seen[(window[seen, 2] > window[seen, 0]) & (window[seen, 3] > window[seen, 1])]
     return seen, window
 

@@ -131,7 +131,9 @@ def write_world(folder: Path, options: WorldOptions, progress: Progress | None =
         if progress is not None:
             progress(done, len(tasks))
     scene = town_of(options)
-    images = [true_image(scene, shot) for group in ("drone", "queries", "street") for shot in _shots(options, group)]
+    images = [
+        true_image(scene, shot) for group in ("drone", "queries", "street") for shot in _shots(options, group)
+    ]
     truth = Truth(seed=options.seed, epsg=scene.epsg, frame=scene.frame, images={i.name: i for i in images})
     write_truth(folder, truth)
     return open_world(folder)
@@ -154,7 +156,9 @@ def town_of(options: WorldOptions) -> Scene:
 
 @lru_cache(maxsize=2)
 def _other_town_of(options: WorldOptions) -> Scene:
-    return make_town(options.seed + 1000, name="other town", size_m=options.town_size_m, place=OTHER_TOWN_PLACE)
+    return make_town(
+        options.seed + 1000, name="other town", size_m=options.town_size_m, place=OTHER_TOWN_PLACE
+    )
 
 
 @lru_cache(maxsize=16)
