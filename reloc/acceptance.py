@@ -63,7 +63,7 @@ def log_nfa(matches: int, inliers: int, tolerance_px: float, width: int, height:
     return float(-value / np.log(10.0))
 
 
-def coverage(pixels: FloatArray, width: int, height: int) -> float:
+def coverage(pixels: NDArray[np.floating], width: int, height: int) -> float:
     """Share of the cells of a 10x10 grid over the image that hold at least one of the pixels (k, 2)."""
     if len(pixels) == 0:
         return 0.0

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
@@ -12,6 +12,9 @@ from featuredb.index.area import Area
 from featuredb.index.descriptor_index import DescriptorIndex
 from featuredb.maps.feature_map import GeoPrior
 from reloc.options import CandidateOptions
+
+# A place this far under the frame's horizon is more than 1,100 km away.
+_FAR_BELOW_M = 100_000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -30,7 +33,7 @@ class Cluster:
         area: where they are.
         images: (i,) rows of the area's images.
         points: (p,) rows of the area's points that they see.
-        score: votes above expectation, in standard deviations; infinity for a whole area.
+        score: votes above expectation, in standard deviations; infinity where all areas are tried anyway.
     """
 
     area: Area
@@ -43,29 +46,38 @@ def find_clusters(
     areas: Sequence[IndexedArea], features: Features, prior: GeoPrior | None, options: CandidateOptions
 ) -> list[Cluster]:
     """Clusters to try, best first; empty where the prior lies outside all maps or nothing got votes."""
+    reach = [(indexed, images_in_reach(indexed.area, prior, options)) for indexed in areas]
+    reach = [(indexed, allowed) for indexed, allowed in reach if allowed.any()]
+    images = [np.flatnonzero(allowed) for _, allowed in reach]
+    points = [indexed.area.points_of_images(rows) for (indexed, _), rows in zip(reach, images, strict=True)]
+    small = [len(rows) <= options.single_cluster_points for rows in points]
+    if all(small) and len(reach) <= options.max_clusters:
+        return [
+            Cluster(area=indexed.area, images=images[i], points=points[i], score=np.inf)
+            for i, (indexed, _) in enumerate(reach)
+        ]
+    votes = _vote([indexed for indexed, _ in reach], features, options)
+    share = sum(int(v.sum()) for v in votes) / max(sum(len(v) for v in votes), 1)
     found: list[Cluster] = []
-    for indexed in areas:
-        area = indexed.area
-        allowed = images_in_reach(area, prior, options)
-        if not allowed.any():
-            continue
-        images = np.flatnonzero(allowed)
-        points = area.points_of_images(images)
-        if len(points) <= options.single_cluster_points:
-            found.append(Cluster(area=area, images=images, points=points, score=np.inf))
-            continue
-        scores = _vote(indexed, features, allowed, options)
-        found.extend(_grow_clusters(area, scores, options))
+    for i, (indexed, allowed) in enumerate(reach):
+        if small[i]:
+            score = float(_above_chance(votes[i][points[i]].sum(), share * len(points[i])))
+            found.append(Cluster(area=indexed.area, images=images[i], points=points[i], score=score))
+        else:
+            scores = np.where(allowed, _image_scores(indexed.area, votes[i], share), -np.inf)
+            found.extend(_grow_clusters(indexed.area, scores, options))
     found.sort(key=lambda cluster: -cluster.score)
     return found[: options.max_clusters]
 
 
 def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
-    """(i,) which images may see what a camera within the prior sees."""
+    """(i,) which images may see what a camera within the prior sees. Only horizontal distances count."""
     if prior is None:
         return np.ones(len(area.image_center), dtype=np.bool_)
     height = prior.height_m if prior.height_m is not None else area.frame.height_m
     place = area.frame.enu_from_geodetic(np.array([prior.latitude_deg, prior.longitude_deg, height]))
+    if place[2] < -_FAR_BELOW_M:  # the far side of the Earth: its horizontal distances come back to zero
+        return np.zeros(len(area.image_center), dtype=np.bool_)
     margin = options.prior_sigmas * prior.sigma_horizontal_m + options.prior_reach * area.image_reach
     to_camera = np.linalg.norm(area.image_center[:, :2] - place[:2], axis=1)
     to_scene = np.linalg.norm(area.image_scene[:, :2] - place[:2], axis=1)
@@ -73,25 +85,37 @@ def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOption
 
 
 def _vote(
-    indexed: IndexedArea, features: Features, allowed: NDArray[np.bool_], options: CandidateOptions
-) -> FloatArray:
-    """(i,) votes of each image above what chance gives it, in standard deviations; -inf where not allowed.
+    areas: Sequence[IndexedArea], features: Features, options: CandidateOptions
+) -> list[NDArray[np.int64]]:
+    """For each area the votes (p,) of its points: a feature votes for its nearest points of all areas."""
+    asked = features.descriptors[: options.vote_features]
+    found = [indexed.index.search(asked, options.vote_neighbours) for indexed in areas]
+    distance = np.concatenate([d for d, _ in found], axis=1)
+    rank = np.argsort(np.argsort(distance, axis=1, kind="stable"), axis=1)
+    chosen = np.split(rank < options.vote_neighbours, len(areas), axis=1)
+    return [
+        np.bincount(rows[mine & (rows >= 0)], minlength=len(indexed.area.points))
+        for indexed, (_, rows), mine in zip(areas, found, chosen, strict=True)
+    ]
 
-    An image that sees many points gets many votes by chance: n votes over P points give an image with p
-    of them n p / P, with about that variance.
+
+def _image_scores(area: Area, votes_of_point: NDArray[np.int64], share: float) -> FloatArray:
+    """(i,) votes of each image above what chance gives it, in standard deviations.
+
+    Args:
+        share: votes per point over all areas. An image that sees many points gets many votes by chance:
+            p points get p times this, with about that variance.
     """
-    area = indexed.area
-    _, rows = indexed.index.search(features.descriptors[: options.vote_features], options.vote_neighbours)
-    votes_of_point = np.bincount(rows[rows >= 0], minlength=len(area.points))
     votes = np.add.reduceat(
         np.append(votes_of_point[area.see_point], 0), np.minimum(area.image_start[:-1], len(area.see_point))
     ).astype(np.float64)
     seen = np.diff(area.image_start)
     votes[seen == 0] = 0.0
-    expected = votes_of_point.sum() * seen / max(len(area.points), 1)
-    score = (votes - expected) / np.sqrt(expected + 1.0)
-    score[~allowed] = -np.inf
-    return np.asarray(score, dtype=np.float64)
+    return np.asarray(_above_chance(votes, share * seen), dtype=np.float64)
+
+
+def _above_chance(votes: ArrayLike, expected: ArrayLike) -> FloatArray:
+    return np.asarray((np.subtract(votes, expected)) / np.sqrt(np.add(expected, 1.0)), dtype=np.float64)
 
 
 def _grow_clusters(area: Area, scores: FloatArray, options: CandidateOptions) -> list[Cluster]:
@@ -108,6 +132,7 @@ def _grow_clusters(area: Area, scores: FloatArray, options: CandidateOptions) ->
         neighbours, shared = neighbours[usable], shared[usable]
         # Shared points decide which images belong together, votes which of them matter.
         weight = np.sqrt(shared) * np.maximum(scores[neighbours], 0.0) + 1e-3 * shared
+        weight[neighbours == seed] = np.inf
         images = np.union1d(
             [seed], neighbours[np.argsort(-weight, kind="stable")[: options.max_cluster_images]]
         )

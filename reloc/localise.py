@@ -22,7 +22,14 @@ from reloc.answer import make_answer
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import Matches, guided_matches, match_cluster, visible_points
 from reloc.options import LocaliseOptions
-from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
+from reloc.pose import (
+    CameraSource,
+    PoseHypothesis,
+    estimate_pose,
+    pose_uncertainty,
+    refine_pose,
+    reprojection_errors,
+)
 from reloc.prior import contradicts_prior
 from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
 from reloc.stopwatch import Stopwatch
@@ -106,12 +113,12 @@ def _search(
         return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
     candidates: list[Candidate] = []
     most = 0
-    for cluster in clusters:
+    for tried, cluster in enumerate(clusters, start=1):
         matches = match_cluster(features, cluster, options.matching)
         watch.split("matching")
         most = max(most, len(matches))
         candidates.extend(_poses(features, cluster, matches, request, options, watch))
-        if candidates and _settled(candidates, cluster, clusters, options):
+        if candidates and _settled(candidates, cluster, clusters[tried:], options):
             break
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
     if not candidates and most < options.pose.min_matches:
@@ -120,13 +127,12 @@ def _search(
 
 
 def _settled(
-    candidates: list[Candidate], cluster: Cluster, clusters: list[Cluster], options: LocaliseOptions
+    candidates: list[Candidate], cluster: Cluster, rest: list[Cluster], options: LocaliseOptions
 ) -> bool:
-    """Whether the remaining clusters need not be tried: this one is sure, and theirs have far fewer votes."""
-    rest = [c.score for c in clusters if c is not cluster and c.score < cluster.score]
+    """Whether the remaining clusters need not be tried: a pose is sure, and they have far fewer votes."""
     best = max(candidates, key=lambda c: c.evidence.log_nfa)
     sure = best.evidence.log_nfa > 4.0 * options.acceptance.min_log_nfa
-    return sure and all(score < 0.5 * cluster.score for score in rest)
+    return sure and all(other.score < 0.5 * cluster.score for other in rest)
 
 
 def _poses(
@@ -199,7 +205,7 @@ def _refined(
         again = refine_pose(pixels, points, best, options.pose)
         if again.count >= best.count:
             best, kept = again, guided
-    return _with_evidence(features, area, best, kept, len(matches), pose.count, len(expected), options)
+    return _with_evidence(features, area, best, kept, matches, len(expected), options)
 
 
 def _with_evidence(
@@ -207,35 +213,48 @@ def _with_evidence(
     area: Area,
     pose: PoseHypothesis,
     matches: Matches,
-    unguided: int,
-    unguided_inliers: int,
+    unguided: Matches,
     visible: int,
     options: LocaliseOptions,
 ) -> Candidate:
-    """The number of false alarms is that of the unguided matches: guided ones look where they are wanted."""
-    pixels, points = _pairs(features, area, matches)
-    inliers = np.flatnonzero(pose.inliers)
+    """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
+
+    Of those, only independent ones count, or a few places that match several times over would be believed.
+    """
     longer = max(pose.camera.width, pose.camera.height)
-    # A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
-    seen = visible_points(area, matches.point[inliers], pose.camera, pose.cam_from_local)
-    inliers = inliers[np.isin(matches.point[inliers], seen)]
-    own = inliers[independent_inliers(pixels[inliers], points[inliers], 0.002 * longer)]
     tolerance_px = options.pose.tolerance_rel * longer
-    sample = 4 if pose.focal_is_free else 3
+    own = _independent(features, area, pose, matches, pose.inliers)
+    error = reprojection_errors(*_pairs(features, area, unguided), pose.camera, pose.cam_from_local)
+    blind = _independent(features, area, pose, unguided, error < tolerance_px)
     evidence = Evidence(
         inliers=len(own),
         log_nfa=log_nfa(
-            unguided,
-            min(unguided_inliers, len(inliers)),
+            len(unguided),
+            len(blind),
             tolerance_px,
             pose.camera.width,
             pose.camera.height,
-            sample,
+            sample=4 if pose.focal_is_free else 3,
         ),
-        coverage=coverage(pixels[own], pose.camera.width, pose.camera.height),
+        coverage=coverage(features.xy[matches.feature[own]], pose.camera.width, pose.camera.height),
         visible_share=len(own) / max(visible, 1),
     )
     return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+
+
+def _independent(
+    features: Features, area: Area, pose: PoseHypothesis, matches: Matches, inlier: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Rows of the inliers that the pose can see, each a measurement of its own.
+
+    A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
+    """
+    rows = np.flatnonzero(inlier)
+    seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local)
+    rows = rows[np.isin(matches.point[rows], seen)]
+    pixels, points = _pairs(features, area, matches)
+    gap_px = 0.002 * max(pose.camera.width, pose.camera.height)
+    return rows[independent_inliers(pixels[rows], points[rows], gap_px)]
 
 
 def _decide(

@@ -13,7 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.jacobians import pixel_jacobians
 from reloc.options import PoseOptions
-from reloc.self_calibration import calibrate
+from reloc.self_calibration import calibrate, covariance_from_information, joint_jacobians
 
 CameraSource = Literal["request", "map", "exif", "estimated"]
 
@@ -27,7 +27,8 @@ class PoseHypothesis:
         camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
         inliers: (m,) bool over the matches that it was estimated from.
         prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
-        calibrated_covariance: (6, 6) where the lens was estimated with the pose, else None.
+        lens_information: (4,) inverse variances of what was known of the lens beforehand (focal length,
+            principal point, radial) where it was estimated with the pose, else None.
     """
 
     cam_from_local: Rigid3
@@ -35,7 +36,7 @@ class PoseHypothesis:
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
     prior_focal_px: float
-    calibrated_covariance: FloatArray | None = None
+    lens_information: FloatArray | None = None
 
     @property
     def count(self) -> int:
@@ -180,7 +181,7 @@ def _refine_with_lens(
         start,
         cam_from_local=found.cam_from_local,
         camera=found.camera,
-        calibrated_covariance=found.covariance,
+        lens_information=found.lens_information,
     )
 
 
@@ -213,24 +214,26 @@ class PoseUncertainty:
 def pose_uncertainty(
     pixels: FloatArray, points: FloatArray, point_covariance: FloatArray, pose: PoseHypothesis
 ) -> PoseUncertainty:
-    """From the Jacobian of the inliers, scaled by the measured residuals.
+    """From the Jacobian of the inliers, scaled by the measured residuals; an estimated lens marginalised.
 
     Args:
         pixels, points: (k, 2), (k, 3) of the inliers only.
         point_covariance: (k, 3, 3) in the area's frame.
     """
-    by_point, by_pose = pixel_jacobians(pose.camera, pose.cam_from_local, points)
+    lens = pose.lens_information
+    jacobians = pixel_jacobians if lens is None else joint_jacobians
+    by_point, jacobian = jacobians(pose.camera, pose.cam_from_local, points)
     residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
     noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
     weight = np.linalg.inv(noise)
-    information = np.einsum("nij,nik,nkl->jl", by_pose, weight, by_pose)
     chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
-    factor = chi_square / max(2 * len(points) - 6, 1)
-    covariance = np.linalg.pinv(information, hermitian=True) * factor
-    if pose.calibrated_covariance is not None:
-        covariance = pose.calibrated_covariance
+    factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
+    # Residuals of zero are test data; the floor is a hundredth of a pixel.
+    information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
+    if lens is not None:
+        information[6:, 6:] += np.diag(lens)
     return PoseUncertainty(
-        covariance=covariance,
+        covariance=covariance_from_information(information)[:6, :6],
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         variance_factor=factor,
     )

@@ -36,12 +36,16 @@ class LensPriors:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibrated:
-    """Pose and camera with the covariance (6, 6) of the pose, intrinsics marginalised; as in
-    pixel_jacobians."""
+    """Pose and camera together.
+
+    Attributes:
+        lens_information: (4,) inverse variances of what was known beforehand of focal length, principal point
+            and radial distortion, in the order of the camera's parameters.
+    """
 
     cam_from_local: Rigid3
     camera: Camera
-    covariance: FloatArray
+    lens_information: FloatArray
 
 
 def calibrate(
@@ -81,26 +85,50 @@ def calibrate(
     problem = _Problem(
         pixels=pixels, points=points, noise_px=noise_px, prior_mean=prior_mean, prior_sigma=prior_sigma
     )
+    pose, camera = _minimise(problem, pose, camera)
+    return Calibrated(cam_from_local=pose, camera=camera, lens_information=1.0 / prior_sigma**2)
+
+
+def joint_jacobians(
+    camera: Camera, cam_from_local: Rigid3, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of pixels by points (k, 2, 3), and by pose and SIMPLE_RADIAL intrinsics (k, 2, 10)."""
+    steps = np.array([1e-4 * camera.params[0], 0.1, 0.1, 1e-4])
+    by_point, by_pose = pixel_jacobians(camera, cam_from_local, points)
+    by_lens = intrinsics_jacobian(camera, cam_from_local.act(points), steps)
+    return by_point, np.concatenate([by_pose, by_lens], axis=2)
+
+
+def covariance_from_information(information: FloatArray) -> FloatArray:
+    """Inverse of an information matrix; what it leaves open gets a huge variance, never a small one."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def _minimise(problem: "_Problem", pose: Rigid3, camera: Camera) -> tuple[Rigid3, Camera]:
+    """Levenberg-Marquardt. Cauchy weights make its steps too short, so longer ones are tried too."""
     damping = 1e-4
     cost = problem.cost(pose, camera)
-    system = problem.linearise(pose, camera)
-    for _ in range(15):
-        damped = system.information + damping * np.diag(np.diag(system.information))
-        step: FloatArray = np.linalg.solve(damped, system.gradient).astype(np.float64)
-        moved_pose, moved_camera = _step(pose, camera, step)
-        moved_cost = problem.cost(moved_pose, moved_camera)
-        if moved_cost > cost:
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        done = cost - moved_cost < 1e-6 * cost
-        pose, camera, cost, damping = moved_pose, moved_camera, moved_cost, 0.3 * damping
+    for _ in range(20):
         system = problem.linearise(pose, camera)
-        if done:
+        before = cost
+        while damping < 1e6:
+            # The floor keeps the matrix regular where no point says anything of a parameter.
+            diagonal = np.maximum(np.diag(system.information), 1e-9)
+            step: FloatArray = np.linalg.solve(
+                system.information + damping * np.diag(diagonal), system.gradient
+            ).astype(np.float64)
+            length, moved = problem.best_length(pose, camera, step)
+            if moved < cost:
+                pose, camera = _step(pose, camera, length * step)
+                cost, damping = moved, max(0.3 * damping, 1e-10)
+                break
+            damping *= 10.0
+        if before - cost < 1e-7 * before:
             break
-    covariance: FloatArray = np.linalg.inv(system.information).astype(np.float64)
-    return Calibrated(cam_from_local=pose, camera=camera, covariance=covariance[:6, :6])
+    return pose, camera
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,13 +157,22 @@ class _Problem:
         prior = ((np.asarray(camera.params) - self.prior_mean) / self.prior_sigma) ** 2
         return 0.5 * float(np.log1p(squared).sum() + prior.sum())
 
+    def best_length(self, pose: Rigid3, camera: Camera, step: FloatArray) -> tuple[float, float]:
+        """The best of the lengths 1, 2 and 4 of a step, and the cost there."""
+        length, cost = 1.0, self.cost(*_step(pose, camera, step))
+        for longer in (2.0, 4.0):
+            longer_cost = self.cost(*_step(pose, camera, longer * step))
+            if longer_cost >= cost:
+                break
+            length, cost = longer, longer_cost
+        return length, cost
+
     def linearise(self, pose: Rigid3, camera: Camera) -> _System:
         """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2)."""
         in_camera = pose.act(self.points)
-        front = in_camera[:, 2] > 0.1
-        steps = np.array([1e-4 * camera.params[0], 0.1, 0.1, 1e-4])
-        _, by_pose = pixel_jacobians(camera, pose, self.points[front])
-        jacobian = np.concatenate([by_pose, intrinsics_jacobian(camera, in_camera[front], steps)], axis=2)
+        # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
+        front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
+        _, jacobian = joint_jacobians(camera, pose, self.points[front])
         residual = self.pixels[front] - camera.project(in_camera[front])
         weight = 1.0 / (1.0 + np.sum(residual**2, axis=1) / self.noise_px**2) / self.noise_px**2
         information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
