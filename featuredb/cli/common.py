@@ -3,6 +3,7 @@
 import argparse
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
+from decimal import Decimal
 
 from featuredb.errors import InvalidValueError
 from featuredb.store import Database
@@ -74,7 +75,7 @@ def format_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str
     cells = [list(header), *([_cell(value) for value in row] for row in body)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     right = [
-        bool(body) and all(isinstance(row[i], int | float) or row[i] is None for row in body)
+        bool(body) and all(isinstance(row[i], int | float | Decimal | None) for row in body)
         for i in range(len(header))
     ]
     lines = [

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
+import pyarrow as pa
+
 from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.changes import Change, add_maps, live_row, retire_map
@@ -288,8 +290,19 @@ def _already_there(
 
 
 def read_rows(maps: Table) -> list[Row]:
+    """All rows of a version of `maps`.
+
+    Raises:
+        SnapshotNotFoundError: its files are gone.
+        StoreError: they cannot be read.
+    """
     try:
-        rows: list[Row] = maps.dataset().to_table().to_pylist()
+        table = maps.dataset().to_table()
+        # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
+        created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
+        rows: list[Row] = table.drop_columns("created_at").to_pylist()
+        for row, time in zip(rows, created, strict=True):
+            row["created_at"] = time.replace(tzinfo=UTC)
     except FileNotFoundError as error:
         raise SnapshotNotFoundError(
             f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"

@@ -78,8 +78,7 @@ class SqlSession:
         return SqlResult(columns=columns, rows=self._fetch())
 
     def _register(self) -> None:
-        rows = self.snapshot.rows()
-        self._connection.register("stored_maps", map_rows_table(rows))
+        self._connection.register("stored_maps", _without_zone(map_rows_table(self.snapshot.rows())))
         self._connection.execute("CREATE VIEW maps AS SELECT * EXCLUDE (write_id) FROM stored_maps")
         self._connection.execute(_CAMERAS_VIEW)
         for name in CHILD_TABLES:
@@ -94,3 +93,9 @@ class SqlSession:
                 yield from rows
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             raise StoreError(f"SQL: {error}") from error
+
+
+def _without_zone(maps: pa.Table) -> pa.Table:
+    """`created_at` as a plain UTC timestamp: DuckDB needs pytz to hand out one with a zone."""
+    index = maps.schema.get_field_index("created_at")
+    return maps.set_column(index, "created_at", maps["created_at"].cast(pa.timestamp("us")))

@@ -24,7 +24,9 @@ def _new_place(options: dict[str, str]) -> Place:
 def ceph() -> Iterator[dict[str, str]]:
     missing = missing_ceph_programs()
     if missing:
-        pytest.skip(f"Ceph is not installed (no {', '.join(missing)}): apt-get install radosgw ceph-mon ceph-osd")
+        pytest.skip(
+            f"Ceph is not installed (no {', '.join(missing)}): apt-get install radosgw ceph-mon ceph-osd"
+        )
     # Not pytest's folder: a socket's path may have 107 characters.
     with tempfile.TemporaryDirectory(prefix="ceph") as folder, ceph_gateway(Path(folder)) as options:
         yield options

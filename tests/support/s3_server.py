@@ -80,7 +80,9 @@ def ceph_gateway(folder: Path) -> Iterator[dict[str, str]]:
     )
     with_conf = ("-c", str(conf))
     with ExitStack() as stack:
-        _run("monmaptool", "--create", "--fsid", fsid, "--addv", "a", f"[v2:127.0.0.1:{monitor_port}]", monmap)
+        _run(
+            "monmaptool", "--create", "--fsid", fsid, "--addv", "a", f"[v2:127.0.0.1:{monitor_port}]", monmap
+        )
         _run("ceph-mon", "--mkfs", "-i", "a", *with_conf, "--monmap", monmap)
         stack.enter_context(_daemon("ceph-mon", "-i", "a", "-f", *with_conf))
         _run("ceph", *with_conf, "osd", "new", osd_uuid)

@@ -1,0 +1,187 @@
+"""The command line: results on stdout, errors in one line on stderr, exit codes."""
+
+import csv
+import io
+import json
+import logging
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from featuredb.cli.main import COMMAND_GROUP, build_parser, main
+from featuredb.errors import StoreError
+from featuredb.store import Database
+from tests.support.maps import random_map
+
+DATABASE_COMMANDS = EntryPoint("db", "featuredb.cli.database:register", COMMAND_GROUP)
+
+
+@pytest.fixture(autouse=True)
+def _only_database_commands(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """As if only featuredb itself were installed; and leave no handlers behind."""
+    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [DATABASE_COMMANDS])
+    root, package = logging.getLogger(), logging.getLogger("featuredb")
+    handlers, level, package_level = list(root.handlers), root.level, package.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    package.setLevel(package_level)
+
+
+@pytest.fixture
+def db(tmp_path: Path) -> str:
+    url = str(tmp_path / "maps.db")
+    Database.create(url).commit_maps([random_map(1), random_map(2, parents=("map-1",)), random_map(3)])
+    return url
+
+
+def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:
+    code = main(argv)
+    out, err = capsys.readouterr()
+    return code, out, err
+
+
+def test_init_is_idempotent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        code, out, _ = run(capsys, "init", str(tmp_path / "new.db"))
+        assert code == 0
+        assert out.endswith("version 0\n")
+
+
+def test_maps_and_history(db: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "maps", db)
+    assert code == 0
+    lines = out.splitlines()
+    assert lines[0].split()[:4] == ["map", "name", "status", "method"]
+    assert [line.split()[0] for line in lines[2:]] == ["map-1", "map-2", "map-3"]
+    code, out, _ = run(capsys, "maps", db, "--json", "--as-of", "0")
+    assert json.loads(out)["maps"] == []
+    code, out, _ = run(capsys, "history", db)
+    assert [line.split()[3] for line in out.splitlines()[2:]] == ["commit", "init"]
+
+
+def test_retire_and_rollback(db: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "retire", db, "map-1", "--reason", "wrong street")
+    assert (code, out) == (0, "retired: map-1, map-2\n")
+    assert len(run(capsys, "maps", db)[1].splitlines()) == 3
+    assert len(run(capsys, "maps", db, "--all")[1].splitlines()) == 5
+    assert run(capsys, "rollback", db, "1")[:2] == (0, "version 3\n")
+    assert len(run(capsys, "maps", db)[1].splitlines()) == 5
+
+
+def test_sql_formats(db: str, capsys: pytest.CaptureFixture[str]) -> None:
+    query = "select map_id, points, created_at, tiles, null as nothing from maps order by map_id"
+    rows = json.loads(run(capsys, "sql", db, query, "--format", "json")[1])
+    assert [row["points"] for row in rows] == [60, 60, 60]
+    assert rows[0]["nothing"] is None
+    assert all(tile.startswith("E0") for tile in rows[0]["tiles"])
+    text = run(capsys, "sql", db, query, "--format", "csv")[1]
+    assert [row["map_id"] for row in csv.DictReader(io.StringIO(text))] == ["map-1", "map-2", "map-3"]
+    table = run(capsys, "sql", db, "select 1.5 as x, 'ab' as name union all select 22.25, 'c' order by x")[1]
+    assert table == "    x  name\n-----  ----\n 1.50  ab\n22.25  c\n"
+    assert json.loads(run(capsys, "sql", db, "select 'nan'::float as x", "--format", "json")[1]) == [
+        {"x": None}
+    ]
+    assert json.loads(run(capsys, "sql", db, "select 1 where false", "--format", "json")[1]) == []
+
+
+def test_verify_compact_vacuum(db: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "verify", db)
+    assert code == 0
+    assert out.endswith("rows: sound\n")
+    assert run(capsys, "compact", db)[0] == 0
+    code, out, _ = run(capsys, "vacuum", db, "--file-grace-hours", "0", "--dry-run")
+    assert out.startswith("would remove")
+    code, out, _ = run(capsys, "vacuum", db, "--file-grace-hours", "0")
+    assert code == 0
+    assert json.loads(run(capsys, "verify", db, "--json")[1])["ok"] is True
+    next(Path(db, "points").rglob("*.parquet")).unlink()
+    code, out, _ = run(capsys, "verify", db)
+    assert code == 1
+    assert "PROBLEM points/" in out
+    code, out, _ = run(capsys, "verify", db, "--json")
+    assert code == 1
+    assert json.loads(out)["problems"]
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        (["maps", "{tmp}/nowhere"], "featuredb init"),
+        (["sql", "{db}", "drop table maps"], "read-only"),
+        (["sql", "{db}", "select nonsense from maps"], "nonsense"),
+        (["maps", "{db}", "--as-of", "77"], "expected a version from 0"),
+        (["maps", "{db}", "--as-of", "1999-01-01"], "expected a version from 0"),
+        (["retire", "{db}", "map-77", "--reason", "x"], "map-77"),
+        (["maps", "{db}", "--storage-option", "novalue"], "KEY=VALUE"),
+    ],
+)
+def test_errors_are_one_message_and_exit_2(
+    db: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], argv: list[str], message: str
+) -> None:
+    code, out, err = run(capsys, *(a.format(db=db, tmp=tmp_path) for a in argv))
+    assert code == 2
+    assert out == ""
+    assert err.startswith("featuredb: ")
+    assert message in err
+    assert "Traceback" not in err
+
+
+def test_debug_logs_the_traceback(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    assert run(capsys, "maps", str(tmp_path / "nowhere"), "--debug")[0] == 2
+    assert "Traceback" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        [],
+        ["no-such-command"],
+        ["maps"],
+        ["maps", "db", "--as-of", "yesterday"],
+        ["vacuum", "db", "--keep-history-hours=-1"],
+    ],
+)
+def test_wrong_usage_is_exit_2(capsys: pytest.CaptureFixture[str], argv: list[str]) -> None:
+    code, _, err = run(capsys, *argv)
+    assert code == 2
+    assert "usage: featuredb" in err
+
+
+def test_help_is_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = run(capsys, "--help")
+    assert code == 0
+    assert all(name in out for name in ("init", "maps", "sql", "verify", "vacuum"))
+
+
+def test_a_defect_is_exit_70(
+    db: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(Database, "history", lambda self: 1 // 0)
+    assert run(capsys, "history", db)[0] == 70
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_a_broken_plugin_does_not_take_the_others_down(caplog: pytest.LogCaptureFixture) -> None:
+    plugins = [
+        EntryPoint("absent", "no_such_module_here:register", COMMAND_GROUP),
+        EntryPoint("broken", f"{__name__}:broken_register", COMMAND_GROUP),
+        DATABASE_COMMANDS,
+    ]
+    parser = build_parser(plugins)
+    assert parser.parse_args(["maps", "db"]).db == "db"
+    assert [record.args[0] for record in caplog.records if isinstance(record.args, tuple)] == [
+        "absent",
+        "broken",
+    ]
+
+
+def broken_register(subparsers: object) -> None:
+    raise StoreError("no good")

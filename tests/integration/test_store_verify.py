@@ -1,0 +1,149 @@
+"""`verify` names each kind of damage."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from deltalake import DeltaTable, write_deltalake
+
+from featuredb.store import Database
+from featuredb.store.verify import verify
+from tests.support.maps import random_map
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    database = Database.create(tmp_path / "maps.db")
+    # One tile, so that there is one file for each child table to damage.
+    database.commit_map(random_map(1, extent_m=10.0))
+    assert verify(database).ok
+    return database
+
+
+def data_file(database: Database, table: str) -> Path:
+    files = sorted(Path(database.url, table).rglob("*.parquet"))
+    assert files
+    return files[0]
+
+
+def edit_file(database: Database, table: str, edit: Callable[[pa.Table], pa.Table]) -> None:
+    """Rewrite a data file behind the log's back, to the same number of bytes, as the log knows that, too."""
+    path = data_file(database, table)
+    size = path.stat().st_size
+    rows = edit(pq.ParquetFile(path).read())
+    pq.write_table(rows, path, compression="zstd", compression_level=19, write_statistics=False)
+    content = path.read_bytes()
+    footer = len(content) - 8 - int.from_bytes(content[-8:-4], "little")
+    assert len(content) <= size
+    path.write_bytes(content[:footer] + bytes(size - len(content)) + content[footer:])
+
+
+def set_first(column: str, value: Any) -> Callable[[pa.Table], pa.Table]:
+    """Change a column in the first row."""
+
+    def edit(table: pa.Table) -> pa.Table:
+        index = table.schema.get_field_index(column)
+        values = [value, *table[column].to_pylist()[1:]]
+        return table.set_column(
+            index, table.schema.field(index), pa.array(values, table.schema.field(index).type)
+        )
+
+    return edit
+
+
+def problems(database: Database) -> str:
+    report = verify(database)
+    assert not report.ok
+    return "\n".join(f"{p.where}: {p.what}" for p in report.problems)
+
+
+@pytest.mark.parametrize("table", ["images", "points", "observations"])
+def test_a_deleted_file(database: Database, table: str) -> None:
+    data_file(database, table).unlink()
+    found = problems(database)
+    assert f"{table}/" in found
+    assert f"map map-1: cannot read its {table}" in found
+
+
+@pytest.mark.parametrize("table", ["images", "points", "observations"])
+def test_a_truncated_file(database: Database, table: str) -> None:
+    path = data_file(database, table)
+    path.write_bytes(path.read_bytes()[:-20])
+    assert f"{table}/" in problems(database)
+
+
+def test_a_flipped_byte_in_the_data(database: Database) -> None:
+    path = data_file(database, "observations")
+    content = bytearray(path.read_bytes())
+    content[len(content) // 3] ^= 0x10
+    path.write_bytes(content)
+    assert "map map-1" in problems(database)
+
+
+def test_a_lost_row(database: Database) -> None:
+    edit_file(database, "points", lambda table: table.slice(1))
+    found = problems(database)
+    assert "expected 60 rows by the log, found 59" in found
+    assert "expected 60 rows in points, found 59" in found
+
+
+def test_a_double_row(database: Database) -> None:
+    edit_file(database, "observations", lambda t: pa.concat_tables([t.slice(1), t.slice(1, 1)]))
+    assert "observation_index is not each of 0 to 199 once" in problems(database)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "value", "message"),
+    [
+        ("points", "height", 1e4, "1 points outside the map's box"),
+        ("points", "easting", float("nan"), "points: coordinates that are not finite"),
+        ("points", "northing", 5_000_000.0, "points: 1 rows in another tile"),
+        ("images", "easting", 100_000.0, "images: 1 rows in another tile"),
+        ("images", "camera_id", 7, "1 images name a camera that is not there"),
+        ("images", "image_id", 77, "observations name an image that is not there"),
+        ("observations", "point_index", 1000, "1 observations name a point that is not there"),
+        ("points", "error_px", 0.001, "content digests differ"),
+        ("points", "red", 300, "content digests differ"),
+        ("observations", "descriptor", b"short", "cannot be loaded"),
+        ("images", "name", "other.jpg", "content digests differ"),
+    ],
+)
+def test_an_edited_row(database: Database, table: str, column: str, value: Any, message: str) -> None:
+    edit_file(database, table, set_first(column, value))
+    assert message in problems(database)
+
+
+def test_observations_in_another_tile_than_their_point(database: Database) -> None:
+    table = DeltaTable(f"{database.url}/observations")
+    rows = table.to_pyarrow_table()
+    moved = rows.set_column(
+        rows.schema.get_field_index("tile"),
+        rows.schema.field("tile"),
+        pa.repeat("E000001_N000001", len(rows)),
+    )
+    write_deltalake(table, moved, mode="overwrite")
+    assert "observations: 200 rows in another tile than their point" in problems(database)
+
+
+def test_a_row_of_maps_that_lies(database: Database) -> None:
+    table = DeltaTable(f"{database.url}/maps")
+    table.update(updates={"points": "points + 1"})
+    assert "expected 61 rows in points, found 60" in problems(database)
+
+
+def test_rows_of_an_unknown_write_are_orphans_and_no_damage(database: Database) -> None:
+    table = DeltaTable(f"{database.url}/points")
+    rows = table.to_pyarrow_table()
+    foreign = rows.set_column(
+        rows.schema.get_field_index("write_id"), rows.schema.field("write_id"), pa.repeat("0" * 32, len(rows))
+    )
+    write_deltalake(table, foreign, mode="append")
+    report = verify(database)
+    assert report.ok
+    assert report.orphans == ("0" * 32,)
+    points = database.snapshot().dataset("points").to_table(["write_id"])
+    assert pc.count_distinct(points["write_id"]).as_py() == 1
