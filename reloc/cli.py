@@ -61,7 +61,10 @@ def register(subparsers: Any) -> None:
 
 def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--prior", metavar="LAT,LON,SIGMA_M", help="where it may have been taken: WGS84 degrees, metres"
+        "--prior",
+        metavar="LAT,LON,SIGMA_M",
+        help="where it may have been taken, WGS84 degrees and metres; with an equals sign where the latitude "
+        "is negative: --prior=-33.86,151.21,25",
     )
     parser.add_argument("--exif-prior", action="store_true", help="the photo's own GPS is the prior")
     parser.add_argument(

@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from featuredb.errors import FeatureDbError, InvalidValueError
 from featuredb.features.decode import decode_rgb
@@ -26,6 +27,7 @@ _INLIER_BGR = (60, 220, 60)
 _RESIDUAL_BGR = (40, 40, 240)
 _OTHER_BGR = (240, 160, 40)
 _MAX_OTHER = 4000  # more dots hide the photo
+_SAME_POINT_M = 0.001
 _MAX_SIDE_PX = 1600  # of the picture; larger ones only take longer to open
 
 
@@ -55,7 +57,8 @@ def draw_overlay(
             cv2.resize(image, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), dtype=np.uint8
         )
     if other_points_utm is not None and len(other_points_utm):
-        for x, y in _inside(project_utm(reply, _thinned(other_points_utm)), reply) * shrink:
+        others = _thinned(_without(other_points_utm, np.array(reply.inlier_points.utm).reshape(-1, 3)))
+        for x, y in _inside(project_utm(reply, others), reply) * shrink:
             cv2.circle(image, (round(x), round(y)), 2, _OTHER_BGR, -1, cv2.LINE_AA)
     keypoints = np.array(reply.inlier_points.pixels).reshape(-1, 2)
     projected = project_utm(reply, np.array(reply.inlier_points.utm).reshape(-1, 3))
@@ -128,6 +131,14 @@ def _inside(pixels: FloatArray, reply: LocaliseReply) -> FloatArray:
     return pixels[inside]
 
 
+def _without(points: FloatArray, taken: FloatArray) -> FloatArray:
+    """The points (n, 3) that are none of `taken` (k, 3), metres; the reply rounds coordinates."""
+    if not len(taken):
+        return points
+    distance, _ = cKDTree(taken).query(points, distance_upper_bound=_SAME_POINT_M)
+    return points[~np.isfinite(distance)]
+
+
 def _thinned(points: FloatArray) -> FloatArray:
     step = max(1, len(points) // _MAX_OTHER)
     return points[::step]
@@ -139,7 +150,6 @@ def _caption(image: NDArray[np.uint8], reply: LocaliseReply) -> None:
         f"EPSG {reply.utm.epsg}  E {reply.utm.easting:.2f}  N {reply.utm.northing:.2f}  "
         f"H {reply.utm.height:.2f}  {reply.inliers} inliers"
     )
-    for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            image, text, (8, image.shape[0] - 10), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, width, cv2.LINE_AA
-        )
+    height = image.shape[0]
+    image[max(0, height - 26) :] //= 4  # a dark band, so that the text reads on any photo
+    cv2.putText(image, text, (8, height - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)

@@ -37,6 +37,7 @@ BAD_REPLY = "BAD_REPLY"
 _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
 _DEADLINE_MARGIN_S = 0.2
+_ASK_AGAIN_S = 0.05  # while no server is there yet
 
 
 class Client:
@@ -249,25 +250,23 @@ class EventStream:
 
 
 def _wait_for_database(session: zenoh.Session, database: str | None, where: str, timeout_s: float) -> str:
-    """The database's name, once the liveliness token of one of its servers is there."""
-    tokens: queue.SimpleQueue[str] = queue.SimpleQueue()
+    """The database's name, once the liveliness token of one of its servers is there.
+
+    Asks again and again instead of subscribing: a Zenoh 1.10 session that had a liveliness subscriber and
+    gave it up gets incomplete answers to later liveliness queries now and then.
+    """
     pattern = f"featuredb/{database or '*'}/servers/*"
-    with session.liveliness().declare_subscriber(
-        pattern, lambda sample: tokens.put(str(sample.key_expr)), history=True
-    ):
-        try:
-            found = {tokens.get(timeout=timeout_s).split("/")[1]}
-        except queue.Empty:
-            named = "" if database is None else f" of database {database!r}"
-            raise ServiceError(
-                NO_SERVER, f"no server{named} answers at {where} within {timeout_s:g} s"
-            ) from None
-    if database is not None:
-        return database
-    # One is there; those that are there too answer at once.
-    for reply in session.liveliness().get(pattern, timeout=timeout_s):
-        if reply.ok is not None:
-            found.add(str(reply.ok.key_expr).split("/")[1])
+    end = time.perf_counter() + timeout_s
+    while True:
+        left_s = max(0.1, end - time.perf_counter())
+        replies = session.liveliness().get(pattern, timeout=left_s)
+        found = {str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None}
+        if found or time.perf_counter() >= end:
+            break
+        time.sleep(_ASK_AGAIN_S)
+    if not found:
+        named = "" if database is None else f" of database {database!r}"
+        raise ServiceError(NO_SERVER, f"no server{named} answers at {where} within {timeout_s:g} s")
     if len(found) > 1:
         raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
     return found.pop()

@@ -285,7 +285,7 @@ def test_a_client_that_goes_away_costs_its_query_only():
             assert gate.entered.acquire(timeout=10)
         gate.open()
         assert client.localise(photo()).status == "not_localised"
-        assert client.status().queue.busy == 0
+        assert client.status().queries.not_localised == {"TOO_FEW_INLIERS": 2}
 
 
 @pytest.mark.parametrize("megabytes", [1, 3])
@@ -319,3 +319,16 @@ def test_logs_are_json_lines_with_the_request_id(caplog):
     assert by_id["traced-1"]["latency_ms"] > 0
     assert (by_id["traced-2"]["event"], by_id["traced-2"]["code"]) == ("refused", "BAD_IMAGE")
     assert all({"time", "level", "logger", "message"} <= line.keys() for line in lines)
+
+
+def test_a_client_that_comes_before_its_server_waits_for_it():
+    with running_server(ScriptedLocaliser(1), name="first") as early, ThreadPoolExecutor(1) as pool:
+        late = Client(early.endpoints[0], "late")
+        opening = pool.submit(late.open)
+        with (
+            client_of(early) as session_of,
+            session_of._session().liveliness().declare_token("featuredb/late/servers/x"),
+        ):
+            opening.result(timeout=10)
+            assert late.database == "late"
+            late.close()

@@ -239,6 +239,11 @@ def test_the_client_finds_the_only_database_by_itself_and_says_which_it_lacks(sh
     server, _ = shared_server
     with Client(server.endpoints[0]) as client:
         assert client.database == "town"
+        with (
+            client._session().liveliness().declare_token("featuredb/hamlet/servers/x"),
+            pytest.raises(ServiceError, match="serves hamlet, town; name the database"),
+        ):
+            Client(server.endpoints[0]).open()
     with pytest.raises(ServiceError, match="village") as caught:
         Client(server.endpoints[0], "village", connect_timeout_s=0.3).open()
     assert caught.value.code == NO_SERVER
