@@ -69,15 +69,24 @@ def radius_68(covariance: FloatArray) -> float:
     return float(np.sqrt(gammaincinv(mean**2 / variance, 0.68) * variance / mean))
 
 
-def _on_earth(area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray) -> FloatArray:
-    """Measured covariance plus that of the map's placement, turned to true east-north-up at the camera."""
-    area_from_map = area.frame.enu_from(main.frame)
-    center_in_map = area_from_map.inverse().act(center)
+def placement_covariance(area: Area, feature_map: FeatureMap, center: FloatArray) -> FloatArray:
+    """What the map's placement adds to the covariance (6, 6) of a pose, in the area's axes.
+
+    Args:
+        center: (3,) camera centre in the area's frame.
+    """
+    area_from_map = area.frame.enu_from(feature_map.frame)
     by_placement = np.zeros((6, 7))
     by_placement[:3, 1:4] = np.eye(3)
-    by_placement[3:, :] = point_jacobian(center_in_map)
+    by_placement[3:, :] = point_jacobian(area_from_map.inverse().act(center))
     turn = np.kron(np.eye(2), area_from_map.rotation)
-    placed = turn @ by_placement @ main.placement.covariance @ by_placement.T @ turn.T
+    placed = turn @ by_placement @ feature_map.placement.covariance @ by_placement.T @ turn.T
+    return np.asarray(placed, dtype=np.float64)
+
+
+def _on_earth(area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray) -> FloatArray:
+    """Measured covariance plus that of the map's placement, turned to true east-north-up at the camera."""
+    placed = placement_covariance(area, main, center)
     to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
     covariance = to_true @ (measured + placed) @ to_true.T
     return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)

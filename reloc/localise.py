@@ -10,15 +10,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IncompatibleExtractorError
+from featuredb.errors import IncompatibleExtractorError, InvalidValueError
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
+from featuredb.maps.feature_map import FeatureMap
 from reloc.acceptance import Evidence, confidence, coverage, independent_inliers, log_nfa, verdict
-from reloc.answer import make_answer
+from reloc.answer import make_answer, placement_covariance
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import Matches, guided_matches, match_cluster, visible_points
 from reloc.options import LocaliseOptions
@@ -52,6 +53,7 @@ def localise(
     Raises:
         IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
         ImageError: the image is not (h, w) uint8 or tiny.
+        InvalidValueError: the request's camera is of another image size.
     """
     options = options or LocaliseOptions()
     check_extractor(areas, options)
@@ -84,6 +86,12 @@ class Candidate:
     matches: Matches
     evidence: Evidence
     rows: NDArray[np.intp]  # matches that are independent inliers
+
+    @property
+    def main_map(self) -> FeatureMap:
+        """The map with most inliers."""
+        rows = self.rows if len(self.rows) else slice(None)
+        return self.area.maps[int(np.bincount(self.area.point_map[self.matches.point[rows]]).argmax())]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -162,8 +170,17 @@ def _poses(
 def camera_hypotheses(
     features: Features, area: Area, request: LocaliseRequest
 ) -> list[tuple[Camera, CameraSource]]:
-    """Intrinsics to try: the request's; else a map camera with the same EXIF key; else the focal is free."""
+    """Intrinsics to try: the request's; else a map camera with the same EXIF key; else the focal is free.
+
+    Raises:
+        InvalidValueError: the request's camera is of another image size.
+    """
     if request.camera is not None:
+        if (request.camera.width, request.camera.height) != (features.width, features.height):
+            raise InvalidValueError(
+                f"LocaliseRequest.camera: expected intrinsics for {features.width}x{features.height} pixels, "
+                f"found {request.camera.width}x{request.camera.height}; use Camera.scaled_to"
+            )
         return [(request.camera, "request")]
     if request.camera_key:
         camera = area.camera_for_key(request.camera_key)
@@ -314,22 +331,40 @@ def _decide(
 
 
 def _runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
-    """The best other pose that is another place: further than 2 m or 5 degrees from the winner."""
+    """The pose of another place with most inliers.
+
+    Another place is further than 2 m or 5 degrees from the winner. Where two maps gave the poses, three
+    standard deviations of their placements come on top: two maps of one place, each placed by GPS, show it
+    metres apart. Heights of different datums are not compared.
+    """
     winner = best.pose.cam_from_local
+    found: list[RunnerUp] = []
     for other in others:
         pose = _in_frame_of(best.area, other)
-        distance_m = float(np.linalg.norm(pose.center - winner.center))
+        offset = pose.center - winner.center
+        if best.main_map.height_datum != other.main_map.height_datum:
+            offset[2] = 0.0
+        distance_m = float(np.linalg.norm(offset))
         angle_deg = pose.angle_to_deg(winner)
-        if distance_m > 2.0 or angle_deg > 5.0:
-            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
-            return RunnerUp(
-                inliers=other.evidence.inliers,
-                distance_m=distance_m,
-                angle_deg=angle_deg,
-                latitude_deg=float(lat),
-                longitude_deg=float(lon),
+        apart_m, apart_deg = 2.0, 5.0
+        if best.main_map.map_id != other.main_map.map_id:
+            placed = placement_covariance(best.area, best.main_map, winner.center) + placement_covariance(
+                other.area, other.main_map, other.pose.cam_from_local.center
             )
-    return None
+            apart_m += 3.0 * float(np.sqrt(np.linalg.eigvalsh(placed[3:, 3:])[-1]))
+            apart_deg += 3.0 * float(np.degrees(np.sqrt(np.linalg.eigvalsh(placed[:3, :3])[-1])))
+        if other.evidence.inliers and (distance_m > apart_m or angle_deg > apart_deg):
+            lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
+            found.append(
+                RunnerUp(
+                    inliers=other.evidence.inliers,
+                    distance_m=distance_m,
+                    angle_deg=angle_deg,
+                    latitude_deg=float(lat),
+                    longitude_deg=float(lon),
+                )
+            )
+    return max(found, key=lambda rival: rival.inliers, default=None)
 
 
 def _in_frame_of(area: Area, candidate: Candidate) -> Rigid3:

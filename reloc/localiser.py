@@ -137,7 +137,9 @@ def _load(snapshot: Snapshot, group: list[MapSummary], key: tuple[str, ...], cac
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
-    """Maps whose boxes come within _AREA_GAP_M of each other, directly or through others; one extractor each.
+    """Maps whose boxes come within _AREA_GAP_M of each other, directly or through others.
+
+    Maps of one group share an extractor and a height datum: heights of different datums do not mix.
 
     Boxes are compared as spheres around their middles in one Cartesian frame, across zone borders.
     """
@@ -162,8 +164,8 @@ def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
         radii.append(0.5 * float(np.linalg.norm(corners[1] - corners[0])))
     place, radius = np.array(centers), np.array(radii)
     gap = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
-    extractor = np.array([m.extractor_fingerprint for m in maps])
-    near = (gap < _AREA_GAP_M) & (extractor[:, None] == extractor[None])
+    kind = np.array([f"{m.extractor_fingerprint} {m.height_datum}" for m in maps])
+    near = (gap < _AREA_GAP_M) & (kind[:, None] == kind[None])
     rows, columns = np.nonzero(near)
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=near.shape)
     count, label = connected_components(graph, directed=False)

@@ -243,6 +243,7 @@ def _covisibility(
         (np.ones(len(see_image), dtype=np.int32), (see_image, see_point)),
         shape=(count, int(see_point.max()) + 1 if len(see_point) else 1),
     )
+    sees.data[:] = 1  # a point that an image sees twice is one point
     shared = sparse.csr_array(sees @ sees.T)
     if len(np.unique(image_map)) < 2:
         return shared
@@ -268,6 +269,8 @@ def _digest(maps: Sequence[FeatureMap], frame: LocalFrame) -> str:
     for feature_map in maps:
         digest.update(feature_map.map_id.encode())
         digest.update(np.ascontiguousarray(feature_map.points.utm).tobytes())
-        digest.update(np.ascontiguousarray(feature_map.observations.descriptors).tobytes())
+        seen = feature_map.observations
+        for array in (seen.point_index, seen.image_id, seen.has_descriptor, seen.descriptors):
+            digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(str(DESCRIPTOR_SIZE).encode())
     return digest.hexdigest()

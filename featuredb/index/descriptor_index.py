@@ -102,11 +102,12 @@ def load_or_build(
     if cache is None or len(descriptors) <= _EXHAUSTIVE_LIMIT:
         return build_index(descriptors, options)
     path = cache / f"v{_VERSION}-{digest[:32]}.faiss"
-    if path.exists():
-        try:
-            return _read(path, len(descriptors), options)
-        except (RuntimeError, StoreError) as error:
-            _LOG.warning("index %s is unusable and is rebuilt: %s", path, error)
+    try:
+        return _read(path, len(descriptors), options)
+    except FileNotFoundError:
+        pass  # the first time
+    except (RuntimeError, MemoryError, OSError, StoreError) as error:
+        _LOG.warning("index %s is unusable and is rebuilt: %s", path, error)
     index = build_index(descriptors, options)
     try:
         _write(index, path)
