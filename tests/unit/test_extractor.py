@@ -1,0 +1,162 @@
+"""The extractor against known blob centres and a float formula."""
+
+import cv2
+import numpy as np
+import pytest
+
+from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.extractor import ExtractorOptions, extract, rootsift_8bit
+
+
+def blobs(width: int, height: int, centers: np.ndarray, sigma: float) -> np.ndarray:
+    """Bright Gaussian blobs at centres (n, 2) in pixels, the top-left pixel's centre being (0.5, 0.5)."""
+    y, x = np.mgrid[0:height, 0:width] + 0.5
+    image = np.full((height, width), 60.0)
+    for cx, cy in centers:
+        image += 150.0 * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * sigma**2))
+    return np.rint(image).astype(np.uint8)
+
+
+def texture(width: int, height: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    noise = rng.standard_normal((height, width)).astype(np.float32)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 2.0) + 2 * cv2.GaussianBlur(noise, (0, 0), 5.0)
+    return np.clip(128 + 300 * smooth, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("factor", "sigma"), [(1.0, 4.0), (1.0, 6.0), (2.0, 8.0), (2.5, 10.0), (3.0, 9.0)]
+)
+def test_centres_of_blobs_within_a_twentieth_of_a_pixel(factor: float, sigma: float) -> None:
+    """Also when the image is shrunk first: there a forgotten half pixel would be `factor / 2` off."""
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.arange(3), np.arange(2)), axis=-1).reshape(-1, 2)
+    centers = (grid * [90, 90] + [70, 70]) * factor + rng.uniform(-3, 3, (6, 2))
+    width, height = round(320 * factor), round(240 * factor)
+    found = extract(
+        blobs(width, height, centers, sigma), ExtractorOptions(max_side_px=320, contrast_threshold=0.01)
+    )
+    assert (found.width, found.height) == (width, height)
+    errors = []
+    for center in centers:
+        distance = np.linalg.norm(found.xy - center, axis=1)
+        errors.append(found.xy[np.argmin(distance)] - center)
+    # The mean is where a wrong convention would show; single blobs also suffer from 8-bit rounding.
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.05 * factor**0.5
+    assert np.linalg.norm(errors, axis=1).max() < 0.1 * factor
+
+
+def test_scale_is_in_full_size_pixels() -> None:
+    """A blob twice as large in an image twice as large, shrunk by two, has twice the diameter."""
+    center = np.array([[100.3, 99.6]])
+    options = ExtractorOptions(max_side_px=200, contrast_threshold=0.01)
+    small = extract(blobs(200, 200, center, 6.0), options)
+    large = extract(blobs(400, 400, 2 * center, 12.0), options)
+    strongest = [float(f.scale[np.argmax(f.response)]) for f in (small, large)]
+    assert strongest[1] / strongest[0] == pytest.approx(2.0, rel=0.03)
+
+
+def test_rootsift_is_the_float_formula() -> None:
+    rng = np.random.default_rng(0)
+    raw = np.floor(rng.gamma(0.5, 40.0, (200, 128))).astype(np.float32)
+    expected = np.minimum(np.rint(512.0 * np.sqrt(raw.astype(np.float64) / raw.sum(1, keepdims=True))), 255)
+    # Ties of rounding may fall either way between float32 and float64.
+    assert np.abs(rootsift_8bit(raw).astype(int) - expected).max() <= 1
+    assert np.mean(rootsift_8bit(raw) != expected) < 1e-3
+    np.testing.assert_array_equal(rootsift_8bit(np.zeros((1, 128), np.float32)), 0)
+
+
+def test_descriptors_are_those_of_opencv_at_the_same_keypoints() -> None:
+    """An independent pass: OpenCV's raw SIFT of the shrunk image, RootSIFT in float64."""
+    gray = texture(300, 220)
+    found = extract(gray, ExtractorOptions(max_features=200))
+    sift = cv2.SIFT_create(0, 3, 0.02, 10.0, 1.6, enable_precise_upscale=True)
+    keypoints, raw = sift.detectAndCompute(gray, None)
+    by_key = {(*k.pt, k.size, k.angle): d for k, d in zip(keypoints, raw, strict=True)}
+    for i in range(0, len(found), 17):
+        x, y = found.xy[i] - np.float32(0.5)
+        key = min(
+            by_key,
+            key=lambda k: (
+                abs(k[0] - x) + abs(k[1] - y) + abs(k[2] - found.scale[i]) + abs(k[3] - found.angle[i])
+            ),
+        )
+        expected = np.minimum(512 * np.sqrt(by_key[key].astype(np.float64) / by_key[key].sum()), 255)
+        assert np.abs(found.descriptors[i] - expected).max() <= 0.51
+    lengths = np.linalg.norm(found.descriptors.astype(float), axis=1)
+    assert len(found) == 200
+    assert np.abs(lengths - 512).max() < 12  # clipping at 255 and rounding
+
+
+def test_the_fingerprint_names_the_space_of_descriptors() -> None:
+    plain = ExtractorOptions()
+    assert ExtractorOptions(upright=True).fingerprint != plain.fingerprint
+    assert ExtractorOptions(max_features=10, max_side_px=640).fingerprint == plain.fingerprint
+    assert extract(texture(64, 64), plain).fingerprint == plain.fingerprint
+
+
+def test_upright_gives_angle_zero_and_one_keypoint_per_place_and_scale() -> None:
+    gray = texture(300, 220, seed=5)
+    turned = extract(gray, ExtractorOptions(contrast_threshold=0.01))
+    upright = extract(gray, ExtractorOptions(contrast_threshold=0.01, upright=True))
+    keys = np.column_stack([upright.xy, upright.scale])
+    assert len(upright) > 100
+    assert (upright.angle == 0).all()
+    assert len(np.unique(keys, axis=0)) == len(keys)
+    turned_keys = np.column_stack([turned.xy, turned.scale])
+    assert len(np.unique(turned_keys, axis=0)) < len(turned_keys)  # it has something to leave out
+    np.testing.assert_allclose(
+        np.unique(turned_keys.round(2), axis=0), np.unique(keys.round(2), axis=0), atol=0.011
+    )
+
+
+def test_no_more_than_max_features_and_always_the_same() -> None:
+    gray = texture(400, 300)
+    first, second = (extract(gray, ExtractorOptions(max_features=150)) for _ in range(2))
+    assert len(first) == 150
+    np.testing.assert_array_equal(first.xy, second.xy)
+    np.testing.assert_array_equal(first.descriptors, second.descriptors)
+    more = extract(gray, ExtractorOptions(max_features=400))
+    assert len(more) > 150
+
+
+@pytest.mark.parametrize("upright", [False, True])
+@pytest.mark.parametrize("shape", [(100, 100), (32, 32), (32, 20_000), (20_000, 32)])
+def test_a_blank_image_has_no_features(shape: tuple[int, int], upright: bool) -> None:
+    found = extract(np.full(shape, 128, np.uint8), ExtractorOptions(upright=upright))
+    assert len(found) == 0
+    assert found.descriptors.shape == (0, 128)
+    assert (found.height, found.width) == shape
+
+
+def test_a_very_long_image_is_survived() -> None:
+    """Shrunk to a few rows there is hardly anything left to find, but nothing to crash on either."""
+    rng = np.random.default_rng(0)
+    gray = rng.integers(0, 256, (33, 30_000), dtype=np.uint8)
+    found = extract(gray, ExtractorOptions(max_side_px=1600))
+    assert np.isfinite(found.xy).all()
+    assert (found.xy >= 0).all()
+    assert (found.xy <= [30_000, 33]).all()
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        np.zeros((31, 100), np.uint8),
+        np.zeros((100, 31), np.uint8),
+        np.zeros((1, 3000), np.uint8),
+        np.zeros((0, 0), np.uint8),
+        np.zeros((100, 100, 3), np.uint8),
+        np.zeros((100, 100), np.float32),
+        np.zeros((100, 100), np.uint16),
+    ],
+)
+def test_what_is_no_gray_image_is_refused(image: np.ndarray) -> None:
+    with pytest.raises(ImageError, match="expected"):
+        extract(image)
+
+
+@pytest.mark.parametrize("wrong", [{"max_side_px": 10}, {"max_side_px": 10**6}, {"max_features": 0}])
+def test_options_out_of_range_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(InvalidValueError, match="expected"):
+        ExtractorOptions(**wrong)
