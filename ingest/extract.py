@@ -66,7 +66,7 @@ def extract_photos(
     progress: Progress = no_progress,
 ) -> Extracted:
     """Write the features of every photo that has none yet."""
-    fingerprint = options_fingerprint(options)
+    fingerprint = features_key(options)
     tasks: dict[str, ExtractTask] = {}
     for photo in photos:
         target = workspace.features(fingerprint, photo.sha256)
@@ -79,9 +79,14 @@ def extract_photos(
     )
 
 
+def features_key(options: ExtractorOptions) -> str:
+    """Names the folder of features made with these options by this version of the extractor."""
+    return f"{options.fingerprint}-{options_fingerprint(options)}"
+
+
 def load_features(workspace: Workspace, options: ExtractorOptions, photo: Photo) -> PhotoFeatures:
     """What `extract_photos` wrote for a photo."""
-    return read_features(workspace.features(options_fingerprint(options), photo.sha256))
+    return read_features(workspace.features(features_key(options), photo.sha256))
 
 
 def read_features(path: Path) -> PhotoFeatures:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
-from featuredb.index.exact import largest_inner_products, use_threads
+from featuredb.index.exact import nearest, use_threads
 from ingest.colmap_bridge import TwoView, verify_pair
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import read_features
@@ -23,7 +23,8 @@ class MatchOptions:
     """How pairs are matched and verified.
 
     Attributes:
-        max_ratio: angle to the nearest descriptor over angle to the second nearest (Lowe's 0.8).
+        max_ratio: angle to the nearest descriptor over angle to the second nearest (Lowe's 0.8),
+            below it in both directions.
         max_angle_rad: no match between descriptors further apart (COLMAP's 0.7).
         max_error_px: of the two-view geometry, at `error_reference_side_px`, growing with the image.
         error_reference_side_px: keypoints are located on images of about this size.
@@ -129,9 +130,9 @@ def _distinct_nearest(
     """Row of base (n,) nearest to each query, -1 where it is too far or the second nearest is as near."""
     if not len(queries):
         return np.zeros(0, np.int64)
-    products, rows = largest_inner_products(queries, base, 2)
-    angles = np.arccos(np.clip(products / _DESCRIPTOR_LENGTH**2, -1.0, 1.0))
-    good = (angles[:, 0] <= options.max_ratio * angles[:, 1]) & (angles[:, 0] <= options.max_angle_rad)
+    squared, rows = nearest(queries, base, 2)
+    angles = 2.0 * np.arcsin(np.clip(np.sqrt(squared) / (2.0 * _DESCRIPTOR_LENGTH), 0.0, 1.0))
+    good = (angles[:, 0] < options.max_ratio * angles[:, 1]) & (angles[:, 0] <= options.max_angle_rad)
     return np.where(good, rows[:, 0], -1)
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.index.exact import kmeans, largest_inner_products
+from featuredb.index.exact import kmeans, nearest
 from ingest.photo import Photo
 
 Pair = tuple[int, int]
@@ -136,7 +136,7 @@ def _retrieval_pairs(
     """Each of the given photos with those whose aggregated descriptor is nearest."""
     vectors = aggregate(descriptors, options)
     count = min(options.retrieval_neighbours + 1, len(vectors))
-    _, neighbours = largest_inner_products(vectors[list(rows)], vectors, count)
+    _, neighbours = nearest(vectors[list(rows)], vectors, count)
     for i, near in zip(rows, neighbours, strict=True):
         for j in near:
             if int(j) not in (i, -1):

@@ -3,7 +3,8 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -13,7 +14,7 @@ from typing import Any
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HEIGHT_DATUMS
 from featuredb.store import Database
-from ingest.executor import InProcessExecutor, PoolExecutor, Progress, no_progress
+from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes
@@ -161,8 +162,13 @@ def _with_sigmas(photos: Sequence[Photo], options: IngestOptions) -> list[Photo]
     ]
 
 
-def _executor(options: IngestOptions) -> Any:
-    return PoolExecutor(options.workers) if options.workers > 1 else InProcessExecutor()
+@contextmanager
+def _executor(options: IngestOptions) -> Iterator[Executor]:
+    if options.workers == 1:
+        yield InProcessExecutor()
+    else:
+        with PoolExecutor(options.workers) as pool:
+            yield pool
 
 
 def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) -> MapIdentity:

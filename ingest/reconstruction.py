@@ -18,7 +18,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView
 from ingest.executor import Executor, Progress, no_progress
-from ingest.extract import PhotoFeatures, extract_photos, load_features
+from ingest.extract import PhotoFeatures, extract_photos, features_key, load_features
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
@@ -219,7 +219,7 @@ def _match(
     executor: Executor,
     progress: Progress,
 ) -> Matched:
-    fingerprint = options_fingerprint(options.extractor)
+    fingerprint = features_key(options.extractor)
     views = [
         PhotoView(
             sha256=photo.sha256,

@@ -1,7 +1,7 @@
-"""Exact nearest neighbours of 8-bit RootSIFT by FAISS: for pairs of images, and codebooks by k-means.
+"""Exact nearest neighbours by FAISS: 8-bit RootSIFT of pairs of images, and codebooks by k-means.
 
-Inner products of 8-bit integers stay below 2^24, so float32 computes them without error: the result
-depends neither on the number of threads nor on the BLAS.
+Squared lengths and inner products of 8-bit integers stay below 2^24, so float32 holds them without error: the
+result depends neither on the number of threads nor on the BLAS.
 """
 
 from typing import Any
@@ -18,18 +18,18 @@ def use_threads(count: int) -> None:
     faiss.omp_set_num_threads(count)
 
 
-def largest_inner_products(
+def nearest(
     queries: NDArray[Any], base: NDArray[Any], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The `count` rows of `base` (m, d) with the largest inner product with each row of `queries` (n, d).
+    """The `count` rows of `base` (m, d) nearest to each row of `queries` (n, d).
 
     Returns:
-        Inner products (n, count) float32, falling, and rows of base (n, count) int64; -1 where m < count.
+        Squared distances (n, count) float32, rising, and rows of base (n, count) int64; -1 where m < count.
     """
-    index = faiss.IndexFlatIP(base.shape[1])
+    index = faiss.IndexFlatL2(base.shape[1])
     index.add(base.astype(np.float32))
-    products, rows = index.search(queries.astype(np.float32), count)
-    return products, rows
+    squared, rows = index.search(queries.astype(np.float32), count)
+    return squared, rows
 
 
 def kmeans(samples: NDArray[np.float32], clusters: int, seed: int, iterations: int = 10) -> FloatArray:

@@ -1,0 +1,123 @@
+"""Ingest of photos end to end, against the truth of rendered hills."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.store import Database
+from ingest.map_builder import MapOptions
+from ingest.pipeline import IngestOptions, ingest_photos
+from ingest.reconstruction import MapMakingOptions
+from tests.support.hill_photos import FRAME, HillPhoto, hill_height, write_hill_photos
+
+_EXTRACTOR = ExtractorOptions(max_features=1500)
+_MAKING = MapMakingOptions(extractor=_EXTRACTOR)
+_TRUTH = IngestOptions(workers=1, gps_sigma_m=(0.02, 0.02), making=_MAKING)
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhoto]]:
+    folder = tmp_path_factory.mktemp("hills")
+    return folder, write_hill_photos(folder)
+
+
+def test_map_agrees_with_the_truth(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+    folder, truth = hills
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, folder, _TRUTH)
+    assert [m.status for m in report.maps] == ["committed"]
+    assert report.count("registered") == len(truth) == 9
+    feature_map = database.snapshot().load_map(report.maps[0].map_id)
+    assert feature_map.epsg == 32632
+    frame_from_map = FRAME.enu_from(feature_map.frame)
+    poses = {photo.name: photo.cam_from_local for photo in truth}
+    for image in feature_map.images:
+        cam_from_frame = image.cam_from_local @ frame_from_map.inverse()
+        assert np.linalg.norm(cam_from_frame.center - poses[image.name].center) < 0.05
+        assert cam_from_frame.angle_to_deg(poses[image.name]) < 0.1
+    points = FRAME.enu_from_utm(feature_map.points.utm, feature_map.epsg)
+    above = points[:, 2] - hill_height(points[:, 0], points[:, 1])
+    assert abs(np.median(above)) < 0.05
+    assert np.percentile(np.abs(above), 95) < 0.4
+    # 68 % of the errors within the reported deviation, if they were normal; a few wrong matches that
+    # survive widen the residuals, and with them the deviation, so that more of the good ones are within.
+    sigma = np.sqrt(feature_map.points.covariance[:, 5])
+    assert 0.6 < (np.abs(above - np.median(above)) < sigma).mean() < 0.92
+
+
+def test_only_long_tracks_carry_descriptors(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+    options = IngestOptions(
+        workers=1,
+        gps_sigma_m=(0.02, 0.02),
+        work=tmp_path / "work",
+        making=MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(min_track_length=4)),
+    )
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, hills[0], options)
+    feature_map = database.snapshot().load_map(report.maps[0].map_id)
+    observations = feature_map.observations
+    long = feature_map.points.track_length[observations.point_index] >= 4
+    assert long.any()
+    assert (~long).any()
+    np.testing.assert_array_equal(observations.has_descriptor, long)
+    norms = np.linalg.norm(observations.descriptors.astype(float), axis=1)
+    assert norms[long].min() > 480
+    assert norms[~long].max() == 0
+    # Tracks are what the observations say.
+    counted = np.bincount(observations.point_index, minlength=len(feature_map.points))
+    np.testing.assert_array_equal(counted, feature_map.points.track_length)
+
+
+def test_photos_without_gps_are_refused_with_a_reason(tmp_path: Path) -> None:
+    write_hill_photos(tmp_path / "photos", columns=2, rows=2, with_gps=False)
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    assert [(m.status, m.reason_code, m.map_id) for m in report.maps] == [("refused", "TOO_FEW", "")]
+    assert {p.reason_code for p in report.photos} == {"too_few"}
+    assert not database.snapshot().maps()
+
+
+def test_two_places_become_two_maps(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    for seed, east in ((1, 0.0), (2, 400.0)):
+        write_hill_photos(folder, columns=2, rows=2, texture_seed=seed, east_m=east, prefix=f"place{seed}")
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, folder, _TRUTH)
+    assert [m.photos for m in report.maps] == [4, 4]
+    snapshot = database.snapshot()
+    loaded = [snapshot.load_map(m.map_id) for m in report.maps]
+    names = [{image.name[:6] for image in m.images} for m in loaded]
+    assert sorted(len(n) for n in names) == [1, 1]
+    assert names[0] != names[1]
+    east = sorted(float(np.median(FRAME.enu_from_utm(m.points.utm, m.epsg)[:, 0])) for m in loaded)
+    assert east[1] - east[0] == pytest.approx(400.0, abs=10.0)
+
+
+def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    write_hill_photos(folder, gps_noise_m=0.01)
+    stray = write_hill_photos(tmp_path / "stray", east_m=30.0)[4]
+    (tmp_path / "stray" / stray.name).replace(folder / stray.name)
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, folder, _TRUTH)
+    assert [m.status for m in report.maps] == ["committed"]
+    unused = [p for p in report.photos if p.gps_used is False]
+    assert [p.name for p in unused] == [stray.name]
+    residual = unused[0].gps_residual_m
+    assert residual is not None
+    assert residual[0] == pytest.approx(30.0, abs=0.3)
+    assert report.maps[0].residual_rms_m is not None
+    assert report.maps[0].residual_rms_m < 0.1
+
+
+def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
+    for seed in (1, 2, 3):
+        write_hill_photos(tmp_path / "photos", columns=1, rows=1, texture_seed=seed, prefix=f"p{seed}")
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    assert report.maps == ()
+    assert report.verified_pairs == 0
+    assert {p.reason_code for p in report.photos} == {"no_matches"}
+    assert "overlap" in report.warnings[0]
