@@ -42,6 +42,9 @@ ATTEMPTS = (
 )
 FIRST_PAUSE_S = 0.02  # a commit on a local disk takes about 10 ms
 LONGEST_PAUSE_S = 2.0
+# Compaction puts maps one after the other into a file; reading one of them skips the row groups of the others.
+# 32768 observations are 4 MB, large enough to be read in one go.
+ROW_GROUP_ROWS = 32_768
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
 
@@ -286,5 +289,7 @@ def _writer_properties(spec: TableSpec) -> WriterProperties:
     # Lengths apart from bytes: 128-byte descriptors take 108 bytes a row instead of 111, and write faster.
     plain = ColumnProperties(dictionary_enabled=False, encoding="DELTA_LENGTH_BYTE_ARRAY")
     return WriterProperties(
-        compression="ZSTD", column_properties=dict.fromkeys(spec.plain_bytes, plain) or None
+        compression="ZSTD",
+        max_row_group_size=ROW_GROUP_ROWS,
+        column_properties=dict.fromkeys(spec.plain_bytes, plain) or None,
     )
