@@ -86,6 +86,7 @@ def build_map(
         height_datum=options.height_datum,
         frame=frame,
         cameras=model.cameras,
+        camera_keys=_camera_keys(model, photos),
         images=tuple(_images(photos, model, poses, pose_spread)),
         points=_points(model, features, frame.utm_from_enu(enu, epsg), linear, covariances, kept),
         observations=_observations(model, features, xy, kept, options),
@@ -95,6 +96,14 @@ def build_map(
         licence=identity.licence,
         provenance=identity.provenance | {"residual_sigma_px": variance**0.5},
     )
+
+
+def _camera_keys(model: Model, photos: Sequence[Photo]) -> tuple[str, ...]:
+    """EXIF key of each camera; "" where its photos name none, or not all the same."""
+    keys: list[set[str]] = [set() for _ in model.cameras]
+    for photo, camera in zip(photos, model.camera_of, strict=True):
+        keys[int(camera)].add(photo.camera_key)
+    return tuple(k.pop() if len(k) == 1 else "" for k in keys)
 
 
 def _images(

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
-from featuredb.index.exact import nearest, use_threads
+from featuredb.index.codebook import use_threads
+from featuredb.index.nearest import nearest
 from ingest.colmap_bridge import TwoView, verify_pair
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import read_features

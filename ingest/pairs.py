@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.index.exact import kmeans, nearest
+from featuredb.index.codebook import kmeans
+from featuredb.index.nearest import nearest
 from ingest.photo import Photo
 
 Pair = tuple[int, int]

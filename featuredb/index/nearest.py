@@ -1,14 +1,16 @@
 """Exact nearest neighbours between two small sets of descriptors."""
 
+from typing import Any
+
 import faiss
 import numpy as np
 from numpy.typing import NDArray
 
 
 def nearest(
-    query: NDArray[np.uint8], base: NDArray[np.uint8], k: int
+    query: NDArray[Any], base: NDArray[Any], k: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The k nearest rows of `base` (m, 128) for each descriptor of `query` (n, 128), by exhaustion.
+    """The k nearest rows of `base` (m, d) for each row of `query` (n, d), by exhaustion.
 
     Returns:
         Squared distances (n, k) float32, ascending, infinity where there are fewer than k; rows (n, k)
