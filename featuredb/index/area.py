@@ -216,7 +216,7 @@ def _sum_by(group: NDArray[np.intp], values: NDArray[np.floating], count: int) -
     matrix = sparse.csr_array(
         (np.ones(len(group)), (group, np.arange(len(group)))), shape=(count, len(group))
     )
-    return np.asarray(matrix @ values, dtype=np.float64).reshape(count, -1)
+    return np.asarray(matrix @ values, dtype=np.float64).reshape(count, values.shape[1])
 
 
 def _full_covariance(upper: NDArray[np.float32], rotation: FloatArray) -> FloatArray:

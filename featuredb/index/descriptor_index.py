@@ -71,15 +71,15 @@ def build_index(descriptors: NDArray[np.uint8], options: IndexOptions | None = N
     else:
         lists = int(2 ** np.round(np.log2(4 * np.sqrt(count))))
         index = faiss.IndexIVFScalarQuantizer(
-            faiss.IndexFlatL2(DESCRIPTOR_SIZE),
+            faiss.IndexFlatL2(
+                DESCRIPTOR_SIZE
+            ),  # kept alive, and freed once, by the Python object of the index
             DESCRIPTOR_SIZE,
             lists,
             faiss.ScalarQuantizer.QT_8bit_direct,
             faiss.METRIC_L2,
             False,  # codes, not residuals: exact
         )
-        index.own_fields = True
-        index.quantizer.this.disown()
         index.cp.seed = 0
         index.cp.niter = 10
         sample = np.random.default_rng(0).choice(count, min(count, 64 * lists), replace=False)
