@@ -194,7 +194,7 @@ def market(layout: Layout, rect: Rect) -> None:
         0.5 * (x0 + x1),
         0.5 * (middle + y1),
         (BAY_M * int((x1 - x0 - 6) // BAY_M), y1 - middle - 5),
-        2.2,
+        2.0,
         facade="facade_panel",
         roof="roof_metal",
         tint=(0.95, 0.9, 0.75),

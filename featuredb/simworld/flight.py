@@ -9,11 +9,12 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.scene import Scene
+from featuredb.simworld.scene import Scene, Street
 from featuredb.simworld.shot import Device, Shot, look_pose
 
 GpsError = Literal["realistic", "none"]
 
+_PHOTOS_PER_SIGHT = 5
 _START = datetime(2025, 6, 14, 9, 12, 5, tzinfo=UTC)
 
 
@@ -160,30 +161,32 @@ def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, widt
 def pedestrians(
     scene: Scene, count: int, seed: int, *, width: int, extent_m: tuple[float, float]
 ) -> list[Shot]:
-    """Street-level photos from pavements within `extent_m` (half sizes, town axes); half have a poor GPS."""
+    """Street-level photos within `extent_m` (half sizes, town axes), each of the sights by several people.
+
+    A sight is a place on the building line of a street; people stand on the far pavement within 14 m of
+    facing it, with another camera each. Every second photo has a poor GPS, the others none.
+    """
     rng = np.random.default_rng((seed, 13))
     devices = street_devices(width)
-    shots = []
     streets = [s for s in scene.plan.streets if abs(s.at) < extent_m[1 if s.along == "x" else 0]]
+    sights = [_sight(streets, extent_m, rng) for _ in range(-(-count // _PHOTOS_PER_SIGHT))]
+    shots = []
     for i in range(count):
-        s = streets[int(rng.integers(len(streets)))]
-        a = float(rng.uniform(-0.9, 0.9)) * extent_m[0 if s.along == "x" else 1]
-        side = float(rng.choice([-1.0, 1.0]))
-        b = s.at + side * (0.5 * s.width + 0.2)
-        x, y = (a, b) if s.along == "x" else (b, a)
-        position = scene.enu_from_town @ np.array(
-            [x, y, max(float(scene.plan.height(y)), 0.0) + rng.uniform(1.5, 1.75)]
-        )
-        # Across the street, turned towards one end of it, as people photograph house fronts.
-        across = (0.0 if side < 0 else 180.0) if s.along == "x" else (90.0 if side < 0 else 270.0)
-        heading = across + _town_heading(scene) + float(rng.choice([-1, 1]) * rng.uniform(15, 70))
+        street, along, side = sights[i // _PHOTOS_PER_SIGHT]
+        stand = along + float(rng.uniform(-14, 14)), street.at - side * (0.5 * street.width + 0.3)
+        target = along, street.at + side * (0.5 * street.width + 6.0)
+        (x, y), (tx, ty) = (stand, target) if street.along == "x" else (stand[::-1], target[::-1])
+        eye = max(float(scene.plan.height(y)), 0.0) + float(rng.uniform(1.5, 1.75))
+        position = scene.enu_from_town @ np.array([x, y, eye])
+        view = scene.enu_from_town @ np.array([tx - x, ty - y, 0.0])
+        heading = float(np.degrees(np.arctan2(view[0], view[1])) + rng.normal(0, 6))
         error = rng.normal(0, [9.0, 9.0, 12.0]) if i % 2 else None
         shots.append(
             Shot(
                 name=f"street/street_{i + 1:04d}.jpg",
                 device=devices[i % len(devices)],
                 cam_from_local=look_pose(
-                    position, heading, float(rng.normal(4, 3)), float(rng.normal(0, 1.5))
+                    position, heading, float(rng.normal(6, 3)), float(rng.normal(0, 1.5))
                 ),
                 time=_START + timedelta(days=35, seconds=90 * i),
                 seed=_shot_seed(seed, 3, i),
@@ -191,6 +194,15 @@ def pedestrians(
             )
         )
     return shots
+
+
+def _sight(
+    streets: list[Street], extent_m: tuple[float, float], rng: np.random.Generator
+) -> tuple[Street, float, float]:
+    """A street, a place along it, and the side (-1, 1) of it that is looked at."""
+    street = streets[int(rng.integers(len(streets)))]
+    along = float(rng.uniform(-0.85, 0.85)) * extent_m[0 if street.along == "x" else 1]
+    return street, along, float(rng.choice([-1.0, 1.0]))
 
 
 def survey_half_extent(options: FlightOptions) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""A whole small world on disk: files, truth, EXIF, the same bytes again, features that match as they should."""
+"""A whole small world on disk: files, truth, EXIF, the same bytes again, features that match truthfully."""
 
 import argparse
 from dataclasses import replace
