@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.store.changes import Change, add_maps, live_row, retire_map
+from featuredb.store.changes import RETIRED, Change, add_maps, live_row, retire_map
 from featuredb.store.delta import Commit, Table, retry_stale
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
 from featuredb.store.snapshot import Snapshot
@@ -145,11 +145,13 @@ class Database:
         Raises:
             ConflictError: other writers were faster too many times; nothing is visible.
             MapNotFoundError: a map to be replaced is not there.
-            StoreError: the store failed, or map ids repeat.
+            StoreError: the store failed, map ids repeat, or a map is retired.
         """
         ids = [feature_map.map_id for feature_map in feature_maps]
         if len(set(ids)) != len(ids):
             raise StoreError(f"commit_maps: expected different map ids, found {ids}")
+        if any(feature_map.status == RETIRED for feature_map in feature_maps):
+            raise StoreError("commit_maps: expected active or quarantined maps, found a retired one")
         started = datetime.now(UTC)
         encoded: dict[str, EncodedMap] = {}
         digests = {m.map_id: content_digest(m) for m in feature_maps if m.map_id in replaces}
@@ -170,14 +172,11 @@ class Database:
                 version = apply_change(
                     maps, change, operation="commit", maps_changed=[m.map_id for m in pending]
                 )
-            written = {m.map_id: encoded[m.map_id].row["write_id"] for m in pending}
+            # After a commit whose answer was lost the map is there already, by our own write.
+            ours = {m: e.row["write_id"] for m, e in encoded.items()}
+            found = {m: visible[m]["write_id"] if m in visible else ours[m] for m in ids}
             return [
-                CommitResult(
-                    map_id=m,
-                    created=m in written,
-                    version=version,
-                    write_id=written[m] if m in written else visible[m]["write_id"],
-                )
+                CommitResult(map_id=m, created=found[m] == ours.get(m), version=version, write_id=found[m])
                 for m in ids
             ]
 

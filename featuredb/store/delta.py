@@ -12,7 +12,8 @@ import json
 import logging
 import random
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -42,7 +43,7 @@ ATTEMPTS = (
 )
 FIRST_PAUSE_S = 0.02  # a commit on a local disk takes about 10 ms
 LONGEST_PAUSE_S = 2.0
-# Compaction puts maps one after the other into a file; reading one of them skips the row groups of the others.
+# Compaction puts maps one after the other into a file; reading one skips the row groups of the others.
 # 32768 observations are 4 MB, large enough to be read in one go.
 ROW_GROUP_ROWS = 32_768
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
@@ -109,9 +110,9 @@ class Table:
     @classmethod
     def create(cls, url: str, spec: TableSpec, storage_options: dict[str, str] | None) -> None:
         """Create the table where there is none; harmless where there is one."""
-        if "://" not in url:
-            Path(url).mkdir(parents=True, exist_ok=True)
         try:
+            if "://" not in url:
+                Path(url).mkdir(parents=True, exist_ok=True)
             DeltaTable.create(
                 url,
                 spec.schema,
@@ -127,7 +128,7 @@ class Table:
             )
         except (DeltaError, OSError) as error:
             # Two creators at once: the loser finds the winner's table.
-            if not cls.exists(url, storage_options):
+            if not isinstance(error, DeltaError) or not cls.exists(url, storage_options):
                 raise StoreError(f"cannot create table {url}: {error}") from error
 
     @classmethod
@@ -159,12 +160,18 @@ class Table:
         return int(self._delta.version())
 
     def refresh(self) -> None:
-        """Move to the newest version."""
-        self._delta.update_incremental()
+        """Move to the newest version.
+
+        Raises:
+            StoreError: the store cannot be reached.
+        """
+        with _as_store_error(f"cannot read the log of {self._delta.table_uri}"):
+            self._delta.update_incremental()
 
     def dataset(self, pruning: Sequence[tuple[str, str, Any]] = ()) -> ds.Dataset:
         """An Arrow dataset over the files that the log does not exclude by (column, operator, value)."""
-        return self._delta.to_pyarrow_dataset(file_pruning_predicate=list(pruning) or None)
+        with _as_store_error(f"cannot read {self._delta.table_uri}"):
+            return self._delta.to_pyarrow_dataset(file_pruning_predicate=list(pruning) or None)
 
     def files(self) -> list[DataFile]:
         """The live files."""
@@ -183,6 +190,8 @@ class Table:
 
     def commits(self, limit: int | None = None) -> list[Commit]:
         """The log, newest first; each entry is one small file to read."""
+        with _as_store_error(f"cannot read the log of {self._delta.table_uri}"):
+            entries = self._delta.history(limit)
         return [
             Commit(
                 version=entry["version"],
@@ -190,7 +199,7 @@ class Table:
                 operation=str(entry.get("operation", "")),
                 metadata={k: str(v) for k, v in entry.items() if k.startswith("featuredb.")},
             )
-            for entry in self._delta.history(limit)
+            for entry in entries
         ]
 
     def append(self, rows: pa.Table) -> None:
@@ -231,16 +240,15 @@ class Table:
 
     def vacuum(self, retention: timedelta, *, dry_run: bool, keep_versions: Sequence[int] = ()) -> list[str]:
         """Delete files that no version within the retention uses, tracked or not; returns their paths."""
-        return [
-            str(path)
-            for path in self._delta.vacuum(
+        with _as_store_error(f"cannot vacuum {self._delta.table_uri}"):
+            removed = self._delta.vacuum(
                 retention_hours=round(retention.total_seconds() / 3600),
                 dry_run=dry_run,
                 enforce_retention_duration=False,
                 full=True,
                 keep_versions=list(keep_versions) or None,
             )
-        ]
+        return [str(path) for path in removed]
 
     def _write(
         self, rows: pa.Table, *, mode: Literal["append", "overwrite"], properties: CommitProperties
@@ -272,6 +280,14 @@ class Table:
                 raise StoreError(f"cannot maintain {self._delta.table_uri}: {error}") from error
 
         return retry_stale(f"maintenance of {self.spec.name}", attempt)
+
+
+@contextmanager
+def _as_store_error(what: str) -> Iterator[None]:
+    try:
+        yield
+    except (DeltaError, OSError) as error:
+        raise StoreError(f"{what}: {error}") from error
 
 
 def _check_format(url: str, spec: TableSpec, delta: Any) -> None:

@@ -6,19 +6,23 @@ A subclass provides the fixture `place`.
 import subprocess
 import sys
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from featuredb.errors import (
+    ConflictError,
     DatabaseNotFoundError,
+    InvalidValueError,
     MapNotFoundError,
     SnapshotNotFoundError,
     StoreError,
 )
 from featuredb.store import Database
+from featuredb.store.delta import StaleVersionError, Table
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
@@ -117,6 +121,47 @@ class StoreSuite:
         assert len(database.snapshot().maps()) == 3
         with pytest.raises(StoreError, match="different"):
             database.commit_maps([random_map(4), random_map(4)])
+
+    def test_what_cannot_be_committed(self, database: Database) -> None:
+        with pytest.raises(StoreError, match="retired"):
+            database.commit_map(random_map(1).with_status("retired"))
+        with pytest.raises(InvalidValueError, match="JSON"):
+            database.commit_map(replace(random_map(1), provenance={"x": object()}))
+        assert database.poll_version() == 0
+
+    def test_a_commit_whose_answer_was_lost(
+        self, database: Database, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The log entry is written, the writer hears of a failure, and finds its own map."""
+        real, lost = Table.swap, []
+
+        def swap(table: Table, *args: Any, **kwargs: Any) -> int:
+            version = real(table, *args, **kwargs)
+            if not lost:
+                lost.append(version)
+                raise StaleVersionError("the answer was lost")
+            return version
+
+        monkeypatch.setattr(Table, "swap", swap)
+        result = database.commit_map(random_map(1))
+        assert lost == [1]
+        assert result.created
+        assert result.version == 1
+        assert len(database.snapshot().rows()) == 1
+
+    def test_writers_that_always_collide_give_up(
+        self, database: Database, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def swap(table: Table, *args: Any, **kwargs: Any) -> int:
+            raise StaleVersionError("someone was first")
+
+        monkeypatch.setattr(Table, "swap", swap)
+        monkeypatch.setattr("featuredb.store.delta.ATTEMPTS", 3)
+        with pytest.raises(ConflictError, match="3 attempts"):
+            database.commit_map(random_map(1))
+        monkeypatch.undo()
+        assert database.snapshot().rows() == []
+        assert len(verify(database).orphans) == 1
 
     def test_replacing_a_map_under_its_own_id(self, database: Database) -> None:
         old, new = random_map(1), random_map(2, map_id="map-1")
