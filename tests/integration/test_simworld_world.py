@@ -21,7 +21,7 @@ from featuredb.simworld.world import World, WorldOptions, open_world, town_of, w
 
 OPTIONS = WorldOptions(
     seed=5,
-    town_size_m=(170.0, 160.0),
+    town_size_m=(155.0, 150.0),
     flight=FlightOptions(lines=2, per_line=2, oblique=1, width=640, gps_error="none"),
     queries=2,
     query_width=480,
@@ -81,6 +81,7 @@ def test_truth_reads_back_as_it_was_written(world: World) -> None:
         )
 
 
+@pytest.mark.slow
 def test_the_same_options_give_the_same_bytes_from_any_number_of_processes(
     world: World, tmp_path: Path
 ) -> None:
@@ -116,7 +117,6 @@ def transferred(
     return b.camera.project(b.cam_from_local.act(points)), np.ptp(around, axis=0) < 0.25
 
 
-@pytest.mark.slow
 def test_features_match_where_truth_says_and_not_everywhere(world: World) -> None:
     """Colour, depth, pose and lens agree to a fraction of a pixel; some matches are wrong, as in life."""
     a, b = world.truth.group("drone")[:2]
