@@ -310,7 +310,7 @@ def _decide(
     pixels, points = _pairs(features, best.area, best.matches)
     rows = best.matches.point[best.rows]
     uncertainty = pose_uncertainty(
-        pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose
+        pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
     )
     answer = make_answer(best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
     against = contradicts_prior(answer, request.prior)

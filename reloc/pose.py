@@ -203,7 +203,7 @@ class PoseUncertainty:
             centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C).
         residual_rms_px: of the inliers.
         variance_factor: chi-square per degree of freedom of the residuals against 1 px and the points'
-            own covariance; the covariance is scaled by it.
+            own covariance, times what the robust loss costs; the covariance is scaled by it.
     """
 
     covariance: FloatArray
@@ -212,7 +212,11 @@ class PoseUncertainty:
 
 
 def pose_uncertainty(
-    pixels: FloatArray, points: FloatArray, point_covariance: FloatArray, pose: PoseHypothesis
+    pixels: FloatArray,
+    points: FloatArray,
+    point_covariance: FloatArray,
+    pose: PoseHypothesis,
+    options: PoseOptions,
 ) -> PoseUncertainty:
     """From the Jacobian of the inliers, scaled by the measured residuals; an estimated lens marginalised.
 
@@ -228,6 +232,7 @@ def pose_uncertainty(
     weight = np.linalg.inv(noise)
     chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
     factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
+    factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options))
     # Residuals of zero are test data; the floor is a hundredth of a pixel.
     information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
     if lens is not None:
@@ -237,6 +242,26 @@ def pose_uncertainty(
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         variance_factor=factor,
     )
+
+
+def _price_of_robustness(residual: FloatArray, scale_px: float) -> float:
+    """Variance of the Cauchy estimate over that of least squares, for residuals (k, 2) like these.
+
+    Asymptotic variance of an M-estimator, E[psi^2] / E[psi']^2 (Huber, Robust Statistics, 1981, ch. 3).
+    """
+    squared = np.sum(residual**2, axis=1)
+    weight = 1.0 / (1.0 + squared / scale_px**2)
+    slope = float(np.mean(weight - weight**2 * squared / scale_px**2))
+    spread = float(np.mean(squared))
+    if spread <= 0.0:
+        return 1.0
+    # Residuals much larger than the scale have hardly any slope left; beyond this the formula says nothing.
+    return float(np.clip(np.mean(weight**2 * squared) / spread / max(slope, 0.1) ** 2, 1.0, 10.0))
+
+
+def _loss_scale_px(camera: Camera, options: PoseOptions) -> float:
+    """Scale of the Cauchy loss: a quarter of the inlier tolerance."""
+    return 0.25 * options.tolerance_rel * max(camera.width, camera.height)
 
 
 def _poselib_camera(camera: Camera) -> dict[str, Any]:

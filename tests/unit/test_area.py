@@ -147,7 +147,7 @@ def test_the_digest_follows_the_content() -> None:
     o = feature_map.observations
     swapped = o.point_index.copy()
     swapped[[0, 1]] = swapped[[1, 0]]
-    moved = feature_map.points.utm + [0.001, 0, 0]
+    moved = feature_map.points.utm + np.array([0.001, 0, 0])
     variants = [
         feature_map,
         replace(feature_map, map_id="other"),

@@ -1,93 +1,169 @@
-"""Matches against a plain search in float64, and verification against a known geometry."""
+"""2D-3D matches against the correspondences that made the scene."""
+
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
+import pytest
 
-from featuredb.geometry.camera import Camera
+from featuredb.features.features import Features
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_bridge import verify_pair
-from ingest.matching import MatchOptions, mutual_matches
+from reloc.candidates import Cluster, IndexedArea
+from reloc.matching import guided_matches, match_cluster, visible_points
+from reloc.options import MatchOptions
+from tests.support.scenes import (
+    CAMERA,
+    box_points,
+    indexed,
+    looking_at,
+    pixels_inside,
+    query_features,
+    random_descriptors,
+    ring,
+    scene_map,
+)
 
-_CAMERA = Camera(model="SIMPLE_RADIAL", width=1600, height=1200, params=(1400.0, 800.0, 600.0, 0.02))
-
-
-def _descriptors(rng: np.random.Generator, count: int) -> NDArray[np.uint8]:
-    raw = rng.gamma(0.4, 1.0, (count, 128))
-    return np.clip(np.rint(512 * np.sqrt(raw / raw.sum(axis=1, keepdims=True))), 0, 255).astype(np.uint8)
-
-
-def _plain(a: NDArray[np.uint8], b: NDArray[np.uint8], options: MatchOptions) -> set[tuple[int, int]]:
-    chords = np.linalg.norm(a[:, None].astype(float) - b[None].astype(float), axis=2)
-    angles = 2 * np.arcsin(chords / 1024)
-    found = set()
-    for i in range(len(a)):
-        j = int(angles[i].argmin())
-        ahead, back = np.sort(angles[i]), np.sort(angles[:, j])
-        good = int(angles[:, j].argmin()) == i and ahead[0] <= options.max_angle_rad
-        if good and ahead[0] < options.max_ratio * ahead[1] and back[0] < options.max_ratio * back[1]:
-            found.add((i, j))
-    return found
+OPTIONS = MatchOptions()
+POSE = looking_at(np.array([38.0, 22.0, 33.0]), np.array([0.0, 0.0, 3.0]))
+RNG = np.random.default_rng(0)
+POINTS, DESCRIPTORS = box_points(RNG, 200), random_descriptors(RNG, 200)
 
 
-def test_matches_are_those_of_a_plain_search() -> None:
-    rng = np.random.default_rng(0)
-    a = _descriptors(rng, 300)
-    noisy = np.clip(a[50:200] + rng.normal(0, 18, (150, 128)), 0, 255).astype(np.uint8)
-    b = np.concatenate([_descriptors(rng, 100), noisy])
-    options = MatchOptions()
-    found = {(int(i), int(j)) for i, j in mutual_matches(a, b, options)}
-    assert found == _plain(a, b, options)
-    true = {(50 + k, 100 + k) for k in range(150)}
-    assert len(found & true) > 100
+def whole(area: IndexedArea) -> Cluster:
+    return Cluster(
+        area=area.area,
+        images=np.arange(len(area.area.image_map)),
+        points=np.arange(len(area.area.points), dtype=np.int32),
+        score=np.inf,
+    )
 
 
-def test_repeated_structure_does_not_match() -> None:
-    rng = np.random.default_rng(1)
-    a = _descriptors(rng, 20)
-    assert len(mutual_matches(a, np.concatenate([a, a]), MatchOptions())) == 0
+def photo(seed: int = 1) -> tuple[Features, np.ndarray]:
+    """Features of a photo by POSE, and which point each of them shows."""
+    rng = np.random.default_rng(seed)
+    pixels, inside = pixels_inside(CAMERA, POSE, POINTS)
+    rows = np.flatnonzero(inside)
+    return query_features(rng, pixels[rows], DESCRIPTORS[rows]), rows
 
 
-def test_an_image_with_hardly_any_features_matches_nothing() -> None:
-    rng = np.random.default_rng(2)
-    for count in (0, 1):
-        assert mutual_matches(_descriptors(rng, count), _descriptors(rng, 9), MatchOptions()).shape == (0, 2)
+def one_map(**changes: object) -> IndexedArea:
+    options = {"points": POINTS, "descriptors": DESCRIPTORS, "poses": ring(6)} | changes
+    return indexed(scene_map(**options))  # type: ignore[arg-type]
 
 
-def _two_views(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    points = np.column_stack([rng.uniform(-6, 6, (120, 2)), rng.uniform(9, 15, 120)])
-    moved = Rigid3.exp([0.02, 0.1, 0.03, -1.5, 0.3, 0.1])
-    noise = rng.normal(0, 0.4, (2, 120, 2))
-    a, b = _CAMERA.project(points), _CAMERA.project(moved.act(points))
-    return (a + noise[0]).astype(np.float32), (b + noise[1]).astype(np.float32)
+def test_every_feature_finds_its_point() -> None:
+    features, truth = photo()
+    area = one_map()
+    matches = match_cluster(features, whole(area), OPTIONS)
+    assert len(matches) == len(features) > 150
+    np.testing.assert_array_equal(area.area.point_row[matches.point], truth[matches.feature])
+    difference = features.descriptors[matches.feature].astype(float) - area.area.descriptors[matches.point]
+    np.testing.assert_allclose(matches.distance, np.linalg.norm(difference, axis=1), rtol=1e-6)
 
 
-def test_verification_keeps_true_matches_and_drops_wrong_ones() -> None:
-    rng = np.random.default_rng(3)
-    xy_a, xy_b = _two_views(rng)
-    wrong = rng.permutation(120)[:60]
-    matches = np.stack([np.arange(120), np.arange(120)], axis=1).astype(np.uint32)
-    matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
-    view = verify_pair(_CAMERA, xy_a, _CAMERA, xy_b, matches, focal_known=True, max_error_px=2.0, seed=0)
-    kept = {(int(i), int(j)) for i, j in view.inliers}
-    true = {(i, i) for i in range(120) if i not in set(wrong.tolist())}
-    assert len(kept & true) > 0.95 * len(true)
-    assert len(kept - true) <= 3
-    again = verify_pair(_CAMERA, xy_a, _CAMERA, xy_b, matches, focal_known=True, max_error_px=2.0, seed=0)
-    np.testing.assert_array_equal(view.inliers, again.inliers)
+def test_the_ratio_test_refuses_what_is_there_twice() -> None:
+    """Half of the points have a twin with the same look elsewhere in the same map."""
+    twins = DESCRIPTORS.copy()
+    twins[100:] = DESCRIPTORS[:100]
+    features, _ = photo()
+    area = one_map(descriptors=twins)
+    matches = match_cluster(features, whole(area), OPTIONS)
+    assert len(matches) <= 2  # noise makes a few differ
+    lenient = match_cluster(features, whole(area), replace(OPTIONS, ratio=1.01))
+    assert len(lenient) > 50  # it is the ratio that refuses
 
 
-def test_random_matches_are_not_verified() -> None:
-    rng = np.random.default_rng(4)
-    xy_a, xy_b = _two_views(rng)
-    matches = np.stack([np.arange(120), rng.permutation(120)], axis=1).astype(np.uint32)
-    view = verify_pair(_CAMERA, xy_a, _CAMERA, xy_b, matches, focal_known=True, max_error_px=2.0, seed=0)
-    assert len(view.inliers) < MatchOptions().min_inliers
+def test_a_broken_track_does_not_compete_with_itself() -> None:
+    points = np.concatenate([POINTS, POINTS[:80] + 0.01])
+    descriptors = np.concatenate([DESCRIPTORS, DESCRIPTORS[:80]])
+    area = one_map(points=points, descriptors=descriptors)
+    features, truth = photo()
+    matches = match_cluster(features, whole(area), OPTIONS)
+    found = area.area.point_row[matches.point]
+    assert len(matches) == len(features)
+    np.testing.assert_array_equal(np.where(found >= 200, found - 200, found), truth[matches.feature])
 
 
-def test_too_few_matches_for_a_geometry() -> None:
-    rng = np.random.default_rng(5)
-    xy_a, xy_b = _two_views(rng)
-    matches = np.zeros((5, 2), np.uint32)
-    view = verify_pair(_CAMERA, xy_a, _CAMERA, xy_b, matches, focal_known=True, max_error_px=2.0, seed=0)
-    assert len(view.inliers) == 0
-    assert int(view.candidates) == 5
+def test_a_second_map_of_the_place_does_not_disturb_the_first() -> None:
+    features, _ = photo()
+    first = scene_map(points=POINTS, descriptors=DESCRIPTORS, poses=ring(6), map_id="a")
+    second = scene_map(points=POINTS + 0.7, descriptors=DESCRIPTORS, poses=ring(6), map_id="b", seed=5)
+    alone = match_cluster(features, whole(indexed(first)), OPTIONS)
+    area = indexed(first, second)
+    both = match_cluster(features, whole(area), OPTIONS)
+    of_first = area.area.point_map[both.point] == 0
+    np.testing.assert_array_equal(np.sort(both.feature[of_first]), np.sort(alone.feature))
+    assert (~of_first).sum() == len(alone)
+
+
+def test_one_to_one_in_features_points_and_places() -> None:
+    """The photo has each keypoint twice (two orientations), and twice more nearby, of the same look."""
+    features, _ = photo()
+    order = np.tile(np.arange(len(features)), 3)
+    many = features.take(order)
+    shifted = many.xy.copy()
+    shifted[2 * len(features) :] += 6.0
+    many = replace(many, xy=shifted)
+    matches = match_cluster(many, whole(one_map()), OPTIONS)
+    assert len(np.unique(matches.point)) == len(matches) == len(features)
+    assert len(np.unique(many.xy[matches.feature].round(1), axis=0)) == len(matches)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_points_and_few_features(count: int) -> None:
+    area = one_map()
+    features, _ = photo()
+    few = replace(whole(area), points=np.arange(count, dtype=np.int32))
+    assert len(match_cluster(features, few, OPTIONS)) <= count
+    assert len(match_cluster(features.take(np.arange(count)), whole(area), OPTIONS)) == count
+    points = np.arange(count, dtype=np.int32)
+    assert len(guided_matches(features, area.area, points, CAMERA, POSE, OPTIONS)) <= count
+
+
+def test_guided_matches_are_near_their_projection_and_look_alike() -> None:
+    features, truth = photo()
+    area = one_map()
+    points = np.arange(len(area.area.points), dtype=np.int32)
+    turned = Rigid3.exp([0, 0.002, 0, 0, 0, 0]) @ POSE  # 1.8 pixels
+    matches = guided_matches(features, area.area, points, CAMERA, turned, OPTIONS)
+    pixels = CAMERA.project(turned.act(area.area.points[matches.point]))
+    gap = np.linalg.norm(pixels - features.xy[matches.feature], axis=1)
+    assert gap.max() < OPTIONS.guided_radius_rel * CAMERA.width
+    np.testing.assert_array_equal(area.area.point_row[matches.point], truth[matches.feature])
+    assert len(matches) > 0.9 * len(features)
+    assert matches.distance.max() < OPTIONS.guided_max_distance
+    far = Rigid3.exp([0, 0.02, 0, 0, 0, 0]) @ POSE  # 18 pixels
+    astray = guided_matches(features, area.area, points, CAMERA, far, OPTIONS)
+    assert len(astray) < 0.05 * len(features)
+    strict = replace(OPTIONS, guided_max_distance=1.0)
+    assert len(guided_matches(features, area.area, points, CAMERA, POSE, strict)) == 0
+
+
+def test_visible_points_against_a_loop() -> None:
+    area = one_map(poses=ring(6)[:2]).area
+    rows = np.arange(len(area.points))
+    for pose in (POSE, looking_at(np.array([-40.0, -15.0, 30.0]), np.zeros(3)), ring(6)[0]):
+        found = set(visible_points(area, rows, CAMERA, pose).tolist())
+        _, inside = pixels_inside(CAMERA, pose, area.points)
+        for row in rows:
+            toward = pose.center - area.points[row]
+            toward /= np.linalg.norm(toward)
+            off_deg = np.degrees(np.arccos(np.clip(toward @ area.view_direction[row], -1, 1)))
+            cone_deg = np.degrees(np.arccos(np.clip(area.view_spread_cos[row], -1, 1))) + 30.0
+            assert (row in found) == bool(inside[row] and off_deg <= cone_deg)
+    # The two cameras of the map look from the east: from the west nothing is known, nor from below.
+    assert len(visible_points(area, rows, CAMERA, ring(6)[0])) > 100
+    west = looking_at(np.array([-45.0, -10.0, 20.0]), np.zeros(3))
+    below = looking_at(np.array([5.0, 0.0, -40.0]), np.zeros(3))
+    for pose in (west, below):
+        assert pixels_inside(CAMERA, pose, area.points)[1].sum() > 100
+        assert len(visible_points(area, rows, CAMERA, pose)) == 0
+
+
+def test_nothing_behind_the_camera_is_visible() -> None:
+    area = one_map().area
+    back = Rigid3.exp([0, np.pi, 0, 0, 0, 0]) @ POSE
+    np.testing.assert_allclose(back.center, POSE.center, atol=1e-9)
+    assert len(visible_points(area, np.arange(len(area.points)), CAMERA, back)) == 0
+    features, _ = photo()
+    points = np.arange(len(area.points), dtype=np.int32)
+    assert len(guided_matches(features, area, points, CAMERA, back, OPTIONS)) == 0

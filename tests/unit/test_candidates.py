@@ -1,0 +1,166 @@
+"""Where a photo may belong: reach of the prior, votes, clusters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.features.features import Features
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from reloc.candidates import IndexedArea, find_clusters, images_in_reach
+from reloc.options import CandidateOptions
+from tests.support.scenes import (
+    CAMERA,
+    box_points,
+    indexed,
+    looking_at,
+    pixels_inside,
+    query_features,
+    random_descriptors,
+    ring,
+    scene_map,
+)
+
+VOTING = CandidateOptions(single_cluster_points=0)
+
+
+def prior_at(area: IndexedArea, east_m: float, north_m: float, sigma_m: float = 5.0) -> GeoPrior:
+    lat, lon, h = area.area.frame.geodetic_from_enu(np.array([east_m, north_m, 0.0]))
+    return GeoPrior(
+        latitude_deg=float(lat),
+        longitude_deg=float(lon),
+        height_m=float(h) + 40.0,
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=10.0,
+    )
+
+
+def place(seed: int, east_m: float = 0.0, images: int = 8, map_id: str | None = None) -> FeatureMap:
+    rng = np.random.default_rng(seed)
+    return scene_map(
+        points=box_points(rng, 300),
+        descriptors=random_descriptors(rng, 300),
+        poses=ring(images),
+        east_m=east_m,
+        map_id=map_id or f"place-{seed}",
+    )
+
+
+def photo_of(seed: int) -> Features:
+    """Features of a photo of `place(seed)`, from a new camera, with as many that belong to nothing."""
+    rng = np.random.default_rng(seed)
+    points, descriptors = box_points(rng, 300), random_descriptors(rng, 300)
+    pixels, inside = pixels_inside(CAMERA, looking_at(np.array([30.0, 40.0, 30.0]), np.zeros(3)), points)
+    other = np.random.default_rng(seed + 1000)
+    return query_features(
+        other,
+        np.concatenate([pixels[inside], other.uniform(0, 800, (200, 2))]),
+        np.concatenate([descriptors[inside], random_descriptors(other, 200)]),
+    )
+
+
+def test_reach_of_a_prior_ends_where_the_options_say() -> None:
+    area = indexed(place(0))
+    options = CandidateOptions(prior_sigmas=3.0, prior_reach=2.0)
+    reach = area.area.image_reach
+    east = area.area.image_center[:, 0].max()
+    i = int(np.argmax(area.area.image_center[:, 0]))
+    limit = east + 3.0 * 5.0 + 2.0 * reach[i]
+    assert images_in_reach(area.area, prior_at(area, limit - 0.5, 0.0), options)[i]
+    assert not images_in_reach(area.area, prior_at(area, limit + 0.5, 0.0), options)[i]
+    assert images_in_reach(area.area, None, options).all()
+    # Height says nothing: drones' heights are off by tens of metres.
+    low = replace(prior_at(area, limit - 0.5, 0.0), height_m=None)
+    assert images_in_reach(area.area, low, options)[i]
+
+
+@pytest.mark.parametrize("far", ["antipode", "quarter"])
+def test_a_prior_on_the_other_side_of_the_earth_is_out_of_reach(far: str) -> None:
+    """Straight below the frame, horizontal distances come back to zero."""
+    area = indexed(place(0))
+    frame = area.area.frame
+    prior = GeoPrior(
+        latitude_deg=-frame.latitude_deg if far == "antipode" else frame.latitude_deg - 89.0,
+        longitude_deg=frame.longitude_deg - 180.0 if far == "antipode" else frame.longitude_deg,
+        height_m=None,
+        sigma_horizontal_m=10.0,
+        sigma_vertical_m=10.0,
+    )
+    assert not images_in_reach(area.area, prior, CandidateOptions()).any()
+    assert find_clusters([area], photo_of(0), prior, CandidateOptions()) == []
+
+
+def test_a_prior_keeps_only_the_images_near_it() -> None:
+    """Two places 1,200 m apart in one area."""
+    area = indexed(place(0, map_id="a"), place(1, east_m=1200.0, map_id="b"))
+    (cluster,) = find_clusters([area], photo_of(0), prior_at(area, 1200.0, 10.0), CandidateOptions())
+    assert (area.area.image_map[cluster.images] == 1).all()
+    assert (area.area.point_map[cluster.points] == 1).all()
+    assert len(cluster.images) == 8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_votes_prefer_the_right_place(seed: int) -> None:
+    """Three places in one area, and again as three areas; each photo is of one of them."""
+    maps = [place(i, east_m=400.0 * i) for i in range(3)]
+    together = find_clusters([indexed(*maps)], photo_of(seed), None, VOTING)
+    assert (together[0].area.image_map[together[0].images] == seed).all()
+    assert together[0].score > 2 * together[-1].score
+    apart = find_clusters([indexed(m) for m in maps], photo_of(seed), None, VOTING)
+    assert apart[0].area.maps[0].map_id == f"place-{seed}"
+
+
+def test_look_alikes_get_fewer_votes_than_the_place_itself() -> None:
+    """A second place shares half of its descriptors with the first."""
+    rng = np.random.default_rng(0)
+    points, descriptors = box_points(rng, 300), random_descriptors(rng, 300)
+    other = random_descriptors(np.random.default_rng(9), 300)
+    other[::2] = descriptors[::2]
+    maps = [
+        scene_map(points=points, descriptors=d, poses=ring(8), map_id=name, east_m=east)
+        for d, name, east in ((other, "like", 0.0), (descriptors, "true", 500.0))
+    ]
+    clusters = find_clusters([indexed(*maps)], photo_of(0), None, VOTING)
+    assert (clusters[0].area.image_map[clusters[0].images] == 1).all()
+
+
+def test_no_small_area_is_lost_among_many() -> None:
+    """More areas than clusters may be tried: the votes choose, whatever the order."""
+    areas = [indexed(place(i, east_m=2000.0 * i, images=4)) for i in range(6)]
+    for seed in (0, 5):
+        clusters = find_clusters(areas, photo_of(seed), None, CandidateOptions())
+        assert len(clusters) == 3
+        assert clusters[0].area.maps[0].map_id == f"place-{seed}"
+        assert np.isfinite([c.score for c in clusters]).all()
+    # With no more areas than clusters none is left out, so votes need not be counted.
+    few = find_clusters(areas[:3], photo_of(0), None, CandidateOptions())
+    assert [c.score for c in few] == [np.inf] * 3
+
+
+def test_a_small_area_does_not_push_aside_the_clusters_of_a_large_one() -> None:
+    large = indexed(*[place(i, east_m=250.0 * i) for i in range(3)])
+    small = [indexed(place(10 + i, images=3)) for i in range(3)]
+    options = CandidateOptions(single_cluster_points=400)
+    clusters = find_clusters([*small, large], photo_of(2), None, options)
+    assert clusters[0].area is large.area
+    assert (large.area.image_map[clusters[0].images] == 2).all()
+
+
+def test_clusters_are_bounded_and_always_the_same() -> None:
+    area = indexed(place(0, images=30))
+    options = replace(VOTING, max_cluster_images=6, max_clusters=4)
+    first, again = (find_clusters([area], photo_of(0), None, options) for _ in range(2))
+    assert len(first) == 4
+    assert [c.score for c in first] == sorted((c.score for c in first), reverse=True)
+    for one, other in zip(first, again, strict=True):
+        assert 1 <= len(one.images) <= 6
+        np.testing.assert_array_equal(one.images, other.images)
+        np.testing.assert_array_equal(one.points, area.area.points_of_images(one.images))
+    assert len({tuple(c.images) for c in first}) == 4
+
+
+def test_no_features_and_no_areas() -> None:
+    nothing = photo_of(0).take(np.zeros(0, dtype=int))
+    assert find_clusters([], photo_of(0), None, CandidateOptions()) == []
+    clusters = find_clusters([indexed(place(0))], nothing, None, VOTING)
+    assert all(c.score <= 0 for c in clusters)

@@ -1,0 +1,241 @@
+"""Poses of synthetic scenes against the truth; derivatives and covariances by independent routes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp, so3_log
+from reloc.jacobians import intrinsics_jacobian, pixel_jacobians
+from reloc.options import PoseOptions
+from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose, reprojection_errors
+from tests.support.scenes import CAMERA, box_points, looking_at, pixels_inside
+
+OPTIONS = PoseOptions()
+POSE = looking_at(np.array([38.0, 22.0, 33.0]), np.array([0.0, 0.0, 3.0]))
+TRUE_LENS = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(900.0, 503.0, 396.0, 0.01))
+
+
+def scene(
+    seed: int, count: int, *, noise_px: float = 0.5, outliers: float = 0.0, camera: Camera = CAMERA
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (n, 2), points (n, 3), and which of the matches are true (n,)."""
+    rng = np.random.default_rng(seed)
+    points = box_points(rng, 3 * count)
+    pixels, inside = pixels_inside(camera, POSE, points)
+    points, pixels = points[inside][:count], pixels[inside][:count]
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+    wrong = rng.random(len(pixels)) < outliers
+    pixels[wrong] = rng.uniform(0, [camera.width, camera.height], (wrong.sum(), 2))
+    return pixels, points, ~wrong
+
+
+def errors(found: Rigid3) -> tuple[float, float]:
+    """Position in metres, orientation in degrees."""
+    return float(np.linalg.norm(found.center - POSE.center)), found.angle_to_deg(POSE)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_known_lens_with_sixty_percent_outliers(seed: int) -> None:
+    pixels, points, true = scene(seed, 200, outliers=0.6)
+    found = estimate_pose(pixels, points, CAMERA, "request", OPTIONS)
+    assert found is not None
+    found = refine_pose(pixels, points, found, OPTIONS)
+    position_m, angle_deg = errors(found.cam_from_local)
+    assert position_m < 0.05
+    assert angle_deg < 0.06
+    assert (found.inliers & true).sum() > 0.95 * true.sum()
+    assert (found.inliers & ~true).sum() <= 3
+    assert found.camera == CAMERA
+    assert found.lens_information is None
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("guess", [600.0, 1300.0])
+def test_a_free_focal_length_with_outliers(seed: int, guess: float) -> None:
+    pixels, points, true = scene(seed, 200, outliers=0.5, camera=TRUE_LENS)
+    start = Camera.from_focal(1000, 800, guess)
+    found = estimate_pose(pixels, points, start, "estimated", OPTIONS)
+    assert found is not None
+    found = refine_pose(pixels, points, found, OPTIONS)
+    position_m, angle_deg = errors(found.cam_from_local)
+    assert position_m < 0.5
+    assert angle_deg < 0.5
+    assert found.camera.focal_px == pytest.approx(900, rel=0.01)
+    assert (found.inliers & true).sum() > 0.95 * true.sum()
+    assert found.prior_focal_px == guess
+
+
+def test_the_same_input_gives_the_same_pose() -> None:
+    pixels, points, _ = scene(0, 150, outliers=0.5)
+    for camera, source in ((CAMERA, "request"), (Camera.from_focal(1000, 800, 1200.0), "estimated")):
+        one, two = (estimate_pose(pixels, points, camera, source, OPTIONS) for _ in range(2))
+        assert one is not None
+        assert two is not None
+        np.testing.assert_array_equal(one.cam_from_local.matrix(), two.cam_from_local.matrix())
+        assert one.camera == two.camera
+
+
+@pytest.mark.parametrize("source", ["request", "estimated"])
+@pytest.mark.parametrize(
+    "kind", ["none", "few", "one place", "one pixel", "line", "noise", "behind", "huge", "duplicates"]
+)
+def test_degenerate_matches_give_no_pose_or_a_finite_one(source: str, kind: str) -> None:
+    rng = np.random.default_rng(0)
+    pixels, points, _ = scene(0, 40)
+    if kind == "none":
+        pixels, points = pixels[:0], points[:0]
+    elif kind == "few":
+        pixels, points = pixels[:7], points[:7]
+    elif kind == "one place":
+        points = np.repeat(points[:1], 40, axis=0)
+    elif kind == "one pixel":
+        pixels = np.repeat(pixels[:1], 40, axis=0)
+    elif kind == "line":
+        points = points[0] + np.linspace(0, 20, 40)[:, None] * [1.0, 0.5, 0.1]
+        pixels = CAMERA.project(POSE.act(points))
+    elif kind == "noise":
+        pixels = rng.uniform(0, 800, pixels.shape)
+    elif kind == "behind":
+        pixels = 1000 - pixels
+    elif kind == "huge":
+        points = points * 1e7
+    elif kind == "duplicates":
+        pixels, points = np.repeat(pixels[:4], 10, axis=0), np.repeat(points[:4], 10, axis=0)
+    camera = CAMERA if source == "request" else Camera.from_focal(1000, 800, 1200.0)
+    found = estimate_pose(pixels, points, camera, source, OPTIONS)  # type: ignore[arg-type]
+    if kind in ("none", "few"):
+        assert found is None
+    if found is None:
+        return
+    found = refine_pose(pixels, points, found, OPTIONS)
+    rows = found.inliers
+    if rows.sum() >= 4:
+        covariances = np.tile(np.eye(3) * 1e-4, (int(rows.sum()), 1, 1))
+        measured = pose_uncertainty(pixels[rows], points[rows], covariances, found, OPTIONS)
+        assert np.isfinite(measured.covariance).all()
+        eigenvalues = np.linalg.eigvalsh(measured.covariance)
+        assert eigenvalues[0] >= -1e-9 * eigenvalues[-1]
+
+
+def test_a_pose_that_points_on_a_line_leave_open_is_not_called_certain() -> None:
+    """They fix neither the turn about the line nor the way around it."""
+    points = np.array([-10.0, -5.0, 2.0]) + np.linspace(0, 20, 40)[:, None] * [1.0, 0.5, 0.1]
+    rng = np.random.default_rng(0)
+    pixels = CAMERA.project(POSE.act(points)) + rng.normal(0, 0.3, (40, 2))
+    pose = PoseHypothesis(
+        cam_from_local=POSE,
+        camera=CAMERA,
+        camera_source="request",
+        inliers=np.ones(40, dtype=bool),
+        prior_focal_px=900.0,
+    )
+    measured = pose_uncertainty(pixels, points, np.zeros((40, 3, 3)), pose, OPTIONS)
+    assert np.sqrt(np.linalg.eigvalsh(measured.covariance[3:, 3:])[-1]) > 50.0
+
+
+def test_points_behind_the_camera_are_infinitely_wrong() -> None:
+    points = POSE.inverse().act(np.array([[0.0, 0, 5], [0, 0, -5], [0, 0, 0]]))
+    error = reprojection_errors(np.full((3, 2), [500.0, 400.0]), points, CAMERA, POSE)
+    assert error[0] == pytest.approx(0.0, abs=1e-6)
+    assert (error[1:] == np.inf).all()
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        CAMERA,
+        Camera(model="PINHOLE", width=1000, height=800, params=(900.0, 910.0, 500.0, 400.0)),
+        Camera(
+            model="OPENCV",
+            width=1000,
+            height=800,
+            params=(900.0, 910.0, 500.0, 400.0, -0.1, 0.02, 1e-3, -1e-3),
+        ),
+        Camera(
+            model="OPENCV_FISHEYE", width=1000, height=800, params=(700.0, 700.0, 500, 400, 0.01, 0, 0, 0)
+        ),
+    ],
+    ids=lambda camera: camera.model,
+)
+def test_jacobians_against_the_perturbation_they_promise(camera: Camera) -> None:
+    """R_true = exp(dtheta) R and C_true = C + dC of local_from_cam, composed and projected."""
+    points = box_points(np.random.default_rng(1), 12)
+    by_point, by_pose = pixel_jacobians(camera, POSE, points)
+    local_from_cam = POSE.inverse()
+    step = 1e-6
+    for axis in range(6):
+        ends = []
+        for sign in (1, -1):
+            delta = np.zeros(6)
+            delta[axis] = sign * step
+            moved = Rigid3(
+                rotation=so3_exp(delta[:3]) @ local_from_cam.rotation,
+                translation=local_from_cam.translation + delta[3:],
+            )
+            ends.append(camera.project(moved.inverse().act(points)))
+        expected = (ends[0] - ends[1]) / (2 * step)
+        np.testing.assert_allclose(by_pose[:, :, axis], expected, rtol=1e-4, atol=2e-3)
+    for axis in range(3):
+        offset = np.zeros(3)
+        offset[axis] = 1e-5
+        expected = (
+            camera.project(POSE.act(points + offset)) - camera.project(POSE.act(points - offset))
+        ) / 2e-5
+        np.testing.assert_allclose(by_point[:, :, axis], expected, rtol=1e-4, atol=1e-3)
+
+
+def test_intrinsics_jacobian_is_the_closed_form_of_simple_radial() -> None:
+    in_camera = POSE.act(box_points(np.random.default_rng(2), 20))
+    u, v = in_camera[:, 0] / in_camera[:, 2], in_camera[:, 1] / in_camera[:, 2]
+    r2 = u**2 + v**2
+    focal, _, _, k = CAMERA.params
+    zero, one = np.zeros_like(u), np.ones_like(u)
+    expected = np.stack(
+        [
+            np.stack([u * (1 + k * r2), v * (1 + k * r2)], axis=1),
+            np.stack([one, zero], axis=1),
+            np.stack([zero, one], axis=1),
+            np.stack([focal * u * r2, focal * v * r2], axis=1),
+        ],
+        axis=2,
+    )
+    found = intrinsics_jacobian(CAMERA, in_camera, np.array([0.1, 0.1, 0.1, 1e-4]))
+    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
+
+
+def normalised_squared_error(found: Rigid3, covariance: np.ndarray) -> float:
+    """Squared error of the pose against POSE, in units of the covariance's axes (rotation, centre)."""
+    delta = np.concatenate([so3_log(POSE.rotation.T @ found.rotation), POSE.center - found.center])
+    return float(delta @ np.linalg.solve(covariance, delta))
+
+
+@pytest.mark.parametrize(("noise_px", "tolerance_rel"), [(0.3, 0.01), (1.5, 0.01), (0.5, 0.0025)])
+def test_the_covariance_is_that_of_the_errors(noise_px: float, tolerance_rel: float) -> None:
+    """Pixel noise unknown to it, and points wrong by their own covariance: the mean of chi-square is 6."""
+    options = replace(OPTIONS, tolerance_rel=tolerance_rel)
+    rng = np.random.default_rng(5)
+    sigma_m = np.array([0.02, 0.02, 0.05])
+    values = []
+    for _ in range(300):
+        points = box_points(rng, 60)
+        pixels, inside = pixels_inside(CAMERA, POSE, points)
+        points, pixels = points[inside], pixels[inside]
+        pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+        # Points share the scale of the pixel noise, which one factor is measured for.
+        mapped = points + rng.normal(0, 1, points.shape) * sigma_m * noise_px
+        start = PoseHypothesis(
+            cam_from_local=POSE,
+            camera=CAMERA,
+            camera_source="request",
+            inliers=np.ones(len(points), dtype=bool),
+            prior_focal_px=900.0,
+        )
+        found = refine_pose(pixels, mapped, start, options)
+        rows = found.inliers
+        covariances = np.tile(np.diag(sigma_m**2), (int(rows.sum()), 1, 1))
+        measured = pose_uncertainty(pixels[rows], mapped[rows], covariances, found, options)
+        values.append(normalised_squared_error(found.cam_from_local, measured.covariance))
+    assert np.mean(values) == pytest.approx(6.0, rel=0.12)
