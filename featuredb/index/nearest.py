@@ -7,9 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def nearest(
-    query: NDArray[Any], base: NDArray[Any], k: int
-) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def nearest(query: NDArray[Any], base: NDArray[Any], k: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """The k nearest rows of `base` (m, d) for each row of `query` (n, d), by exhaustion.
 
     Returns:
