@@ -197,14 +197,14 @@ def run_incremental(
         for parent in parents:
             target = getattr(target, parent)
         setattr(target, last, value)
-    with _quiet():
+    with quiet():
         pycolmap.incremental_mapping(
             str(database), str(images), str(output), options, next_image_callback=on_image
         )
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """COLMAP narrates every image on stderr; only its errors are of use to a person."""
     before = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)

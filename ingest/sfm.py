@@ -3,11 +3,12 @@
 import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from featuredb.geometry.camera import Camera
+from ingest.colmap_adjust import AdjustOptions, adjust_models
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, read_models, run_incremental, write_database
 from ingest.executor import Progress, no_progress
 from ingest.workspace import atomic_folder
@@ -33,6 +34,7 @@ class SfmOptions:
         keep_two_view_tracks: points seen by two photos only are triangulated too.
         seed: of all random choices.
         threads: of bundle adjustment; one gives the same numbers in every run.
+        adjust: the final adjustment of each model.
     """
 
     camera_model: str = "SIMPLE_RADIAL"
@@ -45,6 +47,7 @@ class SfmOptions:
     keep_two_view_tracks: bool = True
     seed: int = 0
     threads: int = 1
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,6 +107,9 @@ def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -
         database = Path(scratch) / "colmap.db"
         write_database(database, task.cameras, task.photos, task.geometries)
         run_incremental(database, Path(scratch), folder, _settings(options, side), on_photo)
+        # A SIFT keypoint is good to about half a pixel of the image that it was found on.
+        scale_px = 0.5 * max(1.0, side / options.error_reference_side_px)
+        adjust_models(folder, database, task.photos, scale_px, options.adjust)
 
 
 def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:

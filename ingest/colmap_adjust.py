@@ -1,0 +1,212 @@
+"""Final adjustment of a reconstruction: a fuller lens model where the photos support it, positions as priors.
+
+A lens that the model cannot follow bends the whole reconstruction while the reprojection errors hardly show
+it. COLMAP's mapping runs best with one distortion parameter; once it has converged, photos of one camera
+determine OPENCV's eight. Whether they do is asked of the data by the Bayesian information criterion.
+Like ingest.colmap_bridge this module knows pycolmap's reconstructions.
+"""
+
+import logging
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from featuredb.geometry.arrays import FloatArray
+from ingest.colmap_bridge import SfmPhoto, quiet
+
+_LOG = logging.getLogger(__name__)
+# focal lengths, principal point and four distortion coefficients beside SIMPLE_RADIAL's focal length and one
+_MORE_PARAMETERS = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustOptions:
+    """The final adjustment.
+
+    Attributes:
+        fuller_lens: try OPENCV for cameras with enough photos.
+        min_photos_of_camera: below, eight parameters of a lens are not told from the scene's shape.
+        evidence_ratio: how many times the information criterion's penalty the gain must be. Real gains are
+            far beyond it (40 times on `brighton`, 300 times on the simulated drone); neighbouring residuals
+            are not independent, which the criterion assumes.
+        use_positions: GPS positions take part, robustly, each with its own sigma.
+        max_iterations: of Ceres.
+        threads: one gives the same numbers in every run.
+    """
+
+    fuller_lens: bool = True
+    min_photos_of_camera: int = 8
+    evidence_ratio: float = 5.0
+    use_positions: bool = True
+    max_iterations: int = 60
+    threads: int = 1
+
+
+def adjust_models(
+    output: Path, database: Path, photos: tuple[SfmPhoto, ...], loss_scale_px: float, options: AdjustOptions
+) -> None:
+    """Adjust every model folder under `output` in place.
+
+    Args:
+        database: COLMAP's, from which points are triangulated anew with the better lens.
+        loss_scale_px: of the Cauchy loss.
+    """
+    for folder in sorted(p for p in output.iterdir() if p.is_dir()):
+        with quiet():
+            reconstruction = pycolmap.Reconstruction(str(folder))
+            adjusted = _adjusted(reconstruction, folder, database, photos, loss_scale_px, options)
+            adjusted.write(str(folder))
+
+
+def _adjusted(
+    reconstruction: Any,
+    folder: Path,
+    database: Path,
+    photos: tuple[SfmPhoto, ...],
+    loss_scale_px: float,
+    options: AdjustOptions,
+) -> Any:
+    fuller = _cameras_to_free(reconstruction, options) if options.fuller_lens else []
+    before = _residuals(reconstruction)
+    if fuller and len(before):
+        trial = pycolmap.Reconstruction(str(folder))
+        for camera_id in fuller:
+            _free_lens(trial.camera(camera_id))
+        _bundle(trial, photos, loss_scale_px, fuller, options)
+        gain = information_gain(before, _residuals(trial), _MORE_PARAMETERS * len(fuller))
+        _LOG.info("fuller lens: gain %.0f times the penalty", gain)
+        if gain >= options.evidence_ratio:
+            trial = _triangulated_anew(trial, database, folder)
+            _bundle(trial, photos, loss_scale_px, fuller, options)
+            return trial
+    _bundle(reconstruction, photos, loss_scale_px, [], options)
+    return reconstruction
+
+
+def information_gain(before: FloatArray, after: FloatArray, more_parameters: int) -> float:
+    """Drop of twice the negative log-likelihood, over the criterion's penalty for the parameters.
+
+    Residuals (m, 2) of the same observations, Cauchy-distributed with the scale that `before` shows.
+    Schwarz, Estimating the dimension of a model, 1978.
+    """
+    scale = 1.4826 * max(float(np.median(np.abs(before))), 1e-6)
+    drop = 2.0 * (_cauchy_cost(before, scale) - _cauchy_cost(after, scale))
+    return float(drop / (more_parameters * np.log(before.size)))
+
+
+def _cauchy_cost(residuals: FloatArray, scale: float) -> float:
+    squared = np.sum(residuals**2, axis=1) / scale**2
+    return float(np.log1p(np.where(np.isfinite(squared), squared, 1e12)).sum())
+
+
+def _cameras_to_free(reconstruction: Any, options: AdjustOptions) -> list[int]:
+    """SIMPLE_RADIAL cameras that enough registered photos share."""
+    counts = Counter(reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids())
+    return sorted(
+        camera_id
+        for camera_id, count in counts.items()
+        if count >= options.min_photos_of_camera
+        and reconstruction.camera(camera_id).model.name == "SIMPLE_RADIAL"
+    )
+
+
+def _free_lens(camera: Any) -> None:
+    """The same lens as an OPENCV camera."""
+    f, cx, cy, k = camera.params
+    camera.model = pycolmap.CameraModelId.OPENCV
+    camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+
+
+def _bundle(
+    reconstruction: Any,
+    photos: tuple[SfmPhoto, ...],
+    loss_scale_px: float,
+    free_center: list[int],
+    options: AdjustOptions,
+) -> None:
+    settings = pycolmap.BundleAdjustmentOptions()
+    settings.print_summary = False
+    settings.refine_principal_point = bool(free_center)
+    settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    settings.ceres.loss_function_scale = loss_scale_px
+    settings.ceres.solver_options.max_num_iterations = options.max_iterations
+    settings.ceres.solver_options.function_tolerance = 1e-6  # relative; what is left is below micrometres
+    settings.ceres.solver_options.num_threads = options.threads
+    config = pycolmap.BundleAdjustmentConfig()
+    image_ids = sorted(reconstruction.reg_image_ids())
+    for image_id in image_ids:
+        config.add_image(image_id)
+    if free_center:
+        # The principal point is free for all or none; cameras with few photos stay as they are.
+        for camera_id in {reconstruction.image(i).camera_id for i in image_ids} - set(free_center):
+            config.set_constant_cam_intrinsics(camera_id)
+    priors = _position_priors(reconstruction, image_ids, photos) if options.use_positions else []
+    if len(priors) >= 3:
+        prior_settings = pycolmap.PosePriorBundleAdjustmentOptions()
+        prior_settings.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        prior_settings.alignment_ransac.max_error = 3.0 * max(
+            float(np.sqrt(np.trace(np.asarray(p.position_covariance)))) for p in priors
+        )
+        prior_settings.alignment_ransac.random_seed = 0
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            settings, prior_settings, config, priors, reconstruction
+        )
+    else:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        adjuster = pycolmap.create_default_bundle_adjuster(settings, config, reconstruction)
+    adjuster.solve()
+    reconstruction.update_point_3d_errors()
+
+
+def _position_priors(reconstruction: Any, image_ids: list[int], photos: tuple[SfmPhoto, ...]) -> list[Any]:
+    """Positions of the registered photos that have one; image ids are rows of the photos + 1."""
+    return [
+        pycolmap.PosePrior(
+            pose_prior_id=image_id,
+            corr_data_id=reconstruction.image(image_id).data_id,
+            position=photos[image_id - 1].prior_position,
+            position_covariance=photos[image_id - 1].prior_covariance,
+            coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+        )
+        for image_id in image_ids
+        if photos[image_id - 1].prior_position is not None
+    ]
+
+
+def _triangulated_anew(reconstruction: Any, database: Path, folder: Path) -> Any:
+    """The same poses and lenses with points triangulated from all matches again."""
+    stored = pycolmap.Database.open(str(database))
+    try:  # COLMAP refuses a database whose cameras are of another model
+        for camera_id in sorted({reconstruction.image(i).camera_id for i in reconstruction.reg_image_ids()}):
+            stored.update_camera(reconstruction.camera(camera_id))
+    finally:
+        stored.close()
+    settings = pycolmap.IncrementalPipelineOptions()
+    settings.extract_colors = False
+    settings.triangulation.ignore_two_view_tracks = False
+    settings.num_threads = 1
+    settings.random_seed = 0
+    return pycolmap.triangulate_points(
+        reconstruction, str(database), str(folder), str(folder), clear_points=True, options=settings
+    )
+
+
+def _residuals(reconstruction: Any) -> FloatArray:
+    """(m, 2) reprojection residuals in pixels, in an order that the structure alone determines."""
+    parts = []
+    for image_id in sorted(reconstruction.reg_image_ids()):
+        image = reconstruction.image(image_id)
+        seen = [p for p in image.points2D if p.has_point3D()]
+        if not seen:
+            continue
+        pixels = np.array([p.xy for p in seen])
+        points = np.array([reconstruction.point3D(p.point3D_id).xyz for p in seen])
+        matrix = np.asarray(image.cam_from_world().matrix())
+        camera = reconstruction.camera(image.camera_id)
+        in_camera = np.ascontiguousarray(points @ matrix[:, :3].T + matrix[:, 3])
+        parts.append(np.asarray(camera.img_from_cam(in_camera)) - pixels)
+    return np.concatenate(parts) if parts else np.zeros((0, 2))
