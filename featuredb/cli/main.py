@@ -104,7 +104,3 @@ def _configure_logging(level: str) -> None:
     )
     for package in ("featuredb", "ingest", "reloc"):
         logging.getLogger(package).setLevel(level.upper())
-
-
-if __name__ == "__main__":
-    sys.exit(main())

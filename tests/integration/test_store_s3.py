@@ -1,6 +1,7 @@
 """The database in an object store: the same suite over S3-compatible servers on loopback."""
 
 import subprocess
+import sys
 import tempfile
 import uuid
 from collections.abc import Iterator
@@ -50,8 +51,9 @@ class TestCephStore(StoreSuite):
     def test_the_command_reaches_it(self, place: Place) -> None:
         place.create().commit_map(random_map(1))
         options = [f"--storage-option={k}={v}" for k, v in place.storage_options.items()]
-        command = ["featuredb", "sql", place.url, "select count(*) as n from points", "--format", "csv"]
-        done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=60)
+        query = ["sql", place.url, "select count(*) as n from points", "--format", "csv"]
+        command = [sys.executable, "-m", "featuredb.cli", *query, *options]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert (done.returncode, done.stdout) == (0, "n\n60\n"), done.stderr
 
 
