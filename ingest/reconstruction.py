@@ -158,7 +158,7 @@ def make_maps(
 
     with clock.stage("build"):
         components = [
-            _component(model, frame, usable, features, identity(number), options)
+            _component(model, usable, features, identity(number), options)
             for number, model in enumerate(models)
         ]
     progress("build", len(components), len(components))
@@ -270,7 +270,6 @@ def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArr
 
 def _component(
     model: Model,
-    frame: LocalFrame | None,
     photos: Sequence[Photo],
     features: Sequence[PhotoFeatures],
     identity: MapIdentity,
@@ -278,6 +277,7 @@ def _component(
 ) -> Component:
     """Place one model and build its map where the placement is accepted."""
     chosen = [photos[r] for r in model.rows]
+    frame = local_frame_of(chosen)  # its own: components may lie in different towns
     positions, sigmas = _priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
     placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
