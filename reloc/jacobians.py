@@ -1,4 +1,4 @@
-"""Derivatives of pixels by points, pose and intrinsics, through any camera model, by central differences."""
+"""Derivatives of pixels by points and pose, through any camera model, by central differences."""
 
 import numpy as np
 
@@ -26,29 +26,15 @@ def pixel_jacobians(
         by_camera[:, :, axis] = (camera.project(in_camera + offset) - camera.project(in_camera - offset)) / (
             2.0 * step[:, None]
         )
+    return chain_to_pose(by_camera, cam_from_local, points)
+
+
+def chain_to_pose(
+    by_camera: FloatArray, cam_from_local: Rigid3, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives as in `pixel_jacobians` from those by the points in camera axes, `by_camera` (k, 2, 3)."""
     by_point = by_camera @ cam_from_local.rotation
     x, y, z = (points - cam_from_local.center).T
     zero = np.zeros_like(x)
     crosses = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
     return by_point, np.concatenate([by_point @ crosses, -by_point], axis=2)
-
-
-def intrinsics_jacobian(camera: Camera, in_camera: FloatArray, steps: FloatArray) -> FloatArray:
-    """Derivatives (k, 2, q) of the pixels of camera-frame points (k, 3) by the camera's q parameters.
-
-    Args:
-        steps: (q,) finite-difference steps in the parameters' own units.
-    """
-    columns = []
-    for i, step in enumerate(steps):
-        up, down = list(camera.params), list(camera.params)
-        up[i] += step
-        down[i] -= step
-        columns.append(
-            (_with(camera, up).project(in_camera) - _with(camera, down).project(in_camera)) / (2 * step)
-        )
-    return np.stack(columns, axis=2)
-
-
-def _with(camera: Camera, params: list[float]) -> Camera:
-    return Camera(model=camera.model, width=camera.width, height=camera.height, params=tuple(params))

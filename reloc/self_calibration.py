@@ -13,7 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from reloc.jacobians import intrinsics_jacobian, pixel_jacobians
+from reloc.jacobians import chain_to_pose
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,7 +64,8 @@ def calibrate(
 
     Args:
         pixels, points: (k, 2), (k, 3), mostly inliers.
-        noise_px: residuals of this size are normal; scale of the Cauchy loss.
+        noise_px: residuals of this size are normal; scale of the Cauchy loss. How much the pixels count
+            against the priors follows from the residuals at the start.
 
     Raises:
         InvalidValueError: the camera is not SIMPLE_RADIAL.
@@ -83,7 +84,12 @@ def calibrate(
         ]
     )
     problem = _Problem(
-        pixels=pixels, points=points, noise_px=noise_px, prior_mean=prior_mean, prior_sigma=prior_sigma
+        pixels=pixels,
+        points=points,
+        noise_px=noise_px,
+        trust=(noise_px / _measured_noise_px(pixels, points, pose, camera, noise_px)) ** 2,
+        prior_mean=prior_mean,
+        prior_sigma=prior_sigma,
     )
     pose, camera = _minimise(problem, pose, camera)
     return Calibrated(cam_from_local=pose, camera=camera, lens_information=1.0 / prior_sigma**2)
@@ -92,11 +98,23 @@ def calibrate(
 def joint_jacobians(
     camera: Camera, cam_from_local: Rigid3, points: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of pixels by points (k, 2, 3), and by pose and SIMPLE_RADIAL intrinsics (k, 2, 10)."""
-    steps = np.array([1e-4 * camera.params[0], 0.1, 0.1, 1e-4])
-    by_point, by_pose = pixel_jacobians(camera, cam_from_local, points)
-    by_lens = intrinsics_jacobian(camera, cam_from_local.act(points), steps)
-    return by_point, np.concatenate([by_pose, by_lens], axis=2)
+    """Derivatives of pixels by points (k, 2, 3), and by pose and SIMPLE_RADIAL intrinsics (k, 2, 10).
+
+    In closed form: pixel = f (1 + k r^2) (u, v) + c with (u, v) = (x, y) / z.
+    """
+    focal, _, _, radial = camera.params
+    in_camera = cam_from_local.act(points)
+    depth = in_camera[:, 2]
+    uv = in_camera[:, :2] / depth[:, None]
+    squared = np.sum(uv**2, axis=1)
+    stretch = 1.0 + radial * squared
+    by_uv = focal * (stretch[:, None, None] * np.eye(2) + 2.0 * radial * uv[:, :, None] * uv[:, None, :])
+    by_camera = np.concatenate([by_uv, -by_uv @ uv[:, :, None]], axis=2) / depth[:, None, None]
+    by_point, by_pose = chain_to_pose(by_camera, cam_from_local, points)
+    by_focal = (stretch[:, None] * uv)[:, :, None]
+    by_center = np.tile(np.eye(2), (len(points), 1, 1))
+    by_radial = (focal * squared[:, None] * uv)[:, :, None]
+    return by_point, np.concatenate([by_pose, by_focal, by_center, by_radial], axis=2)
 
 
 def covariance_from_information(information: FloatArray) -> FloatArray:
@@ -105,6 +123,18 @@ def covariance_from_information(information: FloatArray) -> FloatArray:
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
     return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def _measured_noise_px(
+    pixels: FloatArray, points: FloatArray, pose: Rigid3, camera: Camera, noise_px: float
+) -> float:
+    """Deviation of one coordinate by the median residual; between a tenth and twice what is normal."""
+    error = np.linalg.norm(camera.project(pose.act(points)) - pixels, axis=1)
+    error = error[np.isfinite(error)]
+    if len(error) == 0:
+        return noise_px
+    # 1.1774: median of the length of a two-dimensional unit Gaussian.
+    return float(np.clip(np.median(error) / 1.1774, 0.1 * noise_px, 2.0 * noise_px))
 
 
 def _minimise(problem: "_Problem", pose: Rigid3, camera: Camera) -> tuple[Rigid3, Camera]:
@@ -146,6 +176,7 @@ class _Problem:
     pixels: FloatArray
     points: FloatArray
     noise_px: float
+    trust: float  # of a pixel: variance that noise_px stands for over the measured one
     prior_mean: FloatArray
     prior_sigma: FloatArray
 
@@ -155,7 +186,7 @@ class _Problem:
         squared = np.sum(residual**2, axis=1) / self.noise_px**2
         squared = np.where(np.isfinite(squared), squared, 1e6)
         prior = ((np.asarray(camera.params) - self.prior_mean) / self.prior_sigma) ** 2
-        return 0.5 * float(np.log1p(squared).sum() + prior.sum())
+        return 0.5 * float(self.trust * np.log1p(squared).sum() + prior.sum())
 
     def best_length(self, pose: Rigid3, camera: Camera, step: FloatArray) -> tuple[float, float]:
         """The best of the lengths 1, 2 and 4 of a step, and the cost there."""
@@ -174,7 +205,7 @@ class _Problem:
         front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
         _, jacobian = joint_jacobians(camera, pose, self.points[front])
         residual = self.pixels[front] - camera.project(in_camera[front])
-        weight = 1.0 / (1.0 + np.sum(residual**2, axis=1) / self.noise_px**2) / self.noise_px**2
+        weight = self.trust / (self.noise_px**2 + np.sum(residual**2, axis=1))
         information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
         gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
         information[6:, 6:] += np.diag(1.0 / self.prior_sigma**2)

@@ -8,7 +8,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
-from reloc.jacobians import intrinsics_jacobian, pixel_jacobians
+from reloc.jacobians import pixel_jacobians
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose, reprojection_errors
 from tests.support.scenes import CAMERA, box_points, looking_at, pixels_inside
@@ -185,25 +185,6 @@ def test_jacobians_against_the_perturbation_they_promise(camera: Camera) -> None
             camera.project(POSE.act(points + offset)) - camera.project(POSE.act(points - offset))
         ) / 2e-5
         np.testing.assert_allclose(by_point[:, :, axis], expected, rtol=1e-4, atol=1e-3)
-
-
-def test_intrinsics_jacobian_is_the_closed_form_of_simple_radial() -> None:
-    in_camera = POSE.act(box_points(np.random.default_rng(2), 20))
-    u, v = in_camera[:, 0] / in_camera[:, 2], in_camera[:, 1] / in_camera[:, 2]
-    r2 = u**2 + v**2
-    focal, _, _, k = CAMERA.params
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    expected = np.stack(
-        [
-            np.stack([u * (1 + k * r2), v * (1 + k * r2)], axis=1),
-            np.stack([one, zero], axis=1),
-            np.stack([zero, one], axis=1),
-            np.stack([focal * u * r2, focal * v * r2], axis=1),
-        ],
-        axis=2,
-    )
-    found = intrinsics_jacobian(CAMERA, in_camera, np.array([0.1, 0.1, 0.1, 1e-4]))
-    np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
 
 
 def normalised_squared_error(found: Rigid3, covariance: np.ndarray) -> float:
