@@ -1,0 +1,212 @@
+"""`featuredb demo`: the whole line on a simulated town, with the truth beside every answer.
+
+World -> ingest -> Zenoh server -> client -> table of errors; no photos of yours and no network needed.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from featuredb.errors import FeatureDbError
+
+if TYPE_CHECKING:
+    from featuredb.simworld.scoring import PoseError
+    from featuredb.simworld.world import World
+    from ingest.report import IngestReport
+    from reloc.client import Client
+    from reloc.wire import LocaliseReply
+
+Say = Callable[[str], None]
+# What the simulated drone's tags are good for: exact ones are rounded by EXIF to about a millimetre, which
+# stands for a survey-grade receiver; the others are a consumer drone's, as EXIF suggests by itself.
+_EXACT_SIGMA_M = 0.02
+
+
+def register(subparsers: Any) -> None:
+    """Add `demo` to the parser of `featuredb`."""
+    demo = subparsers.add_parser(
+        "demo",
+        help="the whole line on a simulated town",
+        description="Make a simulated town with photos, ingest the drone's, serve them over Zenoh, ask where "
+        "held-out photos were taken, and compare with the truth.",
+    )
+    demo.add_argument("--out", type=Path, default=Path("featuredb-demo"), help="default: ./featuredb-demo")
+    demo.add_argument("--size", choices=("short", "full"), default="short", help="default: short")
+    demo.add_argument("--seed", type=int, default=1, help="of the town and of everything in it")
+    demo.add_argument(
+        "--gps",
+        choices=("exact", "realistic"),
+        default="exact",
+        help="position tags of the drone's photos: survey-grade, or metres off like a consumer drone's",
+    )
+    demo.set_defaults(run=_run)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """One query and what came of it.
+
+    Attributes:
+        group: drone, street, or the kind of negative.
+        error: None where not localised, or where there is no truth (negatives).
+    """
+
+    group: str
+    name: str
+    reply: "LocaliseReply"
+    error: "PoseError | None"
+    wall_ms: float
+
+
+def _run(args: argparse.Namespace) -> int:
+    def say(line: str) -> None:
+        sys.stdout.write(line + "\n")
+        sys.stdout.flush()
+
+    answers = run_demo(args.out, size=args.size, seed=args.seed, exact_gps=args.gps == "exact", say=say)
+    return 0 if demo_holds(answers) else 1
+
+
+def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[Answer]:
+    """Everything, into `out`: world/, db/, report/, overlay.png. Returns all answers.
+
+    Raises:
+        FeatureDbError: a step could not be done.
+    """
+    from featuredb.store import Database
+    from reloc.client import Client
+    from reloc.service.options import ServeOptions
+    from reloc.service.serve import start_server
+
+    start = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    world = make_world(out / "world", size=size, seed=seed, exact_gps=exact_gps)
+    _tell(say, start, f"simulated town: {len(world.images('drone'))} drone photos in {world.folder}")
+    database = Database.create(out / "db")
+    report = ingest_world(world, database, out / "report", exact_gps=exact_gps)
+    made = next((m for m in report.maps if m.status != "refused"), None)
+    if made is None:
+        raise FeatureDbError(
+            "demo: no map came of the drone photos: " + "; ".join(m.reason for m in report.maps)
+        )
+    _tell(
+        say,
+        start,
+        f"map: {made.photos} photos, {made.points} points; {out / 'report' / 'report.html'}",
+    )
+    with (
+        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
+        Client(server.endpoints[0]) as client,
+    ):
+        answers = ask_all(world, client)
+        _write_overlay(out / "overlay.png", world, client, answers)
+    _tell(say, start, f"{len(answers)} photos asked over Zenoh; {out / 'overlay.png'}")
+    say("")
+    say(table(answers))
+    return answers
+
+
+def make_world(folder: Path, *, size: str, seed: int, exact_gps: bool) -> "World":
+    """The world in `folder`, made unless it is there already."""
+    from featuredb.simworld.world import WorldOptions, open_world, write_world
+
+    if (folder / "truth.json").exists():
+        return open_world(folder)
+    options = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
+    if exact_gps:
+        options = replace(options, flight=replace(options.flight, gps_error="none"))
+    return write_world(folder, options)
+
+
+def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gps: bool) -> "IngestReport":
+    """Ingest the drone photos and write the report."""
+    from ingest.map_builder import MapOptions
+    from ingest.pipeline import IngestOptions, ingest_photos
+    from ingest.reconstruction import MapMakingOptions
+    from ingest.report import write_report
+
+    options = IngestOptions(
+        gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
+        making=MapMakingOptions(maps=MapOptions(height_datum="ellipsoidal")),
+    )
+    report = ingest_photos(database, world.folder / "drone", options)
+    write_report(report_folder, report)
+    return report
+
+
+def ask_all(world: "World", client: "Client") -> list[Answer]:
+    """Held-out drone photos, street photos and negatives, each as a client would ask."""
+    answers = [_ask(world, client, "drone", path, has_truth=True) for path in world.images("queries")]
+    answers += [_ask(world, client, "street", path, has_truth=True) for path in world.images("street")]
+    for path in world.negatives():
+        answers.append(_ask(world, client, path.parent.name, path, has_truth=False))
+    return answers
+
+
+def _ask(world: "World", client: "Client", group: str, path: Path, *, has_truth: bool) -> Answer:
+    from featuredb.simworld.scoring import pose_error
+
+    start = time.perf_counter()
+    reply = client.localise(path, timeout_s=60.0)
+    wall_ms = 1000.0 * (time.perf_counter() - start)
+    error = None
+    if has_truth and reply.utm is not None:
+        name = path.relative_to(world.folder).as_posix()
+        place = (reply.utm.easting, reply.utm.northing, reply.utm.height)
+        error = pose_error(world.truth, name, reply.utm.epsg, place, reply.utm.cam_from_utm_xyzw)
+    return Answer(group=group, name=path.name, reply=reply, error=error, wall_ms=wall_ms)
+
+
+def table(answers: Sequence[Answer]) -> str:
+    """Errors by group, as text."""
+    from featuredb.simworld.scoring import summarise
+
+    head = (
+        f"{'photos':<10}{'asked':>6}{'answered':>10}{'position m':>20}{'angle deg':>18}{'wrong':>7}{'ms':>7}"
+    )
+    lines = [head, f"{'':<26}{'median   95 %':>20}{'median   95 %':>18}{'> 5 m':>7}{'median':>7}"]
+    for group in dict.fromkeys(answer.group for answer in answers):
+        mine = [answer for answer in answers if answer.group == group]
+        answered = sum(a.reply.status == "localised" for a in mine)
+        errors = [a.error for a in mine]
+        wall = sorted(a.wall_ms for a in mine)[len(mine) // 2]
+        if group in ("drone", "street"):
+            s = summarise(errors)
+            figures = "".join(
+                f"{'-':>{w}}" if s.localised == 0 else f"{m:>{w - 9}.3f}{p:>9.3f}"
+                for (m, p), w in ((s.position_m, 20), (s.angle_deg, 18))
+            )
+            wrong = s.wrong
+        else:
+            figures, wrong = f"{'no true place':>38}", answered
+        lines.append(f"{group:<10}{len(mine):>6}{answered:>10}{figures}{wrong:>7}{wall:>7.0f}")
+    return "\n".join(lines)
+
+
+def demo_holds(answers: Sequence[Answer]) -> bool:
+    """Whether most drone photos were answered and nothing was answered wrongly."""
+    drone = [a for a in answers if a.group == "drone"]
+    found = sum(a.error is not None for a in drone)
+    wrong = sum(a.error is not None and a.error.position_m > 5.0 for a in answers)
+    invented = sum(a.reply.status == "localised" for a in answers if a.group not in ("drone", "street"))
+    return found >= 0.8 * len(drone) and wrong == 0 and invented == 0
+
+
+def _write_overlay(path: Path, world: "World", client: "Client", answers: Sequence[Answer]) -> None:
+    """The first answered drone photo with the map drawn on it."""
+    from reloc.overlay import write_overlay
+
+    answered = {a.name for a in answers if a.group == "drone" and a.error is not None}
+    for photo in world.images("queries"):
+        if photo.name in answered:
+            data = photo.read_bytes()
+            write_overlay(path, data, client.localise(data, inliers=True, timeout_s=60.0))
+            return
+
+
+def _tell(say: Say, start: float, text: str) -> None:
+    say(f"[{time.monotonic() - start:5.0f} s] {text}")
