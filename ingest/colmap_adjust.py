@@ -28,6 +28,7 @@ class AdjustOptions:
     """The final adjustment.
 
     Attributes:
+        refine_focal: False keeps the focal lengths, and with them the lens model.
         fuller_lens: try OPENCV for cameras with enough photos.
         min_photos_of_camera: below, eight parameters of a lens are not told from the scene's shape.
         evidence_ratio: how many times the information criterion's penalty the gain must be. Real gains are
@@ -38,6 +39,7 @@ class AdjustOptions:
         threads: one gives the same numbers in every run.
     """
 
+    refine_focal: bool = True
     fuller_lens: bool = True
     min_photos_of_camera: int = 8
     evidence_ratio: float = 5.0
@@ -70,7 +72,8 @@ def _adjusted(
     loss_scale_px: float,
     options: AdjustOptions,
 ) -> Any:
-    fuller = _cameras_to_free(reconstruction, options) if options.fuller_lens else []
+    free = options.fuller_lens and options.refine_focal
+    fuller = _cameras_to_free(reconstruction, options) if free else []
     before = _residuals(reconstruction)
     if fuller and len(before):
         trial = pycolmap.Reconstruction(str(folder))
@@ -130,6 +133,7 @@ def _bundle(
 ) -> None:
     settings = pycolmap.BundleAdjustmentOptions()
     settings.print_summary = False
+    settings.refine_focal_length = options.refine_focal
     settings.refine_principal_point = bool(free_center)
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     settings.ceres.loss_function_scale = loss_scale_px

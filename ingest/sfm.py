@@ -3,7 +3,7 @@
 import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -109,7 +109,8 @@ def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -
         run_incremental(database, Path(scratch), folder, _settings(options, side), on_photo)
         # A SIFT keypoint is good to about half a pixel of the image that it was found on.
         scale_px = 0.5 * max(1.0, side / options.error_reference_side_px)
-        adjust_models(folder, database, task.photos, scale_px, options.adjust)
+        adjust = replace(options.adjust, refine_focal=options.adjust.refine_focal and options.refine_focal)
+        adjust_models(folder, database, task.photos, scale_px, adjust)
 
 
 def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:

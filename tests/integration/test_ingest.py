@@ -1,5 +1,6 @@
 """Ingest of photos end to end, against the truth of rendered hills."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from featuredb.store import Database
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
+from ingest.sfm import SfmOptions
 from tests.support.hill_photos import FRAME, HillPhoto, hill_height, write_hill_photos
 
 _EXTRACTOR = ExtractorOptions(max_features=1500)
@@ -121,3 +123,12 @@ def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
     assert report.verified_pairs == 0
     assert {p.reason_code for p in report.photos} == {"no_matches"}
     assert "overlap" in report.warnings[0]
+
+
+def test_a_kept_focal_length_is_that_of_exif(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+    making = MapMakingOptions(extractor=_EXTRACTOR, sfm=SfmOptions(refine_focal=False))
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making))
+    (camera,) = report.maps[0].cameras
+    assert camera.focal_before_px == camera.focal_after_px
+    assert report.count("registered") == 9
