@@ -89,7 +89,7 @@ def reconstruct(
         with atomic_folder(folder) as temporary:
             _map(task, temporary, options, progress)
     progress("reconstruct", len(task.photos), len(task.photos))
-    return _disjoint(read_models(folder), options.min_model_photos)
+    return disjoint(read_models(folder), options.min_model_photos)
 
 
 def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -> None:
@@ -106,14 +106,14 @@ def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -
     with tempfile.TemporaryDirectory(prefix="featuredb-sfm-") as scratch:
         database = Path(scratch) / "colmap.db"
         write_database(database, task.cameras, task.photos, task.geometries)
-        run_incremental(database, Path(scratch), folder, _settings(options, side), on_photo)
+        run_incremental(database, Path(scratch), folder, mapping_settings(options, side), on_photo)
         # A SIFT keypoint is good to about half a pixel of the image that it was found on.
         scale_px = 0.5 * max(1.0, side / options.error_reference_side_px)
         adjust = replace(options.adjust, refine_focal=options.adjust.refine_focal and options.refine_focal)
         adjust_models(folder, database, task.photos, scale_px, adjust)
 
 
-def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
+def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
     """COLMAP's settings; thresholds in pixels grow with the image, since keypoints' errors do."""
     zoom = max(1.0, side_px / options.error_reference_side_px)
     return {
@@ -134,7 +134,7 @@ def _settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
     }
 
 
-def _disjoint(models: Sequence[Model], min_photos: int) -> list[Model]:
+def disjoint(models: Sequence[Model], min_photos: int) -> list[Model]:
     """Large models first; a later model keeps out if it shares photos with an earlier one.
 
     COLMAP may grow a second model into photos of the first. Two maps with the same photos would agree

@@ -132,3 +132,11 @@ def test_a_kept_focal_length_is_that_of_exif(hills: tuple[Path, list[HillPhoto]]
     (camera,) = report.maps[0].cameras
     assert camera.focal_before_px == camera.focal_after_px
     assert report.count("registered") == 9
+
+
+def test_a_map_without_a_good_point_is_refused(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+    making = MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(max_sigma_over_distance=1e-9))
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making))
+    assert [(m.status, m.reason_code) for m in report.maps] == [("refused", "NO_POINTS")]
+    assert not database.snapshot().maps()

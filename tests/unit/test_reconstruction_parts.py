@@ -1,0 +1,109 @@
+"""Cameras of photos, local frames, settings of structure from motion, and which models are kept."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import GeoPrior
+from ingest.colmap_bridge import Model, SfmPhoto
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.photo import Photo
+from ingest.reconstruction import MapMakingOptions, local_frame_of, photo_cameras
+from ingest.sfm import SfmOptions, SfmTask, disjoint, mapping_settings
+from tests.support.planar_map import CAMERA
+
+_PHOTO = Photo(
+    name="a.jpg", path=Path("a.jpg"), width=4000, height=3000, camera_key="dji", focal_px=2800.0, sha256="aa"
+)
+
+
+def test_photos_of_one_camera_share_intrinsics() -> None:
+    other = replace(_PHOTO, name="c.jpg", camera_key="phone", focal_px=None, width=3000, height=4000)
+    photos = [_PHOTO, replace(_PHOTO, name="b.jpg"), other]
+    cameras, rows = photo_cameras(photos, MapMakingOptions())
+    assert rows == [0, 0, 1]
+    assert [(c.width, c.height, c.focal_px, known) for c, known in cameras] == [
+        (4000, 3000, 2800.0, True),
+        (3000, 4000, pytest.approx(4800.0), False),
+    ]
+    _, rows = photo_cameras(photos, MapMakingOptions(cameras="per-image"))
+    assert rows == [0, 1, 2]
+
+
+def test_photos_that_name_no_camera_share_with_none() -> None:
+    photos = [replace(_PHOTO, name=n, camera_key="") for n in ("a", "b")]
+    assert photo_cameras(photos, MapMakingOptions())[1] == [0, 1]
+
+
+def _at(latitude: float, longitude: float, height: float | None) -> Photo:
+    prior = GeoPrior(
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        height_m=height,
+        sigma_horizontal_m=3.0,
+        sigma_vertical_m=5.0,
+    )
+    return replace(_PHOTO, gps=prior)
+
+
+def test_a_stray_position_does_not_move_the_frame() -> None:
+    photos = [_at(48.99 + 1e-4 * k, 8.41, 200.0 + k) for k in range(5)] + [_at(-33.0, 151.0, 9000.0)]
+    frame = local_frame_of(photos)
+    assert frame is not None
+    assert frame.latitude_deg == pytest.approx(48.99, abs=1e-3)
+    assert frame.longitude_deg == pytest.approx(8.41, abs=1e-3)
+    assert frame.height_m == pytest.approx(202.0, abs=3.0)
+    assert local_frame_of([_PHOTO]) is None
+
+
+def _model(rows: list[int]) -> Model:
+    count = len(rows)
+    return Model(
+        cameras=(CAMERA,),
+        rows=np.array(rows),
+        camera_of=np.zeros(count, np.int64),
+        cam_from_sfm=tuple(Rigid3.identity() for _ in rows),
+        xyz=np.zeros((0, 3)),
+        point_of=np.zeros(0, np.int64),
+        photo_of=np.zeros(0, np.int64),
+        keypoint_of=np.zeros(0, np.int64),
+    )
+
+
+def test_small_and_overlapping_models_are_dropped() -> None:
+    models = [_model([0, 1, 2, 3]), _model([3, 4, 5]), _model([6, 7, 8]), _model([9, 10])]
+    assert [m.rows.tolist() for m in disjoint(models, 3)] == [[0, 1, 2, 3], [6, 7, 8]]
+    assert [m.rows.tolist() for m in disjoint(models, 2)] == [[0, 1, 2, 3], [6, 7, 8], [9, 10]]
+
+
+def test_pixel_thresholds_grow_with_the_image() -> None:
+    small = mapping_settings(SfmOptions(), 800)
+    large = mapping_settings(SfmOptions(), 4000)
+    for name in ("mapper.filter_max_reproj_error", "mapper.init_max_error", "mapper.abs_pose_max_error"):
+        assert large[name] == pytest.approx(2.5 * small[name])
+    assert mapping_settings(SfmOptions(refine_focal=False), 800)["ba_refine_focal_length"] is False
+
+
+def test_keys_follow_the_content() -> None:
+    photo = SfmPhoto(name="a.jpg", camera_row=0, keypoints=np.zeros((3, 2), np.float32))
+    task = SfmTask(cameras=((CAMERA, True),), photos=(photo,), geometries={})
+    moved = replace(photo, keypoints=photo.keypoints + np.float32(1))
+    placed = replace(photo, prior_position=np.zeros(3), prior_covariance=np.eye(3))
+    keys = {
+        task.key(SfmOptions()),
+        task.key(SfmOptions(seed=1)),
+        replace(task, photos=(moved,)).key(SfmOptions()),
+        replace(task, photos=(placed,)).key(SfmOptions()),
+    }
+    assert len(keys) == 4
+    assert task.key(SfmOptions()) == replace(task, photos=(replace(photo),)).key(SfmOptions())
+
+
+def test_fingerprints_tell_options_apart_and_digests_do_not_run_together() -> None:
+    assert options_fingerprint(SfmOptions()) == options_fingerprint(SfmOptions())
+    assert options_fingerprint(SfmOptions()) != options_fingerprint(SfmOptions(seed=2))
+    assert MapMakingOptions().fingerprint != MapMakingOptions(cameras="per-image").fingerprint
+    assert digest("ab", "c") != digest("a", "bc")
