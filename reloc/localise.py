@@ -353,11 +353,12 @@ def _runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
             )
             apart_m += 3.0 * float(np.sqrt(np.linalg.eigvalsh(placed[3:, 3:])[-1]))
             apart_deg += 3.0 * float(np.degrees(np.sqrt(np.linalg.eigvalsh(placed[:3, :3])[-1])))
-        if other.evidence.inliers and (distance_m > apart_m or angle_deg > apart_deg):
+        inliers = _support_beside(best, other)
+        if inliers and (distance_m > apart_m or angle_deg > apart_deg):
             lat, lon, _ = best.area.frame.geodetic_from_enu(pose.center)
             found.append(
                 RunnerUp(
-                    inliers=other.evidence.inliers,
+                    inliers=inliers,
                     distance_m=distance_m,
                     angle_deg=angle_deg,
                     latitude_deg=float(lat),
@@ -365,6 +366,24 @@ def _runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
                 )
             )
     return max(found, key=lambda rival: rival.inliers, default=None)
+
+
+def _support_beside(best: Candidate, other: Candidate) -> int:
+    """Inliers of the other pose that are not inliers of the best one as well.
+
+    Where a photo leaves the pose soft, as a flat place does with an unknown lens, a second estimate comes to
+    lie metres away on the very same matches: it speaks of the covariance, not of another place.
+    """
+    if best.area is not other.area:
+        return other.evidence.inliers
+    shared = np.isin(_pair_numbers(other), _pair_numbers(best))
+    return int(np.count_nonzero(~shared))
+
+
+def _pair_numbers(candidate: Candidate) -> NDArray[np.int64]:
+    """One number for each inlier's pair of feature and point."""
+    matches, rows = candidate.matches, candidate.rows
+    return matches.feature[rows] * len(candidate.area.points) + matches.point[rows]
 
 
 def _in_frame_of(area: Area, candidate: Candidate) -> Rigid3:

@@ -51,7 +51,7 @@ class PoseHypothesis:
 def estimate_pose(
     pixels: FloatArray, points: FloatArray, camera: Camera, source: CameraSource, options: PoseOptions
 ) -> PoseHypothesis | None:
-    """LO-RANSAC (poselib's P3P; pycolmap's P4Pf where the focal length is free), or None.
+    """LO-RANSAC (poselib's P3P; pycolmap's P4Pf besides where the focal length is free), or None.
 
     Args:
         pixels: (m, 2) full-size pixels. points: (m, 3) metres in the area's frame.
@@ -60,22 +60,32 @@ def estimate_pose(
     if len(pixels) < options.min_matches:
         return None
     tolerance_px = options.tolerance_rel * max(camera.width, camera.height)
+    tries = [_ransac(pixels, points, guess, tolerance_px, options) for guess in _guesses(camera, source)]
     if source in ("exif", "estimated"):
-        found = _ransac_focal(pixels, points, camera, tolerance_px, options)
-    else:
-        found = _ransac(pixels, points, camera, tolerance_px, options)
-    if found is None:
-        return None
-    prior_focal_px = camera.focal_px
-    cam_from_local, camera = found
-    residual = reprojection_errors(pixels, points, camera, cam_from_local)
-    return PoseHypothesis(
-        cam_from_local=cam_from_local,
-        camera=camera,
-        camera_source=source,
-        inliers=residual < tolerance_px,
-        prior_focal_px=prior_focal_px,
-    )
+        tries.append(_ransac_focal(pixels, points, camera, tolerance_px, options))
+    found = [
+        PoseHypothesis(
+            cam_from_local=cam_from_local,
+            camera=lens,
+            camera_source=source,
+            inliers=reprojection_errors(pixels, points, lens, cam_from_local) < tolerance_px,
+            prior_focal_px=camera.focal_px,
+        )
+        for cam_from_local, lens in (found for found in tries if found is not None)
+    ]
+    return max(found, key=lambda pose: pose.count, default=None)
+
+
+def _guesses(camera: Camera, source: CameraSource) -> list[Camera]:
+    """Lenses that are tried as if they were known.
+
+    The focal length of a minimal sample is arbitrary where the scene is flat and seen from above; there any
+    focal length fits, and the refinement goes on from the guess.
+    """
+    factors = {"exif": (1.0, 0.87, 1.15), "estimated": (1.0, 0.5, 0.7, 1.4, 2.0)}
+    return [
+        camera if f == 1.0 else camera.with_focal(f * camera.focal_px) for f in factors.get(source, (1.0,))
+    ]
 
 
 def _ransac(
