@@ -1,0 +1,333 @@
+"""Photos of a rendered field, localised in maps whose truth is known: errors in metres, and refusals."""
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError, MapNotFoundError
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import build_area
+from featuredb.index.descriptor_index import build_index
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.store import Database
+from reloc.candidates import IndexedArea
+from reloc.localise import localise
+from reloc.localiser import Localiser
+from reloc.options import LocaliseOptions
+from reloc.result import LocaliseRequest, LocaliseResult
+from tests.support import planar_map as field
+from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, field_texture, render, view
+
+KNOWN = LocaliseRequest(camera=CAMERA)
+POSE = view(5.0, -6.0, 40.0, 8.0, 33.0)
+
+
+@pytest.fixture(scope="module")
+def field_map() -> FeatureMap:
+    return field.planar_map(map_id="field")
+
+
+@pytest.fixture(scope="module")
+def area(field_map: FeatureMap) -> IndexedArea:
+    return indexed(field_map)
+
+
+@pytest.fixture(scope="module")
+def texture() -> NDArray[np.uint8]:
+    return field_texture(1)
+
+
+@pytest.fixture(scope="module")
+def photo(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return render(texture, POSE, seed=99)
+
+
+def indexed(*maps: FeatureMap) -> IndexedArea:
+    made = build_area(maps)
+    return IndexedArea(area=made, index=build_index(made.descriptors))
+
+
+def moved(feature_map: FeatureMap, map_id: str, east_m: float, sigma_m: float = 0.01) -> FeatureMap:
+    """The same content, placed elsewhere, with that uncertainty."""
+    frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
+    points = feature_map.points
+    local = feature_map.points_local()
+    return replace(
+        feature_map,
+        map_id=map_id,
+        frame=frame,
+        points=replace(points, utm=frame.utm_from_enu(local, EPSG)),
+        placement=replace(feature_map.placement, covariance=np.diag([1e-10] * 4 + [sigma_m**2] * 3)),
+    )
+
+
+def pose_errors(result: LocaliseResult, truth: Rigid3) -> tuple[float, float]:
+    """Metres and degrees, in the frame that the map was made in."""
+    assert result.pose is not None, (result.reason, result.detail)
+    frame = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
+    found = result.pose.cam_from_local @ result.pose.frame.enu_from(frame)
+    return float(np.linalg.norm(found.center - truth.center)), found.angle_to_deg(truth)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [POSE, view(-8, 9, 35, 0, 0), view(0, 0, 55, 20, 250), view(10, 10, 42, 15, 120)],
+)
+def test_a_known_camera_within_centimetres(
+    area: IndexedArea, texture: NDArray[np.uint8], truth: Rigid3
+) -> None:
+    result = localise(render(texture, truth, seed=5), KNOWN, [area])
+    position_m, angle_deg = pose_errors(result, truth)
+    assert position_m < 0.05
+    assert angle_deg < 0.05
+    assert result.reason is None
+    assert result.confidence > 0.95
+    assert result.inliers > 200
+    pose = result.pose
+    assert pose is not None
+    np.testing.assert_allclose(pose.utm, area.area.frame.utm_from_enu(truth.center, EPSG), atol=0.05)
+    assert pose.camera_source == "request"
+    assert pose.horizontal_68_m < 0.1
+
+
+@pytest.mark.parametrize(
+    "request_", [LocaliseRequest(), LocaliseRequest(exif_focal_px=560.0)], ids=["unknown", "exif"]
+)
+@pytest.mark.parametrize("kind", ["plain", "upside down", "zoomed", "blurred"])
+def test_an_unknown_lens_over_a_flat_field(
+    area: IndexedArea, photo: NDArray[np.uint8], request_: LocaliseRequest, kind: str
+) -> None:
+    """Flat and nearly from above: the error may be metres in height, and the answer says so."""
+    image, truth, focal = photo, POSE, 600.0
+    if kind == "upside down":
+        image = photo[::-1, ::-1]
+        truth = Rigid3.exp([0, 0, np.pi, 0, 0, 0]) @ POSE
+    elif kind == "zoomed":
+        if request_.exif_focal_px:
+            request_ = replace(request_, exif_focal_px=2 * request_.exif_focal_px)
+        image, focal = cv2.resize(photo[120:360, 160:480], (640, 480), interpolation=cv2.INTER_CUBIC), 1200.0
+    elif kind == "blurred":
+        image = cv2.GaussianBlur(photo, (0, 0), 2.0)
+    result = localise(np.ascontiguousarray(image), request_, [area])
+    pose_m, angle_deg = pose_errors(result, truth)
+    pose = result.pose
+    assert pose is not None
+    allowed_m = 3.0 * np.hypot(pose.horizontal_68_m, pose.vertical_68_m)
+    assert pose_m < max(allowed_m, 0.05)
+    assert angle_deg < max(3.0 * pose.orientation_68_deg, 0.05)
+    assert pose.vertical_68_m < 6.0
+    assert pose.camera.focal_px == pytest.approx(focal, rel=0.2)
+    assert pose.camera_source == ("exif" if request_.exif_focal_px else "estimated")
+
+
+def test_the_camera_of_the_map_is_borrowed_by_its_key(
+    field_map: FeatureMap, photo: NDArray[np.uint8]
+) -> None:
+    area = indexed(replace(field_map, camera_keys=("DJI",)))
+    result = localise(photo, LocaliseRequest(camera_key="DJI", exif_focal_px=400.0), [area])
+    assert result.pose is not None
+    assert (result.pose.camera, result.pose.camera_source) == (CAMERA, "map")
+    assert pose_errors(result, POSE)[0] < 0.05
+    # Of another size it is another picture; so is another key.
+    half = cv2.resize(photo, (320, 240), interpolation=cv2.INTER_AREA)
+    for image, key in ((half, "DJI"), (photo, "GoPro")):
+        result = localise(image, LocaliseRequest(camera_key=key), [area])
+        assert result.pose is None or result.pose.camera_source == "estimated"
+
+
+@pytest.mark.parametrize("request_", [KNOWN, LocaliseRequest()], ids=["known", "unknown"])
+@pytest.mark.parametrize("kind", ["mirrored", "flipped", "other field", "noise", "negative"])
+def test_what_is_no_photo_of_the_field_is_refused(
+    area: IndexedArea, photo: NDArray[np.uint8], kind: str, request_: LocaliseRequest
+) -> None:
+    image = {
+        "mirrored": photo[:, ::-1],
+        "flipped": photo[::-1],
+        "other field": render(field_texture(77), POSE, seed=3),
+        "noise": np.random.default_rng(0).integers(0, 256, photo.shape, dtype=np.uint8),
+        "negative": 255 - photo,
+    }[kind]
+    result = localise(np.ascontiguousarray(image), request_, [area])
+    assert result.pose is None
+    assert result.reason in ("TOO_FEW_INLIERS", "TOO_FEW_MATCHES")
+    assert result.confidence == 0.0
+
+
+def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
+    result = localise(np.full((480, 640), 90, np.uint8), KNOWN, [area])
+    assert result.reason == "TOO_FEW_FEATURES"
+    assert (result.features, result.matches, result.inliers) == (0, 0, 0)
+
+
+def test_no_maps_and_a_prior_far_away_are_no_coverage(area: IndexedArea, photo: NDArray[np.uint8]) -> None:
+    assert localise(photo, KNOWN, []).reason == "NO_COVERAGE"
+    far = replace(KNOWN, prior=prior_at(area, 5000.0))
+    assert localise(photo, far, [area]).reason == "NO_COVERAGE"
+
+
+def prior_at(area: IndexedArea, east_m: float) -> GeoPrior:
+    lat, lon, _ = area.area.frame.geodetic_from_enu(POSE.center + np.array([east_m, 0.0, 0.0]))
+    return GeoPrior(
+        latitude_deg=float(lat),
+        longitude_deg=float(lon),
+        height_m=None,
+        sigma_horizontal_m=5.0,
+        sigma_vertical_m=10.0,
+    )
+
+
+@pytest.mark.parametrize(("east_m", "reason"), [(0.0, None), (15.0, None), (40.0, "CONTRADICTS_PRIOR")])
+def test_a_prior_is_held_against_the_pose(
+    area: IndexedArea, photo: NDArray[np.uint8], east_m: float, reason: str | None
+) -> None:
+    result = localise(photo, replace(KNOWN, prior=prior_at(area, east_m)), [area])
+    assert result.reason == reason
+    assert (result.pose is None) == (reason is not None)
+    assert result.inliers > 200  # the evidence is told either way
+
+
+@pytest.mark.parametrize("apart_m", [150.0, 3000.0])
+@pytest.mark.parametrize("one_area", [True, False])
+def test_a_place_that_exists_twice_is_ambiguous(
+    field_map: FeatureMap, photo: NDArray[np.uint8], apart_m: float, one_area: bool
+) -> None:
+    twin = moved(field_map, "twin", apart_m)
+    areas = [indexed(field_map, twin)] if one_area else [indexed(field_map), indexed(twin)]
+    for order in (areas, areas[::-1]):
+        result = localise(photo, KNOWN, order)
+        assert result.reason == "AMBIGUOUS"
+        assert result.runner_up is not None
+        assert result.runner_up.distance_m == pytest.approx(apart_m, rel=2e-3)
+        assert result.runner_up.inliers > 200
+    # A prior tells them apart where they are far enough from each other.
+    if apart_m > 1000:
+        told = localise(photo, replace(KNOWN, prior=prior_at(indexed(field_map), 0.0)), areas)
+        assert told.reason is None
+        assert pose_errors(told, POSE)[0] < 0.05
+
+
+@pytest.mark.parametrize(("sigma_m", "reason"), [(2.0, None), (0.01, "AMBIGUOUS")])
+def test_two_maps_of_one_place_that_gps_put_metres_apart(
+    field_map: FeatureMap, photo: NDArray[np.uint8], sigma_m: float, reason: str | None
+) -> None:
+    """With honest uncertainties they are one place; were they exact, they would be two."""
+    maps = moved(field_map, "one", 0.0, sigma_m), moved(field_map, "two", 4.0, sigma_m)
+    result = localise(photo, KNOWN, [indexed(*maps)])
+    assert result.reason == reason
+    if reason is None:
+        position_m, angle_deg = pose_errors(result, POSE)
+        assert min(position_m, abs(position_m - 4.0)) < 0.05
+        assert angle_deg < 0.05
+        assert result.pose is not None
+        assert result.pose.horizontal_68_m == pytest.approx(1.51 * sigma_m, rel=0.05)
+
+
+def half_turned(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    return ((texture.astype(int) + texture[::-1, ::-1]) // 2).astype(np.uint8)
+
+
+def periodic(texture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A pattern that comes back every 12 m."""
+    return np.tile(texture[:150, :150], (10, 10))
+
+
+@pytest.mark.parametrize("pattern", [half_turned, periodic])
+@pytest.mark.parametrize("request_", [KNOWN, LocaliseRequest()], ids=["known", "unknown"])
+def test_a_pattern_that_fits_itself_is_never_answered_wrongly(
+    monkeypatch: pytest.MonkeyPatch, texture: NDArray[np.uint8], pattern: object, request_: LocaliseRequest
+) -> None:
+    made = pattern(texture)  # type: ignore[operator]
+    monkeypatch.setattr(field, "field_texture", lambda seed: made)
+    area = indexed(field.planar_map())
+    result = localise(render(made, POSE, seed=9), request_, [area])
+    assert result.reason == "AMBIGUOUS"
+
+
+def test_what_cannot_be_compared_or_used_raises(area: IndexedArea, photo: NDArray[np.uint8]) -> None:
+    upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
+    with pytest.raises(IncompatibleExtractorError, match="same extractor options"):
+        localise(photo, KNOWN, [area], upright)
+    for image in (np.zeros((1, 3000), np.uint8), photo.astype(np.float32), np.zeros((480, 640, 3), np.uint8)):
+        with pytest.raises(ImageError):
+            localise(image, KNOWN, [area])
+    other = Camera(model="PINHOLE", width=1280, height=960, params=(1200.0, 1200.0, 640.0, 480.0))
+    with pytest.raises(InvalidValueError, match="scaled_to"):
+        localise(photo, LocaliseRequest(camera=other), [area])
+
+
+def test_the_timings_add_up_and_the_inliers_reproject(area: IndexedArea, photo: NDArray[np.uint8]) -> None:
+    before = time.perf_counter()
+    result = localise(photo, replace(KNOWN, want_inliers=True), [area], snapshot=7)
+    wall_ms = 1000 * (time.perf_counter() - before)
+    assert result.snapshot == 7
+    assert next(iter(result.timings_ms)) == "features"
+    assert 0.95 * wall_ms - 10.0 < sum(result.timings_ms.values()) <= wall_ms
+    assert result.pose is not None
+    inliers = result.pose.inliers
+    assert inliers is not None
+    local = area.area.frame.enu_from_utm(inliers.points_utm, EPSG)
+    gap = np.linalg.norm(CAMERA.project(POSE.act(local)) - inliers.pixels, axis=1)
+    assert len(gap) == result.inliers
+    assert np.median(gap) < 0.5
+    assert gap.max() < 3.0
+
+
+def test_threads_share_the_areas(area: IndexedArea, texture: NDArray[np.uint8]) -> None:
+    photos = [render(texture, view(e, -5.0, 42.0, 10.0, 20.0 * e), seed=e) for e in range(6)]
+    requests = [KNOWN if i % 2 else LocaliseRequest() for i in range(6)]
+    serial = [localise(p, r, [area]) for p, r in zip(photos, requests, strict=True)]
+    with ThreadPoolExecutor(3) as pool:
+        parallel = list(pool.map(lambda p, r: localise(p, r, [area]), photos, requests))
+    for one, other in zip(serial, parallel, strict=True):
+        assert one.pose is not None
+        assert other.pose is not None
+        np.testing.assert_array_equal(one.pose.cam_from_local.matrix(), other.pose.cam_from_local.matrix())
+        np.testing.assert_array_equal(one.pose.covariance, other.pose.covariance)
+
+
+def test_a_database_serves_its_active_maps_only(
+    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
+) -> None:
+    """Retired and quarantined maps answer nothing; unchanged areas are taken over; map_ids restrict."""
+    database = Database.create(str(tmp_path / "db"))
+    far = moved(field_map, "far", 3000.0)
+    elsewhere = replace(moved(field.planar_map(5), "elsewhere", -3000.0), status="active")
+    for feature_map in (field_map, elsewhere, moved(far, "held", 6000.0).with_status("quarantined")):
+        database.commit_map(feature_map)
+    first = Localiser.open(database)
+    assert sorted(m.map_id for a in first.areas for m in a.area.maps) == ["elsewhere", "field"]
+    result = first.localise(photo, KNOWN)
+    assert pose_errors(result, POSE)[0] < 0.05
+    assert result.snapshot == first.snapshot
+    assert first.localise(photo, replace(KNOWN, map_ids=("elsewhere",))).pose is None
+    only = first.localise(photo, replace(KNOWN, map_ids=("field",)))
+    assert only.pose is not None
+    assert only.pose.map_ids == ("field",)
+    for wrong in ("nowhere", "held"):
+        with pytest.raises(MapNotFoundError, match=wrong):
+            first.localise(photo, replace(KNOWN, map_ids=(wrong,)))
+
+    database.commit_map(far)
+    second = Localiser.open(database, previous=first)
+    kept = {id(a) for a in first.areas}
+    assert sum(id(a) in kept for a in second.areas) == 2
+    assert len(second.areas) == 3
+    assert second.localise(photo, KNOWN).reason == "AMBIGUOUS"
+    assert first.localise(photo, KNOWN).reason is None  # a snapshot stays as it was
+
+    database.retire("field", "moved away")
+    third = Localiser.open(database, previous=second)
+    assert sorted(m.map_id for a in third.areas for m in a.area.maps) == ["elsewhere", "far"]
+    assert third.localise(photo, KNOWN).pose is not None
+    upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
+    with pytest.raises(IncompatibleExtractorError, match="start the server"):
+        Localiser.open(database, upright, previous=third).localise(photo, KNOWN)
