@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from featuredb.geometry.arrays import FloatArray
-from reloc.result import Reason
+from reloc.result import Evidence, Reason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,29 +19,14 @@ class AcceptanceOptions:
         min_log_nfa: smallest -log10 of the number of false alarms, see `log_nfa`.
         min_coverage: smallest share of a 10x10 grid over the image that holds inliers.
         rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
+        settled_log_nfa: with that much evidence for a pose, places with far fewer votes are not tried.
     """
 
     min_inliers: int = 15
     min_log_nfa: float = 12.0
     min_coverage: float = 0.05
     rival_share: float = 0.6
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Evidence:
-    """The figures behind a decision.
-
-    Attributes:
-        inliers: matches that agree with the pose.
-        log_nfa: -log10 of the expected number of as good poses among random matches.
-        coverage: share of a 10x10 grid over the image that holds inliers.
-        visible_share: guided inliers over map points that should be visible.
-    """
-
-    inliers: int
-    log_nfa: float
-    coverage: float
-    visible_share: float
+    settled_log_nfa: float = 48.0
 
 
 def log_nfa(matches: int, inliers: int, tolerance_px: float, width: int, height: int, sample: int) -> float:

@@ -18,7 +18,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.acceptance import Evidence, confidence, coverage, independent_inliers, log_nfa, verdict
+from reloc.acceptance import confidence, coverage, independent_inliers, log_nfa, verdict
 from reloc.answer import make_answer, placement_covariance
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import Matches, guided_matches, match_cluster, visible_points
@@ -32,7 +32,7 @@ from reloc.pose import (
     reprojection_errors,
 )
 from reloc.prior import contradicts_prior
-from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
+from reloc.result import Evidence, LocaliseRequest, LocaliseResult, Reason, RunnerUp
 from reloc.stopwatch import Stopwatch
 
 
@@ -139,7 +139,7 @@ def _settled(
 ) -> bool:
     """Whether the remaining clusters need not be tried: a pose is sure, and they have far fewer votes."""
     best = max(candidates, key=lambda c: c.evidence.log_nfa)
-    sure = best.evidence.log_nfa > 4.0 * options.acceptance.min_log_nfa
+    sure = best.evidence.log_nfa > options.acceptance.settled_log_nfa
     return sure and all(other.score < 0.5 * cluster.score for other in rest)
 
 
@@ -295,6 +295,7 @@ def _decide(
             inliers=inliers,
             runner_up=rival,
             snapshot=snapshot,
+            evidence=found.candidates[0].evidence if found.candidates else None,
             timings_ms=watch.timings_ms,
         )
 
@@ -326,6 +327,7 @@ def _decide(
         inliers=best.evidence.inliers,
         runner_up=rival,
         snapshot=snapshot,
+        evidence=best.evidence,
         timings_ms=watch.timings_ms,
     )
 

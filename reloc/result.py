@@ -133,6 +133,23 @@ class RunnerUp:
     longitude_deg: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """The figures behind a decision.
+
+    Attributes:
+        inliers: matches that agree with the pose.
+        log_nfa: -log10 of the expected number of as good poses among random matches.
+        coverage: share of a 10x10 grid over the image that holds inliers.
+        visible_share: guided inliers over map points that should be visible.
+    """
+
+    inliers: int
+    log_nfa: float
+    coverage: float
+    visible_share: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocaliseResult:
     """The answer to one query: a pose, or a reason why there is none. Never a fallback pose.
@@ -146,6 +163,7 @@ class LocaliseResult:
             matches that agree with the best pose (also of a rejected one: evidence).
         runner_up: the best other hypothesis, or None.
         snapshot: version of the database that answered.
+        evidence: for the best pose, believed or not; None where no pose was found at all.
         timings_ms: stage name -> milliseconds, in the order they ran.
     """
 
@@ -158,6 +176,7 @@ class LocaliseResult:
     inliers: int
     runner_up: RunnerUp | None
     snapshot: int
+    evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

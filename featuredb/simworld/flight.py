@@ -111,7 +111,7 @@ def survey(scene: Scene, options: FlightOptions, seed: int) -> list[Shot]:
         stations.append((position, float(np.degrees(np.arctan2(-outward[0], -outward[1]))), -50.0))
     positions = np.array([scene.enu_from_town @ (p + rng.normal(0, [0.9, 0.9, 0.5])) for p, _, _ in stations])
     times = [_START + timedelta(seconds=3.1 * i) for i in range(len(stations))]
-    believed = _gps(positions, 3.1, options.gps_error, rng)
+    believed = received_positions(positions, 3.1, options.gps_error, rng)
     shots = []
     for i, (_, heading, pitch) in enumerate(stations):
         sway = rng.normal(0, [1.8, 1.3, 1.0])
@@ -213,7 +213,9 @@ def survey_half_extent(options: FlightOptions) -> tuple[float, float]:
     return 0.5 * step * options.per_line, 0.5 * between * options.lines
 
 
-def _gps(positions: FloatArray, step_s: float, error: GpsError, rng: np.random.Generator) -> FloatArray:
+def received_positions(
+    positions: FloatArray, step_s: float, error: GpsError, rng: np.random.Generator
+) -> FloatArray:
     """What a receiver says (n, 3): truth, or truth with noise, a wandering bias and a wrong height.
 
     White noise of 0.8 m, a first-order Gauss-Markov bias of 1.2 m with a time constant of 200 s, and a

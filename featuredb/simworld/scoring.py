@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.simworld.truth import Truth
 
@@ -41,16 +43,21 @@ def pose_error(truth: Truth, name: str, epsg: int, utm: ArrayLike, cam_from_utm_
         utm: (3,) easting, northing, ellipsoidal height in the zone `epsg`.
         cam_from_utm_xyzw: (4,) rotation of grid axes into camera axes.
     """
-    true = truth.images[name]
-    center = truth.frame.enu_from_utm(np.asarray(utm, dtype=np.float64), epsg)
-    offset = center - true.cam_from_local.center
-    grid_from_local = truth.frame.grid_from_enu(center, epsg)
-    rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ grid_from_local
+    return pose_difference(truth.frame, truth.images[name].cam_from_local, epsg, utm, cam_from_utm_xyzw)
+
+
+def pose_difference(
+    frame: LocalFrame, cam_from_local: Rigid3, epsg: int, utm: ArrayLike, cam_from_utm_xyzw: ArrayLike
+) -> PoseError:
+    """An answer given in UTM, as in `pose_error`, minus a pose given in a local frame."""
+    center = frame.enu_from_utm(np.asarray(utm, dtype=np.float64), epsg)
+    offset = center - cam_from_local.center
+    rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(center, epsg)
     return PoseError(
         east_m=float(offset[0]),
         north_m=float(offset[1]),
         up_m=float(offset[2]),
-        angle_deg=float(np.degrees(rotation_angle(rotation @ true.cam_from_local.rotation.T))),
+        angle_deg=float(np.degrees(rotation_angle(rotation @ cam_from_local.rotation.T))),
     )
 
 
