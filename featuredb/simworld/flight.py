@@ -152,7 +152,7 @@ def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, widt
                 cam_from_local=look_pose(position, heading, pitch, float(rng.normal(0, 3))),
                 time=_START + timedelta(days=21, seconds=40 * i),
                 seed=_shot_seed(seed, 2, i),
-                gps_enu=_gps(position[None], 1.0, flight.gps_error, rng)[0],
+                gps_enu=received_positions(position[None], 1.0, flight.gps_error, rng)[0],
             )
         )
     return shots
