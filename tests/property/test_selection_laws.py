@@ -20,8 +20,7 @@ def keypoints(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def cells(xy: np.ndarray) -> list[tuple[int, int]]:
     return [
-        (min(int(x / (WIDTH / COLUMNS)), COLUMNS - 1), min(int(y / (HEIGHT / ROWS)), ROWS - 1))
-        for x, y in xy
+        (min(int(x / (WIDTH / COLUMNS)), COLUMNS - 1), min(int(y / (HEIGHT / ROWS)), ROWS - 1)) for x, y in xy
     ]
 
 

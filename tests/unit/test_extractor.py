@@ -24,9 +24,7 @@ def texture(width: int, height: int, seed: int = 0) -> np.ndarray:
     return np.clip(128 + 300 * smooth, 0, 255).astype(np.uint8)
 
 
-@pytest.mark.parametrize(
-    ("factor", "sigma"), [(1.0, 4.0), (1.0, 6.0), (2.0, 8.0), (2.5, 10.0), (3.0, 9.0)]
-)
+@pytest.mark.parametrize(("factor", "sigma"), [(1.0, 4.0), (1.0, 6.0), (2.0, 8.0), (2.5, 10.0), (3.0, 9.0)])
 def test_centres_of_blobs_within_a_twentieth_of_a_pixel(factor: float, sigma: float) -> None:
     """Also when the image is shrunk first: there a forgotten half pixel would be `factor / 2` off."""
     rng = np.random.default_rng(3)
