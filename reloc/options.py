@@ -75,7 +75,7 @@ class LocaliseOptions:
     """All of the localisation's settings."""
 
     extractor: ExtractorOptions = field(
-        default_factory=lambda: ExtractorOptions(max_side_px=1200, max_features=3000)
+        default_factory=lambda: ExtractorOptions(max_side_px=1000, max_features=3000, oversample=1.5)
     )
     candidates: CandidateOptions = field(default_factory=CandidateOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)

@@ -20,8 +20,6 @@ from featuredb.features.selection import spread_strongest
 _DESCRIPTOR_VERSION = "rootsift8-opencv-1"
 _OCTAVE_LAYERS = 3
 _SIGMA = 1.6
-# The spread selection chooses among this many times as many of the strongest keypoints as it keeps.
-_POOL = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,6 +30,8 @@ class ExtractorOptions:
         max_side_px: the image is area-averaged down to this longer side first. SIFT is scale-invariant,
             so maps and queries may differ in it.
         max_features: the strongest, spatially spread, are kept.
+        oversample: the spread selection chooses among this many times as many of the strongest keypoints.
+            All of them are described, since that shares the scale pyramid with their detection.
         contrast_threshold: SIFT's; half of OpenCV's 0.04, so that asphalt and lawn still give keypoints.
         edge_threshold: SIFT's (Lowe's 10).
         upright: angles are set to zero, for image pairs whose rotation is known; more distinctive.
@@ -39,6 +39,7 @@ class ExtractorOptions:
 
     max_side_px: int = 1600
     max_features: int = 6000
+    oversample: float = 2.5
     contrast_threshold: float = 0.02
     edge_threshold: float = 10.0
     upright: bool = False
@@ -52,6 +53,9 @@ class ExtractorOptions:
             raise InvalidValueError(
                 f"ExtractorOptions.max_features: expected 1..1000000, found {self.max_features}"
             )
+
+        if not 1.0 <= self.oversample <= 100.0:
+            raise InvalidValueError(f"ExtractorOptions.oversample: expected 1..100, found {self.oversample}")
 
     @property
     def fingerprint(self) -> str:
@@ -89,7 +93,7 @@ def extract(gray: NDArray[np.uint8], options: ExtractorOptions | None = None) ->
     create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
     sift = create(
         # OpenCV keeps the strongest; describing them in the same pass shares the scale pyramid.
-        nfeatures=0 if options.upright else int(_POOL * options.max_features),
+        nfeatures=0 if options.upright else int(options.oversample * options.max_features),
         nOctaveLayers=_OCTAVE_LAYERS,
         contrastThreshold=options.contrast_threshold,
         edgeThreshold=options.edge_threshold,

@@ -1,5 +1,6 @@
 """What a server may be told."""
 
+import os
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +21,8 @@ class ServeOptions:
         config_path: a Zenoh configuration (JSON5); `listen` is added to it.
         name: the database's name on the wire; "" takes the name of the database's folder.
         workers: queries localised at a time; two fill the reference machine's two cores.
-        threads_per_worker: of OpenCV and BLAS within one query; more than one only pays when there are
-            more cores than workers.
+        threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
+            case of a robot or a phone, is answered soonest; workers that run at once share them.
         max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
             waiting ones are answered within 4 s, half of the deadline.
         max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
@@ -36,7 +37,7 @@ class ServeOptions:
     config_path: Path | None = None
     name: str = ""
     workers: int = 2
-    threads_per_worker: int = 1
+    threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
     max_queue: int = 32
     max_queued_bytes: int = 512 * 2**20
     deadline_s: float = 8.0
