@@ -1,0 +1,238 @@
+"""Real photos end to end: some are held out, localised over Zenoh, and compared with a map of all photos.
+
+    uv run python tools/real_photos.py --photos FOLDER --held-out DJI_0020.JPG DJI_0025.JPG
+
+1. `featuredb ingest photos` takes all photos but the held-out ones, in a process and a database of its own.
+2. The same takes all photos, into another database: what its map says of the held-out ones is the reference.
+   Both maps are placed by the photos' GPS, so the differences hold the placements' as well.
+3. A server answers from the first database; each held-out photo is asked for as `featuredb query` does, with
+   nothing but the file: no camera, no prior.
+
+Exit code 0 if everything was registered in time and every held-out photo lies within the limits, else 1.
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.simworld.scoring import PoseError, pose_difference
+from featuredb.store import Database
+from reloc.client import Client, LocaliseReply
+from reloc.service.options import ServeOptions
+from reloc.service.serve import start_server
+
+_ROOT = Path(__file__).resolve().parent.parent
+_EVERY = 5  # without --held-out, one photo in so many is held out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ingest:
+    """What one ingest came to.
+
+    Attributes:
+        usable, registered: photos that were taken from the folder, and those that are in a map.
+        wall_s: of the whole command, from the start of its process on an empty database.
+        cpu_s: of all its processes; on an idle machine of two cores the wall time is at least half of it.
+        stages_s: wall time by stage.
+    """
+
+    database: str
+    usable: int
+    registered: int
+    wall_s: float
+    cpu_s: float
+    stages_s: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Row:
+    """One held-out photo: the answer against the reference."""
+
+    name: str
+    reason: str
+    error: PoseError | None
+    inliers: int
+    confidence: float
+    camera: str
+    horizontal_68_m: float
+    vertical_68_m: float
+    orientation_68_deg: float
+    wall_ms: float
+
+    def passes(self, max_m: float, max_deg: float) -> bool:
+        """Whether it was localised, within both limits."""
+        return self.error is not None and self.error.position_m <= max_m and self.error.angle_deg <= max_deg
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    held_out = tuple(args.held_out) or every_nth(args.photos)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        part = ingest(work / "part", args.photos, held_out)
+        _tell(part, f"all but {len(held_out)} photos")
+        whole = ingest(work / "whole", args.photos, ())
+        _tell(whole, "all photos")
+        rows = ask(Database.open(work / "part"), args.photos, held_out, reference(work / "whole"))
+    sys.stdout.write(table(rows, args.max_m, args.max_deg) + "\n")
+    complete = part.registered == part.usable
+    in_time = part.wall_s <= args.max_ingest_s
+    close = sum(row.passes(args.max_m, args.max_deg) for row in rows)
+    sys.stdout.write(
+        f"registered {part.registered} of {part.usable} in {part.wall_s:.1f} s "
+        f"({'within' if in_time else 'more than'} {args.max_ingest_s:g} s); "
+        f"{close} of {len(rows)} held-out photos within {args.max_m:g} m and {args.max_deg:g} degrees\n"
+    )
+    if args.json is not None:
+        document = {"part": asdict(part), "whole": asdict(whole), "queries": [_plain(r) for r in rows]}
+        args.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return 0 if complete and in_time and close == len(rows) else 1
+
+
+def every_nth(folder: Path) -> tuple[str, ...]:
+    """Names of every fifth photo of the folder."""
+    names = sorted(p.name for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png"))
+    return tuple(names[_EVERY // 2 :: _EVERY])
+
+
+def ingest(database: Path, photos: Path, exclude: Sequence[str]) -> Ingest:
+    """Run `featuredb ingest photos` in a process of its own on a database that is not there yet.
+
+    Raises:
+        SystemExit: there is a database already, or the command failed.
+    """
+    if database.exists():
+        raise SystemExit(f"{database} is there already; a cold start needs an empty place")
+    report = database.with_name(f"{database.name}-report")
+    command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
+    command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]
+    cpu_before, start = _children_cpu_s(), time.perf_counter()
+    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
+    wall_s = time.perf_counter() - start
+    if done.returncode != 0:
+        raise SystemExit(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
+    document = json.loads((report / "report.json").read_text(encoding="utf-8"))
+    statuses = [photo["status"] for photo in document["photos"]]
+    return Ingest(
+        database=str(database),
+        usable=sum(status != "skipped" for status in statuses),
+        registered=statuses.count("registered"),
+        wall_s=wall_s,
+        cpu_s=_children_cpu_s() - cpu_before,
+        stages_s={stage["name"]: stage["seconds"] for stage in document["stages"]},
+    )
+
+
+def reference(database: Path) -> FeatureMap:
+    """The map with most images."""
+    snapshot = Database.open(database).snapshot()
+    maps = [m for m in snapshot.maps() if m.status == "active"]
+    return snapshot.load_map(max(maps, key=lambda m: m.images).map_id)
+
+
+def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[Row]:
+    """Localise the photos over Zenoh and compare with their poses in the reference map."""
+    poses = {image.name: image.cam_from_local for image in truth.images}
+    missing = [name for name in names if name not in poses]
+    if missing:
+        raise SystemExit(f"not in the map of all photos, so there is nothing to compare with: {missing}")
+    rows = []
+    with (
+        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
+        Client(server.endpoints[0]) as client,
+    ):
+        for name in names:
+            start = time.perf_counter()
+            reply = client.localise(photos / name, timeout_s=60.0)
+            rows.append(_row(name, reply, truth, poses[name], 1e3 * (time.perf_counter() - start)))
+    return rows
+
+
+def _row(name: str, reply: LocaliseReply, truth: FeatureMap, pose: Rigid3, wall_ms: float) -> Row:
+    error, nan = None, float("nan")
+    if reply.utm is not None:
+        utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
+        error = pose_difference(truth.frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
+    accuracy = reply.accuracy
+    return Row(
+        name=name,
+        reason=reply.reason or "",
+        error=error,
+        inliers=reply.inliers,
+        confidence=reply.confidence,
+        camera=reply.camera.source if reply.camera else "",
+        horizontal_68_m=accuracy.horizontal_68_m if accuracy else nan,
+        vertical_68_m=accuracy.vertical_68_m if accuracy else nan,
+        orientation_68_deg=accuracy.orientation_68_deg if accuracy else nan,
+        wall_ms=wall_ms,
+    )
+
+
+def table(rows: Sequence[Row], max_m: float, max_deg: float) -> str:
+    """Differences and reported radii, one line for each photo."""
+    lines = [
+        f"{'photo':<20}{'east m':>8}{'north m':>9}{'up m':>8}{'all m':>8}{'deg':>8}{'inliers':>9}"
+        f"{'68 %: hor m':>13}{'ver m':>7}{'deg':>7}{'camera':>11}{'ms':>7}"
+    ]
+    for row in rows:
+        end = f"{row.camera or '-':>11}{row.wall_ms:>7.0f}"
+        verdict = "" if row.passes(max_m, max_deg) else "  FAILS"
+        if row.error is None:
+            lines.append(f"{row.name:<20}{row.reason:>41}{row.inliers:>9}{'':>27}{end}{verdict}")
+            continue
+        e = row.error
+        lines.append(
+            f"{row.name:<20}{e.east_m:>8.3f}{e.north_m:>9.3f}{e.up_m:>8.3f}{e.position_m:>8.3f}"
+            f"{e.angle_deg:>8.3f}{row.inliers:>9}{row.horizontal_68_m:>13.2f}{row.vertical_68_m:>7.2f}"
+            f"{row.orientation_68_deg:>7.2f}{end}{verdict}"
+        )
+    return "\n".join(lines)
+
+
+def _tell(done: Ingest, what: str) -> None:
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in done.stages_s.items())
+    sys.stdout.write(
+        f"ingest of {what}: {done.registered} of {done.usable} registered, {done.wall_s:.1f} s wall, "
+        f"{done.cpu_s:.1f} s of CPU ({stages})\n"
+    )
+    sys.stdout.flush()
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    position = None if row.error is None else row.error.position_m
+    return asdict(row) | {"position_m": position}
+
+
+def _children_cpu_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument(
+        "--held-out", nargs="+", default=[], metavar="NAME", help=f"default: every {_EVERY}th photo"
+    )
+    parser.add_argument("--max-m", type=float, default=1.0, help="default: 1.0")
+    parser.add_argument("--max-deg", type=float, default=0.5, help="default: 0.5")
+    parser.add_argument(
+        "--max-ingest-s", type=float, default=60.0, help="of the photos that are not held out; default: 60"
+    )
+    parser.add_argument("--work", type=Path, default=None, help="keep both databases and reports there")
+    parser.add_argument("--json", type=Path, default=None, metavar="FILE")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
