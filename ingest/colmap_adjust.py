@@ -1,11 +1,14 @@
 """Final adjustment of a reconstruction: a fuller lens model where the photos support it, positions as priors.
 
 A lens that the model cannot follow bends the whole reconstruction while the reprojection errors hardly show
-it. COLMAP's mapping runs best with one distortion parameter; once it has converged, photos of one camera
-determine OPENCV's eight. Whether they do is asked of the data by the Bayesian information criterion.
-Like ingest.colmap_bridge this module knows pycolmap's reconstructions.
+it; a lens with more freedom than the photos determine trades it against tilt and height. COLMAP's mapping
+runs best with one distortion parameter. Once it has converged, a ladder is climbed as far as the data ask for
+(Bayesian information criterion): RADIAL (two radial coefficients), then OPENCV (tangential coefficients, two
+focal lengths) with a free principal point. Like ingest.colmap_bridge this module knows pycolmap's
+reconstructions.
 """
 
+import copy
 import logging
 from collections import Counter
 from dataclasses import dataclass
@@ -19,8 +22,8 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import SfmPhoto, quiet
 
 _LOG = logging.getLogger(__name__)
-# focal lengths, principal point and four distortion coefficients beside SIMPLE_RADIAL's focal length and one
-_MORE_PARAMETERS = 6
+_MORE_OF_RADIAL = 1  # the second radial coefficient
+_MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the principal point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,11 +32,14 @@ class AdjustOptions:
 
     Attributes:
         refine_focal: False keeps the focal lengths, and with them the lens model.
-        fuller_lens: try OPENCV for cameras with enough photos.
-        min_photos_of_camera: below, eight parameters of a lens are not told from the scene's shape.
-        evidence_ratio: how many times the information criterion's penalty the gain must be. Real gains are
-            far beyond it (40 times on `brighton`, 300 times on the simulated drone); neighbouring residuals
-            are not independent, which the criterion assumes.
+        fuller_lens: climb the ladder for SIMPLE_RADIAL cameras with enough photos.
+        min_photos_of_camera: below, the lens is not told from the scene's shape.
+        radial_evidence: how many times the information criterion's penalty the gain of RADIAL must be.
+            Neighbouring residuals are not independent, as the criterion assumes, hence not 1.
+        opencv_evidence: the same for OPENCV with a free principal point. Over flat ground these trade
+            against the cameras' tilt; tools/lens_study.py prints the gains: about 8 on `brighton`, where
+            they turned cameras by 0.9 degrees between subsets of the photos and fitted a laser scan no
+            better than RADIAL, and far more on the simulated drone, whose lens truly is so.
         use_positions: GPS positions take part, robustly, each with its own sigma.
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.
@@ -42,7 +48,8 @@ class AdjustOptions:
     refine_focal: bool = True
     fuller_lens: bool = True
     min_photos_of_camera: int = 8
-    evidence_ratio: float = 5.0
+    radial_evidence: float = 5.0
+    opencv_evidence: float = 20.0
     use_positions: bool = True
     max_iterations: int = 60
     threads: int = 1
@@ -74,20 +81,39 @@ def _adjusted(
 ) -> Any:
     free = options.fuller_lens and options.refine_focal
     fuller = _cameras_to_free(reconstruction, options) if free else []
-    before = _residuals(reconstruction)
-    if fuller and len(before):
-        trial = pycolmap.Reconstruction(str(folder))
+    if fuller:
+        radial = copy.deepcopy(reconstruction)
         for camera_id in fuller:
-            _free_lens(trial.camera(camera_id))
-        _bundle(trial, photos, loss_scale_px, fuller, options)
-        gain = information_gain(before, _residuals(trial), _MORE_PARAMETERS * len(fuller))
-        _LOG.info("fuller lens: gain %.0f times the penalty", gain)
-        if gain >= options.evidence_ratio:
-            trial = _triangulated_anew(trial, database, folder)
-            _bundle(trial, photos, loss_scale_px, fuller, options)
-            return trial
+            _as_radial(radial.camera(camera_id))
+        _bundle(radial, photos, loss_scale_px, [], options)
+        gain = information_gain(_residuals(reconstruction), _residuals(radial), _MORE_OF_RADIAL * len(fuller))
+        _LOG.info("%s: RADIAL gains %.1f times the penalty", folder.name, gain)
+        if gain >= options.radial_evidence:
+            return _with_opencv(radial, fuller, folder, database, photos, loss_scale_px, options)
     _bundle(reconstruction, photos, loss_scale_px, [], options)
     return reconstruction
+
+
+def _with_opencv(
+    radial: Any,
+    fuller: list[int],
+    folder: Path,
+    database: Path,
+    photos: tuple[SfmPhoto, ...],
+    loss_scale_px: float,
+    options: AdjustOptions,
+) -> Any:
+    """The better of RADIAL and OPENCV, with points triangulated anew."""
+    opencv = copy.deepcopy(radial)
+    for camera_id in fuller:
+        _as_opencv(opencv.camera(camera_id))
+    _bundle(opencv, photos, loss_scale_px, fuller, options)
+    gain = information_gain(_residuals(radial), _residuals(opencv), _MORE_OF_OPENCV * len(fuller))
+    _LOG.info("%s: OPENCV gains %.1f times the penalty", folder.name, gain)
+    chosen, free_center = (opencv, fuller) if gain >= options.opencv_evidence else (radial, [])
+    chosen = _triangulated_anew(chosen, database, folder)
+    _bundle(chosen, photos, loss_scale_px, free_center, options)
+    return chosen
 
 
 def information_gain(before: FloatArray, after: FloatArray, more_parameters: int) -> float:
@@ -117,11 +143,18 @@ def _cameras_to_free(reconstruction: Any, options: AdjustOptions) -> list[int]:
     )
 
 
-def _free_lens(camera: Any) -> None:
-    """The same lens as an OPENCV camera."""
+def _as_radial(camera: Any) -> None:
+    """The same SIMPLE_RADIAL lens as a RADIAL camera."""
     f, cx, cy, k = camera.params
+    camera.model = pycolmap.CameraModelId.RADIAL
+    camera.params = [f, cx, cy, k, 0.0]
+
+
+def _as_opencv(camera: Any) -> None:
+    """The same RADIAL lens as an OPENCV camera."""
+    f, cx, cy, k1, k2 = camera.params
     camera.model = pycolmap.CameraModelId.OPENCV
-    camera.params = [f, f, cx, cy, k, 0.0, 0.0, 0.0]
+    camera.params = [f, f, cx, cy, k1, k2, 0.0, 0.0]
 
 
 def _bundle(

@@ -1,7 +1,7 @@
 """Everything that must hold before a change goes in: format, lint, types, import rules, tests, the demo.
 
-    uv run --extra dev python tools/check.py            all of it
-    uv run --extra dev python tools/check.py --fast     without slow tests and without the demo
+uv run --extra dev python tools/check.py            all of it
+uv run --extra dev python tools/check.py --fast     without slow tests and without the demo
 """
 
 import argparse
