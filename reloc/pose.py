@@ -242,7 +242,7 @@ def pose_uncertainty(
     weight = np.linalg.inv(noise)
     chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
     factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
-    factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options))
+    factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options), jacobian.shape[2])
     # Residuals of zero are test data; the floor is a hundredth of a pixel.
     information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
     if lens is not None:
@@ -254,19 +254,26 @@ def pose_uncertainty(
     )
 
 
-def _price_of_robustness(residual: FloatArray, scale_px: float) -> float:
+def _price_of_robustness(residual: FloatArray, scale_px: float, parameters: int) -> float:
     """Variance of the Cauchy estimate over that of least squares, for residuals (k, 2) like these.
 
-    Asymptotic variance of an M-estimator, E[psi^2] / E[psi']^2 (Huber, Robust Statistics, 1981, ch. 3).
+    Asymptotic variance of an M-estimator, E[psi^2] / E[psi']^2, with the correction for the number of
+    estimated parameters (Huber, Robust Statistics, 1981, ch. 3 and 7.6). Above 1 for residuals as wide as
+    the loss. Far below it where most are small and a few lie at the edge of the tolerance, as matches
+    usually do: least squares would follow those few.
     """
     squared = np.sum(residual**2, axis=1)
-    weight = 1.0 / (1.0 + squared / scale_px**2)
-    slope = float(np.mean(weight - weight**2 * squared / scale_px**2))
     spread = float(np.mean(squared))
     if spread <= 0.0:
         return 1.0
+    weight = 1.0 / (1.0 + squared / scale_px**2)
+    across, along = weight, weight - 2.0 * weight**2 * squared / scale_px**2
     # Residuals much larger than the scale have hardly any slope left; beyond this the formula says nothing.
-    return float(np.clip(np.mean(weight**2 * squared) / spread / max(slope, 0.1) ** 2, 1.0, 10.0))
+    slope = max(float(np.mean(across + along)) / 2.0, 0.1)
+    variation = max(float(np.mean(across**2 + along**2)) / 2.0 / slope**2 - 1.0, 0.0)
+    few = 1.0 + parameters / residual.size * variation
+    # A dozen residuals may be small by luck; the lower bound keeps that from being taken for precision.
+    return float(np.clip(few**2 * np.mean(weight**2 * squared) / spread / slope**2, 0.1, 10.0))
 
 
 def _loss_scale_px(camera: Camera, options: PoseOptions) -> float:

@@ -10,7 +10,14 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
 from reloc.jacobians import pixel_jacobians
 from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose, reprojection_errors
+from reloc.pose import (
+    PoseHypothesis,
+    _price_of_robustness,
+    estimate_pose,
+    pose_uncertainty,
+    refine_pose,
+    reprojection_errors,
+)
 from tests.support.scenes import CAMERA, box_points, looking_at, pixels_inside
 
 OPTIONS = PoseOptions()
@@ -220,3 +227,25 @@ def test_the_covariance_is_that_of_the_errors(noise_px: float, tolerance_rel: fl
         measured = pose_uncertainty(pixels[rows], mapped[rows], covariances, found, options)
         values.append(normalised_squared_error(found.cam_from_local, measured.covariance))
     assert np.mean(values) == pytest.approx(6.0, rel=0.12)
+
+
+def test_price_of_the_robust_loss_is_the_ratio_of_the_variances_that_both_estimates_have() -> None:
+    rng = np.random.default_rng(5)
+
+    def residuals(samples: int, size: int) -> np.ndarray:
+        sigma = np.where(rng.random((samples, size, 1)) < 0.85, 0.2, 1.2)
+        return rng.normal(size=(samples, size, 2)) * sigma
+
+    drawn = residuals(3000, 150)
+    robust = np.zeros((3000, 1, 2))
+    for _ in range(40):  # a location by reweighting, Cauchy loss of scale 1
+        weight = 1.0 / (1.0 + np.sum((drawn - robust) ** 2, axis=2, keepdims=True))
+        robust = np.sum(weight * drawn, axis=1, keepdims=True) / np.sum(weight, axis=1, keepdims=True)
+    ratio = np.var(robust) / np.var(drawn.mean(axis=1))
+    assert ratio < 0.6
+    assert _price_of_robustness(residuals(1, 100_000)[0], 1.0, 2) == pytest.approx(ratio, rel=0.08)
+
+
+def test_price_of_the_robust_loss_on_gaussian_residuals_is_above_one_and_close_to_it() -> None:
+    narrow = np.random.default_rng(6).normal(0.0, 0.3, (100_000, 2))
+    assert 1.0 < _price_of_robustness(narrow, 1.0, 6) < 1.1
