@@ -72,7 +72,7 @@ def _run(args: argparse.Namespace) -> int:
 
 
 def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[Answer]:
-    """Everything, into `out`: world/, db/, report/, overlay.png. Returns all answers.
+    """Everything, into `out`: world/, db/, report/ (report.html, plan.png), overlay.png. Returns all answers.
 
     Raises:
         FeatureDbError: a step could not be done.
@@ -129,6 +129,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.pipeline import IngestOptions, ingest_photos
     from ingest.reconstruction import MapMakingOptions
     from ingest.report import write_report
+    from ingest.report_plots import plan_png
 
     options = IngestOptions(
         gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
@@ -139,6 +140,9 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     )
     report = ingest_photos(database, world.folder / "drone", options)
     write_report(report_folder, report)
+    for outcome in report.maps[:1]:
+        if outcome.plan is not None:
+            (report_folder / "plan.png").write_bytes(plan_png(outcome.plan))
     return report
 
 
