@@ -18,13 +18,16 @@ class AcceptanceOptions:
         min_inliers: fewer are never believed.
         min_log_nfa: smallest -log10 of the number of false alarms, see `log_nfa`.
         min_coverage: smallest share of a 10x10 grid over the image that holds inliers.
+        min_agreement: smallest share of the parts of the image where the map should be seen that holds
+            inliers; a picture of the place inside another picture agrees in its own part only.
         rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
         settled_log_nfa: with that much evidence for a pose, places with far fewer votes are not tried.
     """
 
     min_inliers: int = 15
-    min_log_nfa: float = 12.0
+    min_log_nfa: float = 20.0
     min_coverage: float = 0.05
+    min_agreement: float = 0.2
     rival_share: float = 0.6
     settled_log_nfa: float = 48.0
 
@@ -52,9 +55,32 @@ def coverage(pixels: NDArray[np.floating], width: int, height: int) -> float:
     """Share of the cells of a 10x10 grid over the image that hold at least one of the pixels (k, 2)."""
     if len(pixels) == 0:
         return 0.0
-    column = np.clip((pixels[:, 0] * 10 / width).astype(int), 0, 9)
-    row = np.clip((pixels[:, 1] * 10 / height).astype(int), 0, 9)
-    return len(np.unique(row * 10 + column)) / 100.0
+    return len(np.unique(_cells(pixels, width, height))) / 100.0
+
+
+def agreement(
+    inliers: NDArray[np.floating], expected: NDArray[np.floating], width: int, height: int
+) -> float:
+    """Share of the parts of the image where the map should be seen that hold inliers; 0 where there are none.
+
+    Of a 10x10 grid those cells count in which at least three map points should be visible. A patch of the
+    place inside another picture, a poster or a screen agrees in its own part only.
+
+    Args:
+        inliers: (k, 2) pixels. expected: (v, 2) pixels of all map points that the pose makes visible.
+    """
+    expected_cells, counts = np.unique(_cells(expected, width, height), return_counts=True)
+    expected_cells = expected_cells[counts >= 3]
+    if len(expected_cells) == 0:
+        return 0.0
+    return float(np.isin(expected_cells, _cells(inliers, width, height)).mean())
+
+
+def _cells(pixels: NDArray[np.floating], width: int, height: int) -> NDArray[np.int64]:
+    """Numbers (k,) of the 10x10 grid's cells of pixels (k, 2)."""
+    column = np.clip((pixels[:, 0] * 10 / width).astype(np.int64), 0, 9)
+    row = np.clip((pixels[:, 1] * 10 / height).astype(np.int64), 0, 9)
+    return np.asarray(row * 10 + column, dtype=np.int64)
 
 
 def independent_inliers(pixels: FloatArray, points: FloatArray, min_gap_px: float) -> NDArray[np.intp]:
@@ -88,6 +114,12 @@ def verdict(evidence: Evidence, rival_inliers: int, options: AcceptanceOptions) 
             "TOO_FEW_INLIERS",
             f"the inliers cover {100 * evidence.coverage:.0f} % of the photo, "
             f"{100 * options.min_coverage:.0f} % needed",
+        )
+    if evidence.agreement < options.min_agreement:
+        return (
+            "TOO_FEW_INLIERS",
+            f"inliers lie in {100 * evidence.agreement:.0f} % of the parts of the photo where the map should "
+            f"be seen, {100 * options.min_agreement:.0f} % needed: it may show a picture of the place",
         )
     if rival_inliers >= options.rival_share * evidence.inliers:
         return (

@@ -18,7 +18,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.acceptance import confidence, coverage, independent_inliers, log_nfa, verdict
+from reloc.acceptance import agreement, confidence, coverage, independent_inliers, log_nfa, verdict
 from reloc.answer import make_answer, placement_covariance
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import Matches, guided_matches, match_cluster, visible_points
@@ -213,7 +213,6 @@ def _refined(
     area = cluster.area
     pixels, points = _pairs(features, area, matches)
     best, kept = refine_pose(pixels, points, pose, options.pose), matches
-    expected = visible_points(area, cluster.points.astype(np.int64), best.camera, best.cam_from_local)
     guided = guided_matches(
         features, area, cluster.points, best.camera, best.cam_from_local, options.matching
     )
@@ -222,39 +221,42 @@ def _refined(
         again = refine_pose(pixels, points, best, options.pose)
         if again.count >= best.count:
             best, kept = again, guided
-    return _with_evidence(features, area, best, kept, matches, len(expected), options)
+    return _with_evidence(features, cluster, best, kept, matches, options)
 
 
 def _with_evidence(
     features: Features,
-    area: Area,
+    cluster: Cluster,
     pose: PoseHypothesis,
     matches: Matches,
     unguided: Matches,
-    visible: int,
     options: LocaliseOptions,
 ) -> Candidate:
     """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
 
     Of those, only independent ones count, or a few places that match several times over would be believed.
     """
-    longer = max(pose.camera.width, pose.camera.height)
-    tolerance_px = options.pose.tolerance_rel * longer
+    area, width, height = cluster.area, pose.camera.width, pose.camera.height
+    tolerance_px = options.pose.tolerance_rel * max(width, height)
     own = _independent(features, area, pose, matches, pose.inliers)
     error = reprojection_errors(*_pairs(features, area, unguided), pose.camera, pose.cam_from_local)
     blind = _independent(features, area, pose, unguided, error < tolerance_px)
+    inlier_pixels = features.xy[matches.feature[own]]
+    visible = visible_points(area, cluster.points.astype(np.int64), pose.camera, pose.cam_from_local)
+    expected_pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
     evidence = Evidence(
         inliers=len(own),
         log_nfa=log_nfa(
             len(unguided),
             len(blind),
             tolerance_px,
-            pose.camera.width,
-            pose.camera.height,
+            width,
+            height,
             sample=4 if pose.focal_is_free else 3,
         ),
-        coverage=coverage(features.xy[matches.feature[own]], pose.camera.width, pose.camera.height),
-        visible_share=len(own) / max(visible, 1),
+        coverage=coverage(inlier_pixels, width, height),
+        visible_share=len(own) / max(len(visible), 1),
+        agreement=agreement(inlier_pixels, expected_pixels, width, height),
     )
     return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
 

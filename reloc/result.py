@@ -142,12 +142,14 @@ class Evidence:
         log_nfa: -log10 of the expected number of as good poses among random matches.
         coverage: share of a 10x10 grid over the image that holds inliers.
         visible_share: guided inliers over map points that should be visible.
+        agreement: of the parts of the image where the map should be seen, the share that holds inliers.
     """
 
     inliers: int
     log_nfa: float
     coverage: float
     visible_share: float
+    agreement: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -190,7 +190,9 @@ def _row(
     query: Query, variant: str, gray: Gray, request: LocaliseRequest, localiser: Localiser, *, possible: bool
 ) -> Row:
     result = localiser.localise(gray, request)
-    evidence = result.evidence or Evidence(inliers=0, log_nfa=0.0, coverage=0.0, visible_share=0.0)
+    evidence = result.evidence or Evidence(
+        inliers=0, log_nfa=0.0, coverage=0.0, visible_share=0.0, agreement=0.0
+    )
     rival = result.runner_up.inliers if result.runner_up else 0
     refusal = verdict(evidence, rival, AcceptanceOptions())
     return Row(

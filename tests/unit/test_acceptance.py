@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from reloc.acceptance import (
     AcceptanceOptions,
     Evidence,
+    agreement,
     confidence,
     coverage,
     independent_inliers,
@@ -21,7 +22,7 @@ from reloc.acceptance import (
 )
 
 OPTIONS = AcceptanceOptions()
-GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, visible_share=0.5)
+GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, visible_share=0.5, agreement=0.8)
 
 
 @settings(deadline=None, max_examples=60)
@@ -83,6 +84,17 @@ def test_coverage_counts_cells() -> None:
     assert coverage(grid.astype(float), 200, 100) == 1.0
 
 
+def test_agreement_asks_where_the_map_should_be_seen() -> None:
+    # Map points are expected in the left half: fifty cells with four points each.
+    expected = np.stack(np.meshgrid(np.arange(2.5, 50, 5), np.arange(2.5, 100, 5)), -1).reshape(-1, 2)
+    patch = expected[(expected[:, 0] < 20) & (expected[:, 1] < 30)]
+    assert agreement(expected, expected, 100, 100) == 1.0
+    assert agreement(patch, expected, 100, 100) == pytest.approx(6 / 50)
+    # Inliers elsewhere do not help, and two points in a cell are too few to expect anything there.
+    assert agreement(expected + [50.0, 0.0], expected, 100, 100) == 0.0
+    assert agreement(patch, np.repeat(patch[:1], 2, axis=0), 100, 100) == 0.0
+
+
 def test_inliers_on_top_of_each_other_count_once() -> None:
     rng = np.random.default_rng(0)
     pixels = np.stack(np.meshgrid(np.arange(10), np.arange(10)), -1).reshape(-1, 2) * 10.0 + 1.0
@@ -107,6 +119,8 @@ def test_inliers_on_top_of_each_other_count_once() -> None:
         (replace(GOOD, log_nfa=OPTIONS.min_log_nfa), 0, None, ""),
         (replace(GOOD, log_nfa=OPTIONS.min_log_nfa - 0.1), 0, "TOO_FEW_INLIERS", "chance"),
         (replace(GOOD, coverage=OPTIONS.min_coverage), 0, None, ""),
+        (replace(GOOD, agreement=OPTIONS.min_agreement), 0, None, ""),
+        (replace(GOOD, agreement=OPTIONS.min_agreement - 0.01), 0, "TOO_FEW_INLIERS", "picture of the place"),
         (replace(GOOD, coverage=OPTIONS.min_coverage - 0.01), 0, "TOO_FEW_INLIERS", "cover 4 %"),
         (GOOD, 23, None, ""),
         (GOOD, 24, "AMBIGUOUS", "24 inliers, this one 40"),
