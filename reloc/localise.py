@@ -5,7 +5,7 @@ cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,10 +122,9 @@ def _search(
     candidates: list[Candidate] = []
     most = 0
     for tried, cluster in enumerate(clusters, start=1):
-        matches = match_cluster(features, cluster, options.matching)
-        watch.split("matching")
-        most = max(most, len(matches))
-        candidates.extend(_poses(features, cluster, matches, request, options, watch))
+        found, count = _try_cluster(features, cluster, request, options, watch)
+        most = max(most, count)
+        candidates.extend(found)
         if candidates and _settled(candidates, cluster, clusters[tried:], options):
             break
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
@@ -134,13 +133,48 @@ def _search(
     return _Search(candidates=candidates, matches=most, reason=None, detail="")
 
 
+def _try_cluster(
+    features: Features,
+    cluster: Cluster,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    watch: Stopwatch,
+) -> tuple[list[Candidate], int]:
+    """Poses of one cluster and the number of matches behind them.
+
+    The first features, which are the best spread, are matched alone; all of them only where that does not
+    settle it. Guided matching uses all of them in any case.
+    """
+    first = options.matching.first_features
+    for count in (first, len(features)) if first < len(features) else (len(features),):
+        matches = match_cluster(features.take(np.arange(count)), cluster, options.matching)
+        watch.split("matching")
+        found = _poses(features, cluster, matches, request, options, watch)
+        if any(c.evidence.log_nfa > options.acceptance.settled_log_nfa for c in found):
+            break
+    return found, len(matches)
+
+
 def _settled(
     candidates: list[Candidate], cluster: Cluster, rest: list[Cluster], options: LocaliseOptions
 ) -> bool:
-    """Whether the remaining clusters need not be tried: a pose is sure, and they have far fewer votes."""
+    """Whether the remaining clusters need not be tried.
+
+    So it is when a pose is sure and each of them has far fewer votes or lies around that very pose: its
+    images got their votes for seeing the same place, which the pose's own cluster holds already.
+    """
     best = max(candidates, key=lambda c: c.evidence.log_nfa)
     sure = best.evidence.log_nfa > options.acceptance.settled_log_nfa
-    return sure and all(other.score < 0.5 * cluster.score for other in rest)
+    return sure and all(other.score < 0.5 * cluster.score or _around(best, other) for other in rest)
+
+
+def _around(candidate: Candidate, cluster: Cluster) -> bool:
+    """Whether the cluster's images look at what a camera at the candidate's pose may see."""
+    if cluster.area is not candidate.area:
+        return False
+    offset = cluster.area.image_scene[cluster.images] - candidate.pose.cam_from_local.center
+    reach = float(np.median(cluster.area.image_reach[cluster.images]))
+    return bool(np.median(np.linalg.norm(offset, axis=1)) <= 2.0 * reach)
 
 
 def _poses(
@@ -152,19 +186,30 @@ def _poses(
     watch: Stopwatch,
 ) -> list[Candidate]:
     """The cluster's best pose, and the best one among the matches that it leaves over."""
-    found: list[Candidate] = []
-    cameras = camera_hypotheses(features, cluster.area, request)
-    left = matches
-    for _ in range(2):
-        pose = _best_pose(features, cluster.area, left, cameras, options)
-        watch.split("pose")
-        if pose is None or pose.count < 4:
-            break
-        found.append(_refined(features, cluster, left, pose, options))
-        watch.split("guided")
-        taken = np.isin(left.point, found[0].matches.point[found[0].rows]) | pose.inliers
-        left = Matches(feature=left.feature[~taken], point=left.point[~taken], distance=left.distance[~taken])
-    return found
+    pose = _best_pose(
+        features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
+    )
+    watch.split("pose")
+    if pose is None or pose.count < 4:
+        return []
+    best = _refined(features, cluster, matches, pose, options)
+    watch.split("guided")
+    taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
+    left = Matches(
+        feature=matches.feature[~taken], point=matches.point[~taken], distance=matches.distance[~taken]
+    )
+    # A photo has one lens, which the first pose has estimated.
+    rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
+    watch.split("pose")
+    if rival is None or rival.count < 4:
+        return [best]
+    second = _refined(features, cluster, left, rival, options)
+    watch.split("guided")
+    source, focal_px = best.pose.camera_source, best.pose.prior_focal_px
+    return [
+        best,
+        replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
+    ]
 
 
 def camera_hypotheses(
@@ -212,7 +257,7 @@ def _refined(
     """Refine on matches looked for where the pose says they are; keep that only if it agrees with more."""
     area = cluster.area
     pixels, points = _pairs(features, area, matches)
-    best, kept = refine_pose(pixels, points, pose, options.pose), matches
+    best, kept = refine_pose(pixels, points, pose, options.pose, rounds=1), matches
     guided = guided_matches(
         features, area, cluster.points, best.camera, best.cam_from_local, options.matching
     )

@@ -132,15 +132,18 @@ def _ransac_focal(
 
 
 def refine_pose(
-    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions, rounds: int = 2
 ) -> PoseHypothesis:
     """Robust refinement (Cauchy) on all matches within reach, then the inliers counted anew.
 
     The lens is refined too where it is not known, within what lenses are like.
+
+    Args:
+        rounds: how often the matches within reach are chosen anew.
     """
     tolerance_px = options.tolerance_rel * max(start.camera.width, start.camera.height)
     pose = start
-    for _ in range(2):
+    for _ in range(rounds):
         residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
         near = residual < 2.0 * tolerance_px
         if near.sum() < 4:

@@ -69,10 +69,10 @@ class Area:
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
-        if len(images) == 0:
-            return np.zeros(0, dtype=np.int32)
-        slices = [self.see_point[self.image_start[i] : self.image_start[i + 1]] for i in images]
-        return np.unique(np.concatenate(slices))
+        seen = np.zeros(len(self.points), dtype=np.bool_)
+        for i in images:
+            seen[self.see_point[self.image_start[i] : self.image_start[i + 1]]] = True
+        return np.flatnonzero(seen).astype(np.int32)
 
     def camera_for_key(self, camera_key: str) -> Camera | None:
         """Intrinsics of a map camera with this EXIF key; of the map with most images if several."""
