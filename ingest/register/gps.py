@@ -171,10 +171,12 @@ def _judge(
             f"{options.max_variance_factor**0.5:g})",
             None,
         )
-    noise = noise_variance_factor(weighted, freedom, options.noise_confidence)
+    noise = _noise_by_axis(residuals[inliers] / sigmas[inliers], freedom, options.noise_confidence)
     covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise)
-    figures["noise_variance_factor"] = noise
-    figures["bias_sigma_m"] = (np.median(sigmas[inliers], axis=0) * max(0.0, 1.0 - noise) ** 0.5).tolist()
+    figures["noise_variance_factor"] = noise.tolist()
+    figures["bias_sigma_m"] = (
+        np.median(sigmas[inliers], axis=0) * np.sqrt(np.maximum(0.0, 1.0 - noise))
+    ).tolist()
     figures["scale_sigma"] = float(np.sqrt(covariance[0, 0]))
     if figures["scale_sigma"] > options.max_scale_sigma:
         return outcome(
@@ -186,16 +188,38 @@ def _judge(
     return outcome(None, "placed by GPS", covariance)
 
 
-def _covariance(sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise_factor: float) -> FloatArray:
-    """(7, 7): noise by the normal equations, plus the shared bias in the translation."""
-    jacobian = point_jacobian(sim.act(centers)) / sigmas[:, :, None]
+def _covariance(sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise: FloatArray) -> FloatArray:
+    """(7, 7): noise by the normal equations, plus the shared bias in the translation.
+
+    Args:
+        noise: (3,) variance of the noise over the square of the sigmas, by axis.
+    """
+    jacobian = point_jacobian(sim.act(centers)) / (sigmas * np.sqrt(noise))[:, :, None]
     normal = np.einsum("nij,nik->jk", jacobian, jacobian)
-    covariance = np.linalg.inv(normal) * noise_factor
-    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2) * max(0.0, 1.0 - noise_factor)
+    covariance = np.linalg.inv(normal)
+    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2 * np.maximum(0.0, 1.0 - noise))
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def noise_variance_factor(weighted: float, freedom: int, confidence: float) -> float:
+def _noise_by_axis(normalised: FloatArray, freedom: int, confidence: float) -> FloatArray:
+    """(3,) noise factors: one for both horizontal axes, one for the height.
+
+    A height is often off by metres and steady to decimetres, more so than the position: one factor for both
+    would take part of its bias for noise, which averages out.
+
+    Args:
+        normalised: (n, 3) residuals over sigmas.
+        freedom: degrees of freedom of all of them together; shared out by their numbers.
+    """
+    squared = (normalised**2).sum(axis=0)
+    horizontal = noise_variance_factor(float(squared[:2].sum()), freedom * 2 / 3, confidence)
+    vertical = noise_variance_factor(float(squared[2]), freedom / 3, confidence)
+    # Residuals of exactly zero are test data; the floor keeps the weights finite.
+    factors: FloatArray = np.maximum(np.array([horizontal, horizontal, vertical]), 1e-12)
+    return factors
+
+
+def noise_variance_factor(weighted: float, freedom: float, confidence: float) -> float:
     """Variance of the noise over the square of the sigmas, from the weighted sum of squared residuals.
 
     Where the residuals are larger than the sigmas say: as measured. Where they are smaller: the upper end
