@@ -69,7 +69,8 @@ def build_index(descriptors: NDArray[np.uint8], options: IndexOptions | None = N
     if count <= _EXHAUSTIVE_LIMIT:
         index: Any = faiss.IndexFlatL2(DESCRIPTOR_SIZE)
     else:
-        lists = int(2 ** np.round(np.log2(4 * np.sqrt(count))))
+        # k-means wants at least 39 points a list.
+        lists = min(int(2 ** np.round(np.log2(4 * np.sqrt(count)))), count // 39)
         index = faiss.IndexIVFScalarQuantizer(
             faiss.IndexFlatL2(
                 DESCRIPTOR_SIZE
