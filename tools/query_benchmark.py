@@ -40,9 +40,9 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
-from reloc.localise import camera_hypotheses
 from reloc.localiser import Localiser
 from reloc.options import LocaliseOptions
+from reloc.search import camera_hypotheses
 from reloc.service.handler import StageClock, answer_query, localise_request
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
