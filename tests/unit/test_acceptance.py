@@ -91,7 +91,7 @@ def test_agreement_asks_where_the_map_should_be_seen() -> None:
     assert agreement(expected, expected, 100, 100) == 1.0
     assert agreement(patch, expected, 100, 100) == pytest.approx(6 / 50)
     # Inliers elsewhere do not help, and two points in a cell are too few to expect anything there.
-    assert agreement(expected + [50.0, 0.0], expected, 100, 100) == 0.0
+    assert agreement(np.add(expected, [50.0, 0.0]), expected, 100, 100) == 0.0
     assert agreement(patch, np.repeat(patch[:1], 2, axis=0), 100, 100) == 0.0
 
 
