@@ -171,12 +171,11 @@ def _judge(
             f"{options.max_variance_factor**0.5:g})",
             None,
         )
-    noise = _noise_by_axis(residuals[inliers] / sigmas[inliers], freedom, options.noise_confidence)
-    covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise)
-    figures["noise_variance_factor"] = noise.tolist()
-    figures["bias_sigma_m"] = (
-        np.median(sigmas[inliers], axis=0) * np.sqrt(np.maximum(0.0, 1.0 - noise))
-    ).tolist()
+    noise = noise_variance_factor(weighted, freedom, options.noise_confidence)
+    bias = _bias_shares(residuals[inliers] / sigmas[inliers], noise, freedom, options.noise_confidence)
+    covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise, bias)
+    figures["noise_variance_factor"] = noise
+    figures["bias_sigma_m"] = (np.median(sigmas[inliers], axis=0) * np.sqrt(bias)).tolist()
     figures["scale_sigma"] = float(np.sqrt(covariance[0, 0]))
     if figures["scale_sigma"] > options.max_scale_sigma:
         return outcome(
@@ -188,35 +187,33 @@ def _judge(
     return outcome(None, "placed by GPS", covariance)
 
 
-def _covariance(sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise: FloatArray) -> FloatArray:
-    """(7, 7): noise by the normal equations, plus the shared bias in the translation.
-
-    Args:
-        noise: (3,) variance of the noise over the square of the sigmas, by axis.
-    """
-    jacobian = point_jacobian(sim.act(centers)) / (sigmas * np.sqrt(noise))[:, :, None]
+def _covariance(
+    sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise_factor: float, bias_shares: FloatArray
+) -> FloatArray:
+    """(7, 7): noise by the normal equations, plus the shared bias in the translation."""
+    jacobian = point_jacobian(sim.act(centers)) / sigmas[:, :, None]
     normal = np.einsum("nij,nik->jk", jacobian, jacobian)
-    covariance = np.linalg.inv(normal)
-    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2 * np.maximum(0.0, 1.0 - noise))
+    covariance = np.linalg.inv(normal) * noise_factor
+    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2 * bias_shares)
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _noise_by_axis(normalised: FloatArray, freedom: int, confidence: float) -> FloatArray:
-    """(3,) noise factors: one for both horizontal axes, one for the height.
+def _bias_shares(normalised: FloatArray, noise_factor: float, freedom: int, confidence: float) -> FloatArray:
+    """(3,) share of each axis' variance that is taken for bias, east, north, up.
 
-    A height is often off by metres and steady to decimetres, more so than the position: one factor for both
-    would take part of its bias for noise, which averages out.
+    A height is often off by metres and yet steady to decimetres, steadier than the position: by one noise
+    factor for all axes, part of its bias would pass for noise, which averages out. So the height's own
+    factor counts where it leaves more to the bias, and likewise that of the horizontal axes.
 
     Args:
         normalised: (n, 3) residuals over sigmas.
-        freedom: degrees of freedom of all of them together; shared out by their numbers.
+        noise_factor, freedom: of all of them together; the degrees of freedom are shared out evenly.
     """
     squared = (normalised**2).sum(axis=0)
     horizontal = noise_variance_factor(float(squared[:2].sum()), freedom * 2 / 3, confidence)
     vertical = noise_variance_factor(float(squared[2]), freedom / 3, confidence)
-    # Residuals of exactly zero are test data; the floor keeps the weights finite.
-    factors: FloatArray = np.maximum(np.array([horizontal, horizontal, vertical]), 1e-12)
-    return factors
+    noise = np.minimum(noise_factor, np.array([horizontal, horizontal, vertical]))
+    return np.asarray(np.maximum(0.0, 1.0 - noise), dtype=np.float64)
 
 
 def noise_variance_factor(weighted: float, freedom: float, confidence: float) -> float:

@@ -161,3 +161,13 @@ def test_the_same_input_gives_the_same_answer() -> None:
     assert a.local_from_sfm is not None
     assert b.local_from_sfm is not None
     np.testing.assert_array_equal(a.local_from_sfm.matrix(), b.local_from_sfm.matrix())
+
+
+def test_a_steady_height_hides_no_bias_behind_an_unsteady_position() -> None:
+    """Heights off by 5 m and steady to 0.1 m beside positions with all their error in the noise."""
+    rng = np.random.default_rng(3)
+    sigmas = np.tile([1.5, 1.5, 5.0], (40, 1))
+    noise = rng.normal(0, 1, (40, 3)) * [1.5, 1.5, 0.1] + [0.0, 0.0, 5.0]
+    placed = _place(_flight(40), noise, sigmas)
+    assert placed.covariance is not None
+    assert np.sqrt(placed.covariance[6, 6]) == pytest.approx(5.0, rel=0.03)
