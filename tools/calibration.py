@@ -192,7 +192,7 @@ def true_sigmas(receiver: Receiver, centers: FloatArray, rng: np.random.Generato
     """
     few = centers[:: max(1, len(centers) // 4)]
     errors = np.array([receiver.draw(few, rng) - few for _ in range(_FLIGHTS_FOR_SIGMA)])
-    return np.percentile(np.abs(errors), 68.0, axis=(0, 1)) / norm.ppf(0.84)
+    return np.asarray(np.percentile(np.abs(errors), 68.0, axis=(0, 1)) / norm.ppf(0.84))
 
 
 def pose_offset(pose: Rigid3, true: Rigid3) -> FloatArray:

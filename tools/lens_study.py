@@ -3,11 +3,12 @@
 Judged by something the reconstruction never saw: the truth of a simulated world, or a laser scan of the same
 place, to which the map's points are fitted by a similarity (trimmed iterative closest points).
 
-uv run python tools/lens_study.py --world featuredb-demo/world
+uv run python tools/lens_study.py --world featuredb-demo/world --gps-sigma 1
 uv run --extra lidar python tools/lens_study.py --photos PHOTOS --scan SCAN.laz
 """
 
 import argparse
+import logging
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -38,6 +39,8 @@ def main() -> None:
     photos = args.world / "drone" if args.world else args.photos
     if photos is None:
         parser.error("give --photos or --world")
+    logging.basicConfig(format="%(message)s")
+    logging.getLogger("ingest.colmap_adjust").setLevel(logging.INFO)  # tells the gain of each step
     with tempfile.TemporaryDirectory() as scratch:
         print(f"{'lens':<16}{'photos':>7}{'points':>8}{'GPS RMS m':>11}  against the independent truth")
         for fuller in (False, True):
