@@ -37,4 +37,4 @@ def test_held_out_photos_lie_where_a_map_of_all_photos_has_them(shared_data: Pat
         # The map lends its lens to a photo of the same camera, and says how sure it is.
         assert row.camera == "map"
         assert 0.0 < row.horizontal_68_m < 10.0
-        assert row.confidence > 0.9
+        assert row.confidence > 0.5
