@@ -309,3 +309,14 @@ def _writer_properties(spec: TableSpec) -> WriterProperties:
         max_row_group_size=ROW_GROUP_ROWS,
         column_properties=dict.fromkeys(spec.plain_bytes, plain) or None,
     )
+
+
+def no_prefetch() -> dict[str, object]:
+    """Scan settings under which Arrow's threads read nothing ahead.
+
+    A thread that still holds one of Python's buffers when the interpreter ends aborts the process.
+    """
+    return {
+        "use_threads": False,
+        "fragment_scan_options": ds.ParquetFragmentScanOptions(pre_buffer=False),
+    }
