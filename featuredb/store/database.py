@@ -13,7 +13,7 @@ import pyarrow as pa
 from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.changes import RETIRED, Change, add_maps, live_row, retire_map
-from featuredb.store.delta import Commit, Table, no_prefetch, retry_stale
+from featuredb.store.delta import Commit, Table, retry_stale
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CHILD_TABLES, MAPS, SPECS
@@ -296,7 +296,7 @@ def read_rows(maps: Table) -> list[Row]:
         StoreError: they cannot be read.
     """
     try:
-        table = maps.dataset().to_table(**no_prefetch())
+        table = maps.dataset().to_table()
         # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
         created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
         rows: list[Row] = table.drop_columns("created_at").to_pylist()

@@ -16,7 +16,7 @@ from featuredb.store.database import (
     read_rows,
     write_time,
 )
-from featuredb.store.delta import Commit, Table, no_prefetch, retry_stale
+from featuredb.store.delta import Commit, Table, retry_stale
 from featuredb.store.tables import CHILD_TABLES, MAPS, TABLES
 
 
@@ -118,7 +118,7 @@ def write_ids_in(table: Table) -> set[str]:
             mixed = True
     if mixed:
         unknown = ~ds.field("write_id").isin(sorted(found)) if found else None
-        for batch in table.dataset().to_batches(columns=["write_id"], filter=unknown, **no_prefetch()):
+        for batch in table.dataset().to_batches(columns=["write_id"], filter=unknown, use_threads=False):
             found.update(pc.unique(batch.column("write_id")).to_pylist())
     return found
 

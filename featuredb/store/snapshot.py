@@ -11,7 +11,7 @@ from featuredb.errors import MapNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map
-from featuredb.store.delta import Table, no_prefetch
+from featuredb.store.delta import Table
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS, CHILD_TABLES
 
@@ -158,7 +158,7 @@ class Snapshot:
     def _read(self, table: str, write_id: str) -> list[pa.RecordBatch]:
         dataset = self._children[table].dataset([("write_id", "=", write_id)])
         batches: list[pa.RecordBatch] = dataset.to_table(
-            filter=ds.field("write_id") == write_id, **no_prefetch()
+            filter=ds.field("write_id") == write_id, use_threads=False
         ).to_batches()
         return batches
 
