@@ -1,0 +1,106 @@
+"""Points of a scan as the renderer wants them: in a local frame, ordered by nodes of levels of detail."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import frozen_array
+
+UNCLASSIFIED = 1  # ASPRS class of points that nobody classified
+GROUND = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CloudNodes:
+    """Runs of points that are drawn together or not at all.
+
+    Levels add up: each point is in one node, and what a finer level adds lies in its own nodes. Drawing all
+    nodes of levels 0..l gives a cloud whose points are about `spacing` of level l apart; drawing all levels
+    gives the scan.
+
+    Attributes:
+        start, count: (k,) int64, rows of the cloud; nodes follow each other without gaps.
+        level: (k,) int16, 0 is the coarsest.
+        spacing_m: (k,) float32, distance between neighbouring points when this level and all coarser ones
+            are drawn.
+        box_min, box_max: (k, 3) float32, corners of the box around the node's points, local frame, metres.
+    """
+
+    start: NDArray[np.int64]
+    count: NDArray[np.int64]
+    level: NDArray[np.int16]
+    spacing_m: NDArray[np.float32]
+    box_min: NDArray[np.float32]
+    box_max: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        k = len(self.start)
+        for name, shape, dtype in (
+            ("start", (k,), np.int64),
+            ("count", (k,), np.int64),
+            ("level", (k,), np.int16),
+            ("spacing_m", (k,), np.float32),
+            ("box_min", (k, 3), np.float32),
+            ("box_max", (k, 3), np.float32),
+        ):
+            object.__setattr__(
+                self, name, frozen_array(f"CloudNodes.{name}", getattr(self, name), shape, dtype)
+            )
+        ends = np.concatenate([[0], self.start + self.count])
+        if (self.count < 1).any() or not np.array_equal(ends[:-1], self.start):
+            raise InvalidValueError("CloudNodes: expected non-empty runs that follow each other from row 0")
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointCloud:
+    """A scan, or the part of one that was loaded, in a local frame.
+
+    Attributes:
+        frame: the local east-north-up frame of `xyz`.
+        height_datum: vertical datum of the scan, see featuredb.geo.datum.
+        xyz: (n, 3) float32 metres.
+        rgb: (n, 3) uint8, or None where the scan has no colour.
+        intensity: (n,) uint8, stretched over the scan's range (see featuredb.lidar), or None.
+        classification: (n,) uint8, ASPRS classes; UNCLASSIFIED where the file says nothing. Noise (7, 18) is
+            not in here.
+        nodes: levels of detail and culling.
+    """
+
+    frame: LocalFrame
+    height_datum: str
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8] | None
+    intensity: NDArray[np.uint8] | None
+    classification: NDArray[np.uint8]
+    nodes: CloudNodes
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        # Scans are large: arrays that are right already are taken over, not copied.
+        for name, shape, dtype in (
+            ("xyz", (n, 3), np.float32),
+            ("rgb", (n, 3), np.uint8),
+            ("intensity", (n,), np.uint8),
+            ("classification", (n,), np.uint8),
+        ):
+            value = getattr(self, name)
+            if value is None and name in ("rgb", "intensity"):
+                continue
+            if value.shape != shape or value.dtype != dtype:
+                raise InvalidValueError(
+                    f"PointCloud.{name}: expected {shape} {np.dtype(dtype)}, "
+                    f"found {value.shape} {value.dtype}"
+                )
+        if int(self.nodes.count.sum()) != n:
+            raise InvalidValueError(
+                f"PointCloud: expected nodes with {n} points, found {int(self.nodes.count.sum())}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.xyz)

@@ -1,0 +1,89 @@
+"""Values of registering one photo to a LiDAR scan: the prior that goes in and the verdict that comes out."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rigid3 import Rigid3
+
+FrameReason = Literal[
+    "NO_SCAN",  # the scan does not cover what the prior sees
+    "TOO_FEW_FEATURES",
+    "TOO_FEW_MATCHES",
+    "NO_CONSISTENT_POSE",
+    "AMBIGUOUS",  # another pose does nearly as well
+    "CONTRADICTS_PRIOR",
+    "NOT_CONFIRMED",  # the pictures do not agree at the pose found
+]
+RenderSource = Literal["rgb", "intensity", "shaded"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FramePrior:
+    """A coarse pose of a photo in the local frame of a scan, with honest standard deviations.
+
+    Attributes:
+        cam_from_local: the best guess.
+        sigma_horizontal_m, sigma_vertical_m: of the camera's centre.
+        sigma_heading_deg: about the vertical; 180 or more means unknown.
+        sigma_tilt_deg: of pitch and roll each.
+    """
+
+    cam_from_local: Rigid3
+    sigma_horizontal_m: float
+    sigma_vertical_m: float
+    sigma_heading_deg: float
+    sigma_tilt_deg: float
+
+    def __post_init__(self) -> None:
+        for name in ("sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg"):
+            value = getattr(self, name)
+            if not 0 < value < float("inf"):
+                raise InvalidValueError(f"FramePrior.{name}: expected a finite number > 0, found {value}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameRegistration:
+    """One photo registered to a scan, or why not.
+
+    Attributes:
+        cam_from_local: None when refused.
+        covariance: (6, 6) of the left perturbation of cam_from_local (rotation before translation, camera
+            axes), None when refused.
+        reason, message: of the refusal; None and "" when accepted.
+        source: what was rendered for the accepted pose.
+        points_local: (n, 3) scan points of the inlier correspondences, local frame, metres.
+        pixels: (n, 2) where the photo shows them, full-size pixels.
+        evidence: figures behind the verdict, JSON-able.
+        seconds: time by stage, in order.
+    """
+
+    cam_from_local: Rigid3 | None
+    covariance: FloatArray | None
+    reason: FrameReason | None
+    message: str
+    source: RenderSource | None
+    points_local: FloatArray
+    pixels: FloatArray
+    evidence: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        parts = (self.cam_from_local is None, self.covariance is None, self.reason is not None)
+        if len(set(parts)) != 1:
+            raise InvalidValueError(
+                "FrameRegistration: expected a pose with covariance and no reason, or a reason and neither"
+            )
+        n = len(self.points_local)
+        if self.covariance is not None:
+            object.__setattr__(
+                self, "covariance", frozen_array("FrameRegistration.covariance", self.covariance, (6, 6))
+            )
+        for name, columns in (("points_local", 3), ("pixels", 2)):
+            value = frozen_array(f"FrameRegistration.{name}", getattr(self, name), (n, columns))
+            object.__setattr__(self, name, value)
+
+    @property
+    def accepted(self) -> bool:
+        return self.reason is None
