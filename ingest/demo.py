@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from reloc.wire import LocaliseReply
 
 Say = Callable[[str], None]
-# What the simulated drone's tags are good for: exact ones are rounded by EXIF to about a millimetre, which
-# stands for a survey-grade receiver; the others are a consumer drone's, as EXIF suggests by itself.
-_EXACT_SIGMA_M = 0.02
+# What the simulated drone's tags are good for: exact ones are rounded by EXIF to about a millimetre, and a
+# reconstruction places its cameras to a few of them; the others are a consumer drone's, as EXIF suggests.
+_EXACT_SIGMA_M = 0.003
 
 
 def register(subparsers: Any) -> None:

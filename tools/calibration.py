@@ -73,14 +73,15 @@ class Coverage:
     vertical: float
     orientation: float
 
-    def holds(self, *, cautious: bool) -> bool:
-        """Whether both position radii hold what they claim, give or take ten points.
+    def verdict(self) -> str:
+        """ "holds" if both position radii hold what they claim, give or take ten points.
 
-        Args:
-            cautious: what went in claims less than it is worth, so the radii may hold more.
+        Otherwise "too sure" if one of them holds less, or "too cautious" if both hold enough and one more.
         """
-        most = 1.0 if cautious else COVERAGE[1]
-        return all(COVERAGE[0] <= share <= most for share in (self.horizontal, self.vertical))
+        shares = (self.horizontal, self.vertical)
+        if min(shares) < COVERAGE[0]:
+            return "too sure"
+        return "holds" if max(shares) <= COVERAGE[1] else "too cautious"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
