@@ -7,6 +7,7 @@ from featuredb.errors import MapNotFoundError, StoreError
 from featuredb.store.encode import Row
 
 RETIRED = "retired"
+QUARANTINED = "quarantined"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,11 +18,13 @@ class Change:
         rows: all rows after the change.
         added: the rows among them that are new.
         only_adds: no old row is changed or gone, so that appending `added` is enough.
+        flagged: ids of maps put into quarantine, because a map that placed them gave way.
     """
 
     rows: list[Row]
     added: list[Row]
     only_adds: bool
+    flagged: tuple[str, ...] = ()
 
 
 def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
@@ -33,7 +36,8 @@ def add_maps(rows: Sequence[Row], new_rows: Sequence[Row], replaces: Sequence[st
     """Add maps in the place of those that `replaces` names.
 
     A retired row of the same map id gives way to the new one. A replaced map of another id stays in the table
-    as retired, with the reason.
+    as retired, with the reason. Maps that hang on a replaced one, directly or through others, were placed by
+    what no longer holds: they are quarantined, with the reason, unless they are among the new ones.
 
     Raises:
         MapNotFoundError: a map to be replaced is not there.
@@ -49,8 +53,11 @@ def add_maps(rows: Sequence[Row], new_rows: Sequence[Row], replaces: Sequence[st
         if row["map_id"] in replaces and row["status"] != RETIRED:
             row = {**row, "status": RETIRED, "status_reason": f"replaced by {', '.join(new_ids)}"}
         kept.append(row)
+    stale = descendants(kept, [m for m in replaces if live_row(rows, m) is not None])
+    flagged = [row["map_id"] for row in kept if row["map_id"] in stale and row["status"] != QUARANTINED]
+    kept = [_quarantined(row, stale[row["map_id"]]) if row["map_id"] in flagged else row for row in kept]
     unchanged = len(kept) == len(rows) and all(a is b for a, b in zip(kept, rows, strict=True))
-    return Change(rows=[*kept, *new_rows], added=list(new_rows), only_adds=unchanged)
+    return Change(rows=[*kept, *new_rows], added=list(new_rows), only_adds=unchanged, flagged=tuple(flagged))
 
 
 def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, list[str]]:
@@ -79,6 +86,32 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
         for row in rows
     ]
     return Change(rows=changed, added=[], only_adds=False), retired
+
+
+def descendants(rows: Iterable[Row], ancestors: Iterable[str]) -> dict[str, str]:
+    """Live maps with a chain of live parents up to one of `ancestors`, and the ancestor that each hangs on.
+
+    The ancestors themselves are not among them, whether live or not.
+    """
+    live = {row["map_id"]: row["parents"] for row in rows if row["status"] != RETIRED}
+    root = {map_id: map_id for map_id in ancestors}
+    tops = set(root)
+    while True:
+        more = {
+            map_id: root[parent]
+            for map_id, parents in live.items()
+            if map_id not in root
+            for parent in parents[::-1]
+            if parent in root
+        }
+        if not more:
+            return {map_id: top for map_id, top in root.items() if map_id not in tops}
+        root |= more
+
+
+def _quarantined(row: Row, ancestor: str) -> Row:
+    reason = f"map {ancestor}, which placed it, was placed anew; place this one anew, too"
+    return {**row, "status": QUARANTINED, "status_reason": reason}
 
 
 def anchored(rows: Iterable[Row], without: str | None = None) -> set[str]:

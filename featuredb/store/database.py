@@ -37,12 +37,14 @@ class CommitResult:
         created: False if the map was visible already and nothing had to be done.
         version: snapshot in which the map is visible.
         write_id: of its child rows.
+        flagged: ids of other maps that this commit put into quarantine, because what placed them gave way.
     """
 
     map_id: str
     created: bool
     version: int
     write_id: str
+    flagged: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,22 +130,39 @@ class Database:
                 self._poll_table.refresh()
             return self._poll_table.version
 
-    def commit_map(self, feature_map: FeatureMap, *, replaces: str | None = None) -> CommitResult:
-        """Make one map visible; see `commit_maps`."""
-        return self.commit_maps([feature_map], replaces=() if replaces is None else (replaces,))[0]
+    def commit_map(
+        self, feature_map: FeatureMap, *, replaces: str | None = None, based_on: str | None = None
+    ) -> CommitResult:
+        """Make one map visible; see `commit_maps`.
+
+        Args:
+            based_on: write id of the replaced map that the new one was made from.
+        """
+        write_ids = {replaces: based_on} if replaces is not None and based_on is not None else {}
+        return self.commit_maps(
+            [feature_map], replaces=() if replaces is None else (replaces,), based_on=write_ids
+        )[0]
 
     def commit_maps(
-        self, feature_maps: Sequence[FeatureMap], *, replaces: Sequence[str] = ()
+        self,
+        feature_maps: Sequence[FeatureMap],
+        *,
+        replaces: Sequence[str] = (),
+        based_on: Mapping[str, str] | None = None,
     ) -> list[CommitResult]:
         """Make maps visible, all in one commit.
 
         A map whose id is visible and not retired is left alone, so committing twice, from one process or two,
         gives one row. With `replaces`, those maps give way in the same commit: a new map of the same id takes
         the old one's place (a re-placement), a replaced map of another id becomes retired. Snapshots before
-        it still show the old ones.
+        it still show the old ones. Maps placed by a replaced one are quarantined (`CommitResult.flagged`).
+
+        Args:
+            based_on: write ids, by id, of the replaced maps that the new ones were made from.
 
         Raises:
-            ConflictError: other writers were faster too many times; nothing is visible.
+            ConflictError: other writers were faster too many times, or a map of `based_on` has been placed
+                anew, retired or rolled back since it was read; nothing is visible.
             MapNotFoundError: a map to be replaced is not there.
             StoreError: the store failed, map ids repeat, or a map is retired.
         """
@@ -161,22 +180,35 @@ class Database:
             rows = read_rows(maps)
             visible = {m: row for m in ids if (row := _already_there(rows, m, replaces, digests))}
             pending = [m for m in feature_maps if m.map_id not in visible]
+            if pending:
+                _check_unchanged(rows, based_on or {})
             for feature_map in pending:
                 if feature_map.map_id not in encoded:
                     encoded[feature_map.map_id] = self._write_children(feature_map)
             if datetime.now(UTC) - started > LONGEST_COMMIT:
                 raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
             version = maps.version
+            flagged: tuple[str, ...] = ()
             if pending:
                 change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces)
                 version = apply_change(
-                    maps, change, operation="commit", maps_changed=[m.map_id for m in pending]
+                    maps,
+                    change,
+                    operation="commit",
+                    maps_changed=[*(m.map_id for m in pending), *change.flagged],
                 )
+                flagged = change.flagged
             # After a commit whose answer was lost the map is there already, by our own write.
             ours = {m: e.row["write_id"] for m, e in encoded.items()}
             found = {m: visible[m]["write_id"] if m in visible else ours[m] for m in ids}
             return [
-                CommitResult(map_id=m, created=found[m] == ours.get(m), version=version, write_id=found[m])
+                CommitResult(
+                    map_id=m,
+                    created=found[m] == ours.get(m),
+                    version=version,
+                    write_id=found[m],
+                    flagged=flagged,
+                )
                 for m in ids
             ]
 
@@ -286,6 +318,18 @@ def _already_there(
     if row is None or (map_id in replaces and row["content_digest"] != digests[map_id]):
         return None
     return row
+
+
+def _check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
+    """Refuse to replace what the caller has never seen."""
+    for map_id, write_id in based_on.items():
+        row = live_row(rows, map_id)
+        if row is None or row["write_id"] != write_id:
+            found = "retired or gone" if row is None else "placed anew"
+            raise ConflictError(
+                f"map {map_id} was {found} by someone else while this was computed from an earlier state "
+                f"of it (write {write_id}); run the command again"
+            )
 
 
 def read_rows(maps: Table) -> list[Row]:

@@ -183,6 +183,31 @@ class StoreSuite:
         with pytest.raises(MapNotFoundError, match="map-9"):
             database.commit_map(random_map(3), replaces="map-9")
 
+    def test_replacing_a_map_quarantines_what_it_placed(self, database: Database) -> None:
+        child = random_map(3, parents=("map-1",))
+        database.commit_maps([random_map(1), random_map(2), child])
+        result = database.commit_map(random_map(9, map_id="map-1"), replaces="map-1")
+        assert result.flagged == ("map-3",)
+        assert {m.map_id: m.status for m in database.snapshot().maps()} == {
+            "map-1": "active",
+            "map-2": "active",
+            "map-3": "quarantined",
+        }
+        assert "map-1" in database.snapshot().get("map-3").status_reason
+        assert database.snapshot(result.version - 1).get("map-3").status == "active"
+        database.rollback(result.version - 1)
+        assert database.snapshot().get("map-3").status == "active"
+
+    def test_a_map_changed_since_it_was_read_is_not_replaced(self, database: Database) -> None:
+        first = database.commit_map(random_map(1))
+        database.commit_map(random_map(2, map_id="map-1"), replaces="map-1", based_on=first.write_id)
+        with pytest.raises(ConflictError, match="map-1 was placed anew"):
+            database.commit_map(random_map(3, map_id="map-1"), replaces="map-1", based_on=first.write_id)
+        second = database.snapshot().get("map-1").write_id
+        database.retire("map-1", "wrong street")
+        with pytest.raises(ConflictError, match="retired"):
+            database.commit_map(random_map(3, map_id="map-1"), replaces="map-1", based_on=second)
+
     def test_retire_takes_what_hangs_on_the_map_alone(self, database: Database) -> None:
         database.commit_maps(
             [

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from featuredb.errors import MapNotFoundError, StoreError
-from featuredb.store.changes import add_maps, anchored, live_row, retire_map
+from featuredb.store.changes import add_maps, anchored, descendants, live_row, retire_map
 
 
 def row(map_id: str, *parents: str, status: str = "active") -> dict[str, Any]:
@@ -82,6 +82,30 @@ def test_replacing() -> None:
         ("n", "active"),
     ]
     assert other.rows[0]["status_reason"] == "replaced by n"
+
+
+def test_what_hangs_on_a_replaced_map_is_quarantined_with_the_reason() -> None:
+    change = add_maps(FAMILY, [row("c", "a")], ["c"])
+    assert change.flagged == ("d", "e", "f")
+    status = {r["map_id"]: (r["status"], r["status_reason"]) for r in change.rows}
+    assert {m for m, (s, _) in status.items() if s == "quarantined"} == {"d", "e", "f"}
+    assert "map c, which placed it, was placed anew" in status["f"][1]
+    assert status["a"] == status["b"] == status["c"] == ("active", "")
+    assert all(r["status"] == "active" for r in FAMILY), "the old rows are untouched"
+
+
+def test_children_placed_anew_with_their_parent_and_retired_ones_are_left_alone() -> None:
+    rows = [row("a"), row("c", "a"), row("d", "a", status="retired"), row("e", "d"), row("g", "c")]
+    change = add_maps(rows, [row("a"), row("c", "a")], ["a", "c"])
+    assert change.flagged == ("g",)
+    assert [r["status"] for r in change.rows] == ["retired", "active", "quarantined", "active", "active"]
+    assert add_maps(change.rows, [row("a")], ["a"]).flagged == ("c",), "g is in quarantine already"
+
+
+def test_descendants_name_the_ancestor_and_end_in_cycles() -> None:
+    assert descendants(FAMILY, ["a"]) == {"c": "a", "d": "a", "e": "a", "f": "a"}
+    assert descendants(FAMILY, ["f"]) == {}
+    assert descendants([row("p", "q"), row("q", "p")], ["p"]) == {"q": "p"}
 
 
 def test_a_retired_row_of_the_same_id_gives_way() -> None:
