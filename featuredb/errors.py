@@ -13,6 +13,10 @@ class InvalidValueError(FeatureDbError, ValueError):
     """A value breaks the rules of its type (shape, finiteness, range, unit)."""
 
 
+class MissingExtraError(FeatureDbError):
+    """An optional part was called whose libraries are not installed; the message names the extra."""
+
+
 class GeodesyError(FeatureDbError):
     """A coordinate or CRS cannot be used: outside UTM's limits, unknown EPSG code, wrong kind of CRS."""
 
@@ -55,6 +59,10 @@ class ConflictError(StoreError):
 
 class IngestError(FeatureDbError):
     """An ingest cannot go on: nothing usable in the folder, or a work folder of another job."""
+
+
+class ControlFileError(FeatureDbError):
+    """A control point file cannot be used; the message names the lines and what to do."""
 
 
 class ServiceError(FeatureDbError):

@@ -1,0 +1,310 @@
+"""Ground control points as OpenDroneMap writes them: gcp_list.txt.
+
+First line: the coordinate reference system (a PROJ string, an EPSG code, or words such as "WGS84 UTM 11N").
+Every further line is one mark, one point seen in one photo, separated by spaces or tabs:
+
+    geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extra ...]
+
+Lines that begin with # and empty lines count for nothing. Pixels are counted from the corner of the top-left
+pixel, whose centre is (0.5, 0.5). See https://docs.opendronemap.org/gcp/.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.errors import ControlFileError, GeodesyError, InvalidValueError
+from featuredb.geo.projected import SurveyCrs, geodetic_from_survey, survey_crs
+from featuredb.geometry.arrays import FloatArray
+
+_COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"
+_MOST_ERRORS = 8  # a file with a wrong separator has one on every line
+_MAX_BYTES = 20_000_000  # about 200,000 marks; more is some other file
+_UNKNOWN_HEIGHTS = ("nan", "na", "none", "-")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mark:
+    """Where one photo shows one control point.
+
+    Attributes:
+        point: name of the point.
+        photo: name of the photo as the file has it.
+        x, y: full-size pixels, top-left pixel centre at (0.5, 0.5).
+        line: of the file, from 1.
+    """
+
+    point: str
+    photo: str
+    x: float
+    y: float
+    line: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlFile:
+    """A control point file, checked.
+
+    Attributes:
+        crs: of the survey.
+        names: of the points, in the order of the file.
+        lat_lon_h: (n, 3) WGS84 degrees and metres; height NaN where it is unknown.
+        marks: all of them, in the order of the file.
+        notes: what was taken for granted, for people.
+    """
+
+    crs: SurveyCrs
+    names: tuple[str, ...]
+    lat_lon_h: FloatArray
+    marks: tuple[Mark, ...]
+    notes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        places = np.array(self.lat_lon_h, dtype=np.float64)
+        if places.shape != (len(self.names), 3):
+            raise InvalidValueError(
+                f"ControlFile.lat_lon_h: expected shape ({len(self.names)}, 3), found {places.shape}"
+            )
+        places.setflags(write=False)
+        object.__setattr__(self, "lat_lon_h", places)
+
+    @property
+    def heights_known(self) -> int:
+        """Number of points whose height is known."""
+        return int(np.isfinite(self.lat_lon_h[:, 2]).sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Line:
+    number: int
+    x: float
+    y: float
+    z: float
+    px: float
+    py: float
+    photo: str
+    name: str
+
+
+def read_control_file(path: Path, crs: str | None = None) -> ControlFile:
+    """Read and check a control point file.
+
+    Args:
+        crs: the reference system, instead of what the first line says.
+
+    Raises:
+        ControlFileError: the file cannot be read, or what it says cannot be used; every fault by its line.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ControlFileError(f"{path}: expected a list of control points, found a file of over 20 MB")
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ControlFileError(f"{path}: cannot read the control points ({error})") from error
+    except UnicodeDecodeError as error:
+        raise ControlFileError(
+            f"{path}: expected a text file in UTF-8, found byte {error.object[error.start]:#x} at "
+            f"{error.start}; save it as plain text"
+        ) from error
+    return parse_control_file(text, str(path), crs)
+
+
+def parse_control_file(text: str, where: str, crs: str | None = None) -> ControlFile:
+    """The control points of a file's text; `where` names it in messages.
+
+    Raises:
+        ControlFileError: as `read_control_file`.
+    """
+    numbered = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
+    filled = [(n, line) for n, line in numbered if line and not line.startswith("#")]
+    if not filled:
+        raise ControlFileError(f"{where}: expected a reference system and marks, found an empty file")
+    system, body = _header(filled, where, crs)
+    if not body:
+        raise ControlFileError(f"{where}: expected a mark per line ({_COLUMNS}), found only a header")
+    lines = _collect((lambda n=n, line=line: _parse_line(n, line) for n, line in body), where)
+    points, notes = _points(lines, where)
+    marks, more_notes = _marks(points, where)
+    xyz = np.array([[group[0].x, group[0].y, group[0].z] for group in points.values()])
+    xyz, height_notes = _heights(xyz, list(points), system)
+    return ControlFile(
+        crs=system,
+        names=tuple(points),
+        lat_lon_h=_geodetic(system, xyz, points, where),
+        marks=marks,
+        notes=(*notes, *more_notes, *height_notes),
+    )
+
+
+def _header(
+    filled: list[tuple[int, str]], where: str, given: str | None
+) -> tuple[SurveyCrs, list[tuple[int, str]]]:
+    """The reference system and the lines after it."""
+    number, first = filled[0]
+    first_is_mark = _looks_like_mark(first)
+    if first_is_mark and given is None:
+        raise ControlFileError(
+            f"{where}, line {number}: expected the reference system of the coordinates, found a mark; put "
+            "e.g. EPSG:32611 in the first line, or say --gcp-crs EPSG:32611"
+        )
+    try:
+        system = survey_crs(given if given is not None else first)
+    except GeodesyError as error:
+        place = "--gcp-crs" if given is not None else f"{where}, line {number}"
+        raise ControlFileError(f"{place}: {error}") from error
+    return system, filled if first_is_mark else filled[1:]
+
+
+def _looks_like_mark(line: str) -> bool:
+    fields = line.split()
+    return len(fields) >= 6 and all(_number(field) is not None for field in (*fields[:2], *fields[3:5]))
+
+
+def _parse_line(number: int, line: str) -> _Line:
+    fields = _fields(line)
+    if len(fields) < 6:
+        hint = "; separate columns by spaces or tabs, not commas" if line.count(",") >= 5 else ""
+        raise ControlFileError(
+            f"line {number}: expected at least 6 columns ({_COLUMNS}), found {len(fields)}{hint}"
+        )
+    values = []
+    for column, field in zip(_COLUMNS.split(), fields[:5], strict=False):
+        value = _number(field)
+        if column == "geo_z" and field.lower() in _UNKNOWN_HEIGHTS:
+            value = math.nan
+        if value is None:
+            raise ControlFileError(f"line {number}: expected a number as {column}, found {field!r}")
+        values.append(value)
+    x, y, z, px, py = values
+    if px < 0 or py < 0:
+        raise ControlFileError(
+            f"line {number}: expected pixels >= 0, found {px:g} {py:g}; the columns are {_COLUMNS}"
+        )
+    return _Line(
+        number=number,
+        x=x,
+        y=y,
+        z=z,
+        px=px,
+        py=py,
+        photo=fields[5].replace("\\", "/"),
+        name=fields[6] if len(fields) > 6 else "",
+    )
+
+
+def _fields(line: str) -> list[str]:
+    """Columns; by tabs where they make enough of them, since names of photos may hold spaces."""
+    by_tab = [field.strip() for field in line.split("\t") if field.strip()]
+    return by_tab if len(by_tab) >= 6 else line.split()
+
+
+def _number(field: str) -> float | None:
+    try:
+        value = float(field)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _collect(parsers: Iterable[Callable[[], _Line]], where: str) -> list[_Line]:
+    """All lines, or one error that names every line at fault."""
+    lines, faults = [], []
+    for parse in parsers:
+        try:
+            lines.append(parse())
+        except ControlFileError as error:
+            faults.append(str(error))
+    _raise(faults, where)
+    return lines
+
+
+def _raise(faults: list[str], where: str) -> None:
+    if faults:
+        more = f"\n  and {len(faults) - _MOST_ERRORS} more" if len(faults) > _MOST_ERRORS else ""
+        raise ControlFileError(f"{where}:\n  " + "\n  ".join(faults[:_MOST_ERRORS]) + more)
+
+
+def _points(lines: list[_Line], where: str) -> tuple[dict[str, list[_Line]], list[str]]:
+    """Lines by point: by name, and by equal coordinates where there is no name."""
+    name_at: dict[tuple[float, float], str] = {}
+    points: dict[str, list[_Line]] = defaultdict(list)
+    faults, notes = [], []
+    for line in lines:
+        if line.name:
+            other = name_at.setdefault((line.x, line.y), line.name)
+            if other != line.name and line.name not in points:
+                notes.append(f"line {line.number}: {line.name} has the coordinates of {other}")
+    for line in lines:
+        name = line.name or name_at.setdefault((line.x, line.y), f"point {len(name_at) + 1}")
+        first = points[name][0] if points[name] else line
+        same_height = first.z == line.z or (math.isnan(first.z) and math.isnan(line.z))
+        if (first.x, first.y) != (line.x, line.y) or not same_height:
+            faults.append(
+                f"line {line.number}: {name} is at {line.x:.10g} {line.y:.10g} {line.z:.10g}, line "
+                f"{first.number} says {first.x:.10g} {first.y:.10g} {first.z:.10g}; give it one position, or "
+                "different names to different points"
+            )
+            continue
+        points[name].append(line)
+    _raise(faults, where)
+    return dict(points), notes
+
+
+def _marks(points: dict[str, list[_Line]], where: str) -> tuple[tuple[Mark, ...], list[str]]:
+    """Marks in the order of the file; a repeated one counts once, contradicting ones are a fault."""
+    marks: dict[tuple[str, str], Mark] = {}
+    faults, notes = [], []
+    for name, lines in points.items():
+        for line in lines:
+            mark = Mark(point=name, photo=line.photo, x=line.px, y=line.py, line=line.number)
+            first = marks.setdefault((name, line.photo), mark)
+            if first is mark:
+                continue
+            if (first.x, first.y) == (mark.x, mark.y):
+                notes.append(f"line {line.number} repeats line {first.line}")
+            else:
+                faults.append(
+                    f"line {line.number}: {name} is marked in {line.photo} a second time, at {line.px:g} "
+                    f"{line.py:g}; line {first.line} has it at {first.x:g} {first.y:g}; remove one of them"
+                )
+    _raise(faults, where)
+    return tuple(sorted(marks.values(), key=lambda m: m.line)), notes
+
+
+def _heights(xyz: FloatArray, names: list[str], crs: SurveyCrs) -> tuple[FloatArray, list[str]]:
+    """Coordinates with heights NaN where unknown, and what was made of them."""
+    heights = xyz[:, 2]
+    known = np.isfinite(heights)
+    notes = []
+    if known.any() and (heights[known] == 0.0).all():
+        xyz = xyz.copy()
+        xyz[:, 2] = np.nan
+        return xyz, ["every height is exactly zero, so heights are taken as unknown"]
+    if not known.any():
+        notes.append("no point has a height")
+    elif not known.all():
+        lacking = ", ".join(name for name, there in zip(names, known, strict=True) if not there)
+        notes.append(f"without a height: {lacking}")
+    if known.any() and crs.height_unit_m != 1.0:
+        notes.append(f"heights are taken in the system's unit of {crs.height_unit_m:.10g} m")
+    return xyz, notes
+
+
+def _geodetic(crs: SurveyCrs, xyz: FloatArray, points: dict[str, list[_Line]], where: str) -> FloatArray:
+    faults = []
+    if crs.geographic:
+        for lines in points.values():
+            if abs(lines[0].x) > 180 or abs(lines[0].y) > 90:
+                faults.append(
+                    f"line {lines[0].number}: expected longitude and latitude in degrees ({crs.name}), found "
+                    f"{lines[0].x:g} {lines[0].y:g}; name the projected system in the first line"
+                )
+    _raise(faults, where)
+    try:
+        return geodetic_from_survey(crs, xyz)
+    except GeodesyError as error:
+        raise ControlFileError(f"{where}: {error}") from error
