@@ -95,6 +95,11 @@ class Camera:
         """Mean focal length in pixels."""
         return float(np.mean([self.params[i] for i in _template(self.model).focal_length_idxs()]))
 
+    @property
+    def tan_of_fold(self) -> float:
+        """Tangent of the angle off the axis from which on `project` answers NaN; infinity for most lenses."""
+        return _tan_of_fold(self.model, self.params)
+
     def with_focal(self, focal_px: float) -> "Camera":
         """The same camera with every focal length scaled so that their mean is `focal_px`."""
         params = list(self.params)

@@ -1,0 +1,182 @@
+"""Compiled loops that draw points: projection, z-buffered splats, pictures; see `compiled_module`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.render.compiled import compiled
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
+Int64 = NDArray[np.int64]
+
+
+@compiled
+def project(x: float, y: float, z: float, lens: Float64) -> tuple[float, float]:
+    """Pixel of a point in camera axes by a lens vector; NaN behind the camera and beyond the fold."""
+    if z <= 0.0:
+        return np.nan, np.nan
+    u, v = x / z, y / z
+    r2 = u * u + v * v
+    if r2 >= lens[14]:
+        return np.nan, np.nan
+    q, scale = r2, 1.0
+    if lens[13] != 0.0 and r2 > 1e-16:
+        r = np.sqrt(r2)
+        theta = np.arctan(r)
+        q, scale = theta * theta, theta / r
+    above = 1.0 + q * (lens[4] + q * (lens[5] + q * (lens[6] + q * lens[7])))
+    below = 1.0 + q * (lens[8] + q * (lens[9] + q * lens[10]))
+    scale *= above / below
+    p1, p2 = lens[11], lens[12]
+    du = u * scale + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
+    dv = v * scale + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
+    return lens[0] * du + lens[2], lens[1] * dv + lens[3]
+
+
+@compiled
+def project_many(points: Float64, lens: Float64) -> Float64:
+    """Pixels (n, 2) of points (n, 3) in camera axes."""
+    pixels = np.empty((len(points), 2))
+    for i in range(len(points)):
+        pixels[i] = project(points[i, 0], points[i, 1], points[i, 2], lens)
+    return pixels
+
+
+@compiled
+def finest_spacing(
+    low: Float32, high: Float32, spacing: Float32, corner: Float64, cell_m: float, size: int
+) -> Float32:
+    """Plan (size, size), rows north: spacing of the finest node drawn over each cell; infinity over none."""
+    plan = np.full((size, size), np.inf, np.float32)
+    for k in range(len(low)):
+        x0 = int((low[k, 0] - corner[0]) / cell_m)
+        x1 = int((high[k, 0] - corner[0]) / cell_m)
+        y0 = int((low[k, 1] - corner[1]) / cell_m)
+        y1 = int((high[k, 1] - corner[1]) / cell_m)
+        for y in range(max(y0, 0), min(y1, size - 1) + 1):
+            for x in range(max(x0, 0), min(x1, size - 1) + 1):
+                plan[y, x] = min(plan[y, x], spacing[k])
+    return plan
+
+
+@compiled
+def draw(
+    xyz: Float32,
+    runs: Int64,
+    spacing: Float32,
+    plan: Float32,
+    corner: Float64,
+    cell_m: float,
+    pose: Float64,
+    lens: Float64,
+    near_m: float,
+    radius_per_spacing: float,
+    max_radius_px: float,
+    key: Float32,
+    index: Int32,
+) -> int:
+    """Draw runs of points into a depth buffer; returns how many fell into the image.
+
+    A splat is a disc. Its key grows from the point's depth at the middle by half a spacing at the rim, so
+    that of two splats of one surface each pixel takes the nearer middle, and a nearer surface still wins.
+
+    Args:
+        runs: (k, 2) first row and count.
+        spacing: (k,) metres, of the runs' own nodes.
+        plan, corner, cell_m: see `finest_spacing`.
+        pose: (3, 4) of cam_from_local.
+        key, index: (h, w), changed: infinity and -1 where nothing was drawn yet.
+    """
+    height, width = key.shape
+    size = len(plan)
+    focal = 0.5 * (lens[0] + lens[1])
+    drawn = 0
+    for k in range(len(runs)):
+        for i in range(runs[k, 0], runs[k, 0] + runs[k, 1]):
+            px, py, pz = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            z = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz + pose[2, 3]
+            if z < near_m:
+                continue
+            x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
+            y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
+            u, v = project(x, y, z, lens)
+            if not (
+                u > -max_radius_px
+                and v > -max_radius_px
+                and u < width + max_radius_px
+                and v < height + max_radius_px
+            ):
+                continue
+            drawn += 1
+            column = min(max(int((px - corner[0]) / cell_m), 0), size - 1)
+            row = min(max(int((py - corner[1]) / cell_m), 0), size - 1)
+            apart = min(spacing[k], plan[row, column])
+            radius = min(radius_per_spacing * apart * focal / z, max_radius_px)
+            middle_x, middle_y = int(np.floor(u)), int(np.floor(v))
+            if 0 <= middle_x < width and 0 <= middle_y < height:
+                _put(key, index, middle_y, middle_x, np.float32(z), i)
+            if radius <= 0.5:
+                continue
+            bias = 0.5 * apart / (radius * radius)
+            for ty in range(
+                max(int(np.ceil(v - radius - 0.5)), 0), min(int(v + radius - 0.5), height - 1) + 1
+            ):
+                dy2 = (ty + 0.5 - v) ** 2
+                for tx in range(
+                    max(int(np.ceil(u - radius - 0.5)), 0), min(int(u + radius - 0.5), width - 1) + 1
+                ):
+                    d2 = (tx + 0.5 - u) ** 2 + dy2
+                    if d2 <= radius * radius:
+                        _put(key, index, ty, tx, np.float32(z + bias * d2), i)
+    return drawn
+
+
+@compiled
+def _put(key: Float32, index: Int32, y: int, x: int, value: np.float32, i: int) -> None:
+    """Keep the nearer; of equals the lower row, so that the order of drawing does not matter."""
+    if value < key[y, x] or (value == key[y, x] and i < index[y, x]):
+        key[y, x] = value
+        index[y, x] = i
+
+
+@compiled
+def merge(key: Float32, index: Int32, other_key: Float32, other_index: Int32) -> None:
+    """Draw another buffer into this one."""
+    for y in range(key.shape[0]):
+        for x in range(key.shape[1]):
+            if other_index[y, x] >= 0:
+                _put(key, index, y, x, other_key[y, x], other_index[y, x])
+
+
+@compiled
+def depth_of_index(xyz: Float32, index: Int32, pose: Float64, depth: Float32) -> None:
+    """Fill depth (h, w) with the depth of each pixel's point, NaN where there is none."""
+    for y in range(index.shape[0]):
+        for x in range(index.shape[1]):
+            i = index[y, x]
+            if i < 0:
+                depth[y, x] = np.nan
+            else:
+                depth[y, x] = (
+                    pose[2, 0] * xyz[i, 0] + pose[2, 1] * xyz[i, 1] + pose[2, 2] * xyz[i, 2] + pose[2, 3]
+                )
+
+
+@compiled
+def gather_rgb(values: NDArray[np.uint8], index: Int32, picture: NDArray[np.uint8]) -> None:
+    """Fill picture (h, w, 3) with the pixels' points' colours; zero where there is none."""
+    for y in range(index.shape[0]):
+        for x in range(index.shape[1]):
+            i = index[y, x]
+            for c in range(3):
+                picture[y, x, c] = values[i, c] if i >= 0 else 0
+
+
+@compiled
+def gather_grey(values: NDArray[np.uint8], index: Int32, picture: NDArray[np.uint8]) -> None:
+    """Fill picture (h, w) with the pixels' points' values; zero where there is none."""
+    for y in range(index.shape[0]):
+        for x in range(index.shape[1]):
+            i = index[y, x]
+            picture[y, x] = values[i] if i >= 0 else 0

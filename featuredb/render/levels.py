@@ -1,0 +1,145 @@
+"""Orders the points of a scan into levels of detail and nodes that are drawn together."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.render.cloud import UNCLASSIFIED, CloudNodes, PointCloud
+from featuredb.render.compiled import compiled_module
+
+_CODE_BITS = 21  # per axis in a 63-bit code
+_PROBE_POINTS = 16.0  # points per probing cell: enough that its spacing is known to an eighth or so
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelOptions:
+    """How points are ordered.
+
+    Attributes:
+        coarsest_points: levels are added until the coarsest has at most this many points.
+        node_bits: a node is a cell of 2^node_bits spacings of its level along each edge.
+    """
+
+    # Drawing this many costs less than a millisecond: nothing is gained by a coarser level.
+    coarsest_points: int = 4000
+    # 32 spacings: about a thousand points of a surface, cheap to cull and small beside a camera's view.
+    node_bits: int = 5
+
+
+def build_cloud(
+    frame: LocalFrame,
+    height_datum: str,
+    xyz: ArrayLike,
+    rgb: ArrayLike | None = None,
+    intensity: ArrayLike | None = None,
+    classification: ArrayLike | None = None,
+    options: LevelOptions | None = None,
+) -> PointCloud:
+    """A cloud whose points are ordered into levels, each with half the spacing of the one before.
+
+    Level l has one point in each cell of its spacing where no coarser level has one already; the finest
+    level has all that is left. The result is a permutation of the input, the same for the same input.
+
+    Args:
+        frame: local frame of `xyz`.
+        height_datum: vertical datum of the scan, see featuredb.geo.datum.
+        xyz: (n, 3) metres, n >= 1.
+        rgb: (n, 3) uint8, or None.
+        intensity: (n,) uint8, or None.
+        classification: (n,) uint8 ASPRS classes, or None for a scan without.
+
+    Raises:
+        InvalidValueError: no points, wrong shapes, coordinates that are not finite.
+        MissingExtraError: numba is not installed.
+    """
+    options = options or LevelOptions()
+    points = np.ascontiguousarray(xyz, dtype=np.float32)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
+        raise InvalidValueError(f"build_cloud: expected points (n, 3) with n >= 1, found {points.shape}")
+    if not np.isfinite(points).all():
+        raise InvalidValueError("build_cloud: expected finite coordinates, found NaN or infinity")
+    order, nodes = _order(points, options)
+    n = len(points)
+    classes = np.full(n, UNCLASSIFIED, np.uint8) if classification is None else classification
+    return PointCloud(
+        frame=frame,
+        height_datum=height_datum,
+        xyz=points[order],
+        rgb=None if rgb is None else _bytes("rgb", rgb, (n, 3))[order],
+        intensity=None if intensity is None else _bytes("intensity", intensity, (n,))[order],
+        classification=_bytes("classification", classes, (n,))[order],
+        nodes=nodes,
+    )
+
+
+def _bytes(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    array = np.asarray(value)
+    if array.shape != shape or array.dtype != np.uint8:
+        raise InvalidValueError(
+            f"build_cloud: {name}: expected {shape} uint8, found {array.shape} {array.dtype}"
+        )
+    return array
+
+
+def _order(points: NDArray[np.float32], options: LevelOptions) -> tuple[NDArray[np.int64], CloudNodes]:
+    """The rows in drawing order, and the nodes."""
+    loops = compiled_module("featuredb.render.level_loops")
+    origin = points.min(axis=0).astype(np.float64)
+    extent = float((points.max(axis=0) - origin).max())
+    by_code, codes, cell_m = _sorted_by_code(points, origin, extent)
+    finest = _level_count(codes, extent, cell_m, options.coarsest_points)
+    level = loops.assign_levels(points[by_code], codes, origin, cell_m, finest)
+    runs = [
+        loops.node_runs(codes, level, current, finest, options.node_bits, cell_m)
+        for current in range(finest + 1)
+    ]
+    order = by_code[np.argsort(level, kind="stable")]
+    count = np.concatenate([counts for counts, _ in runs])
+    start = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int64)
+    low, high = loops.node_boxes(points[order], start, count)
+    nodes = CloudNodes(
+        start=start,
+        count=count,
+        level=np.repeat(np.arange(finest + 1, dtype=np.int16), [len(counts) for counts, _ in runs]),
+        spacing_m=np.concatenate([spacings for _, spacings in runs]),
+        box_min=low,
+        box_max=high,
+    )
+    return order, nodes
+
+
+def _sorted_by_code(
+    points: NDArray[np.float32], origin: NDArray[np.float64], extent: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], float]:
+    """Rows by Morton code, their codes, and the codes' cell edge: the scan's own spacing in metres."""
+    loops = compiled_module("featuredb.render.level_loops")
+    # Codes may not overflow, and float32 has no finer steps than this either.
+    finest_m = max(extent, 1e-3) / (2**_CODE_BITS - 1)
+    codes = loops.morton_codes(points, origin, finest_m)
+    by_code = np.argsort(codes, kind="stable")
+    codes = codes[by_code]
+    spacing, edge = finest_m, finest_m
+    for shift in range(_CODE_BITS):
+        cells = loops.occupied(codes, 3 * shift)
+        edge = finest_m * 2.0**shift
+        if len(codes) / cells >= _PROBE_POINTS:
+            spacing = edge * float(np.sqrt(cells / len(codes)))
+            break
+    else:
+        spacing = edge  # a handful of points: one level
+    cell_m = max(spacing, finest_m)
+    codes = loops.morton_codes(points, origin, cell_m)
+    by_code = np.argsort(codes, kind="stable")
+    return by_code, codes[by_code], cell_m
+
+
+def _level_count(codes: NDArray[np.int64], extent: float, cell_m: float, coarsest_points: int) -> int:
+    """The number of the finest level, when level 0 has at most that many points."""
+    loops = compiled_module("featuredb.render.level_loops")
+    finest = 0
+    while finest < _CODE_BITS and loops.occupied(codes, 3 * finest) > coarsest_points:
+        finest += 1
+    return finest
