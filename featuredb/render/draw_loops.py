@@ -75,6 +75,7 @@ def draw(
     max_radius_px: float,
     key: Float32,
     index: Int32,
+    apart_m: Float32,
 ) -> int:
     """Draw runs of points into a depth buffer; returns how many fell into the image.
 
@@ -86,7 +87,8 @@ def draw(
         spacing: (k,) metres, of the runs' own nodes.
         plan, corner, cell_m: see `finest_spacing`.
         pose: (3, 4) of cam_from_local.
-        key, index: (h, w), changed: infinity and -1 where nothing was drawn yet.
+        key, index, apart_m: (h, w), changed: infinity, -1 and anything where nothing was drawn yet; `apart_m`
+            becomes the distance between points of the surface that the pixel shows.
     """
     height, width = key.shape
     size = len(plan)
@@ -115,7 +117,7 @@ def draw(
             radius = min(radius_per_spacing * apart * focal / z, max_radius_px)
             middle_x, middle_y = int(np.floor(u)), int(np.floor(v))
             if 0 <= middle_x < width and 0 <= middle_y < height:
-                _put(key, index, middle_y, middle_x, np.float32(z), i)
+                _put(key, index, apart_m, middle_y, middle_x, np.float32(z), i, apart)
             if radius <= 0.5:
                 continue
             bias = 0.5 * apart / (radius * radius)
@@ -128,55 +130,28 @@ def draw(
                 ):
                     d2 = (tx + 0.5 - u) ** 2 + dy2
                     if d2 <= radius * radius:
-                        _put(key, index, ty, tx, np.float32(z + bias * d2), i)
+                        _put(key, index, apart_m, ty, tx, np.float32(z + bias * d2), i, apart)
     return drawn
 
 
 @compiled
-def _put(key: Float32, index: Int32, y: int, x: int, value: np.float32, i: int) -> None:
+def _put(
+    key: Float32, index: Int32, apart_m: Float32, y: int, x: int, value: np.float32, i: int, apart: np.float32
+) -> None:
     """Keep the nearer; of equals the lower row, so that the order of drawing does not matter."""
     if value < key[y, x] or (value == key[y, x] and i < index[y, x]):
         key[y, x] = value
         index[y, x] = i
+        apart_m[y, x] = apart
 
 
 @compiled
-def merge(key: Float32, index: Int32, other_key: Float32, other_index: Int32) -> None:
+def merge(
+    key: Float32, index: Int32, apart_m: Float32, other_key: Float32, other_index: Int32, other_apart: Float32
+) -> None:
     """Draw another buffer into this one."""
     for y in range(key.shape[0]):
         for x in range(key.shape[1]):
-            if other_index[y, x] >= 0:
-                _put(key, index, y, x, other_key[y, x], other_index[y, x])
-
-
-@compiled
-def depth_of_index(xyz: Float32, index: Int32, pose: Float64, depth: Float32) -> None:
-    """Fill depth (h, w) with the depth of each pixel's point, NaN where there is none."""
-    for y in range(index.shape[0]):
-        for x in range(index.shape[1]):
-            i = index[y, x]
-            if i < 0:
-                depth[y, x] = np.nan
-            else:
-                depth[y, x] = (
-                    pose[2, 0] * xyz[i, 0] + pose[2, 1] * xyz[i, 1] + pose[2, 2] * xyz[i, 2] + pose[2, 3]
-                )
-
-
-@compiled
-def gather_rgb(values: NDArray[np.uint8], index: Int32, picture: NDArray[np.uint8]) -> None:
-    """Fill picture (h, w, 3) with the pixels' points' colours; zero where there is none."""
-    for y in range(index.shape[0]):
-        for x in range(index.shape[1]):
-            i = index[y, x]
-            for c in range(3):
-                picture[y, x, c] = values[i, c] if i >= 0 else 0
-
-
-@compiled
-def gather_grey(values: NDArray[np.uint8], index: Int32, picture: NDArray[np.uint8]) -> None:
-    """Fill picture (h, w) with the pixels' points' values; zero where there is none."""
-    for y in range(index.shape[0]):
-        for x in range(index.shape[1]):
-            i = index[y, x]
-            picture[y, x] = values[i] if i >= 0 else 0
+            i = other_index[y, x]
+            if i >= 0:
+                _put(key, index, apart_m, y, x, other_key[y, x], i, other_apart[y, x])

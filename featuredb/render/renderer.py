@@ -1,48 +1,37 @@
 """Draws a point cloud as a camera with distortion sees it."""
 
-import os
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.render.cloud import CloudNodes, PointCloud
+from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
-from featuredb.render.lens import lens_vector
 from featuredb.render.rendering import Rendering
-
-_PLAN_CELLS = 256  # a side of the plan of spacings: finer than nodes at any level that matters, 256 KiB
+from featuredb.render.splats import SplatOptions, Splats, draw_splats
+from featuredb.render.surfaces import SurfaceOptions, Surfaces, surfaces_of
+from featuredb.render.threads import over_rows, thread_count
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderOptions:
-    """How a cloud is drawn.
+    """How a cloud is drawn. For a cheaper picture ask for fewer pixels: `camera.scaled_to`.
 
     Attributes:
         attributes: colour and intensity too; False draws depth and index only.
-        close_holes: close what lies between the splats of one surface.
-        near_m: nothing closer is drawn.
         finest_px: points closer together than this in the picture are left to coarser levels.
-        radius_per_spacing: radius of a splat, as a share of the distance between points.
-        max_radius_px: of a splat.
         threads: 0 takes as many as the process may use, up to four.
     """
 
     attributes: bool = True
-    close_holes: bool = True
-    near_m: float = 0.3  # a camera does not stand in a wall
-    finest_px: float = 0.6  # two to three points a pixel at most: more cost time and show nothing
-    radius_per_spacing: float = 0.6
-    max_radius_px: float = 12.0
+    # Two to three points a pixel at most: more cost time and show nothing.
+    finest_px: float = 0.6
     threads: int = 0
+    splats: SplatOptions = field(default_factory=SplatOptions)
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
 
 def render(
@@ -50,113 +39,59 @@ def render(
 ) -> Rendering:
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
+    The same picture whatever the number of threads; safe to call from several threads at once.
+
     Raises:
         MissingExtraError: numba is not installed.
     """
     options = options or RenderOptions()
-    loops = compiled_module("featuredb.render.draw_loops")
+    threads = thread_count(options.threads)
     rows = visible_nodes(
-        cloud.nodes, camera, cam_from_local, near_m=options.near_m, finest_px=options.finest_px
+        cloud.nodes, camera, cam_from_local, near_m=options.splats.near_m, finest_px=options.finest_px
     )
-    pose = np.hstack([cam_from_local.rotation, cam_from_local.translation[:, None]])
-    threads = _thread_count(options.threads)
-    _, index, drawn = _draw(cloud, rows, camera, pose, options, threads)
-    depth = np.empty(index.shape, np.float32)
-    loops.depth_of_index(cloud.xyz, index, pose, depth)
+    splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads)
+    surfaces = surfaces_of(cloud.xyz, splats, camera, cam_from_local, options.surfaces, threads)
     rgb = intensity = None
     if options.attributes and cloud.rgb is not None:
-        rgb = np.empty((*index.shape, 3), np.uint8)
-        loops.gather_rgb(cloud.rgb, index, rgb)
+        rgb = _painted(cloud.rgb, splats, surfaces, threads)
     if options.attributes and cloud.intensity is not None:
-        intensity = np.empty(index.shape, np.uint8)
-        loops.gather_grey(cloud.intensity, index, intensity)
+        intensity = _painted(cloud.intensity[:, None], splats, surfaces, threads)[..., 0]
+    depth = _finished(splats, surfaces, threads)
     return Rendering(
         camera=camera,
         cam_from_local=cam_from_local,
         depth=depth,
-        index=index,
+        index=splats.index,
         rgb=rgb,
         intensity=intensity,
-        points_drawn=drawn,
+        points_drawn=splats.points_drawn,
     )
 
 
-def _draw(
-    cloud: PointCloud,
-    rows: NDArray[np.intp],
-    camera: Camera,
-    pose: FloatArray,
-    options: RenderOptions,
-    threads: int,
-) -> tuple[NDArray[np.float32], NDArray[np.int32], int]:
-    """Keys and indices (h, w) of the nearest splats, and how many points fell into the image."""
-    loops = compiled_module("featuredb.render.draw_loops")
-    nodes, lens = cloud.nodes, lens_vector(camera)
-    plan, corner, cell_m = _spacing_plan(nodes, rows)
-    shape = (camera.height, camera.width)
-
-    def draw_part(part: NDArray[np.intp]) -> tuple[Any, Any, int]:
-        key, index = np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int32)
-        runs = np.column_stack([nodes.start[part], nodes.count[part]])
-        drawn = loops.draw(
-            cloud.xyz,
-            runs,
-            nodes.spacing_m[part],
-            plan,
-            corner,
-            cell_m,
-            pose,
-            lens,
-            options.near_m,
-            options.radius_per_spacing,
-            options.max_radius_px,
-            key,
-            index,
-        )
-        return key, index, drawn
-
-    parts = _balanced(rows, nodes.count, threads)
-    results = list(_mapped(draw_part, parts, threads))
-    key, index, drawn = results[0]
-    for other_key, other_index, other_drawn in results[1:]:
-        loops.merge(key, index, other_key, other_index)
-        drawn += other_drawn
-    return key, index, drawn
+def _painted(
+    values: NDArray[np.uint8], splats: Splats, surfaces: Surfaces, threads: int
+) -> NDArray[np.uint8]:
+    """Picture (h, w, c) of values (n, c)."""
+    loops = compiled_module("featuredb.render.picture_loops")
+    picture = np.empty((*splats.index.shape, values.shape[1]), np.uint8)
+    s = surfaces
+    over_rows(
+        lambda first, end: loops.paint(
+            values, splats.index, s.nearness, s.filled, splats.apart_m, s.source, picture, first, end
+        ),
+        len(picture),
+        threads,
+    )
+    return picture
 
 
-def _spacing_plan(nodes: CloudNodes, rows: NDArray[np.intp]) -> tuple[NDArray[np.float32], FloatArray, float]:
-    """The spacing of the finest node drawn over each cell of a plan, its corner, and its cell's edge."""
-    loops = compiled_module("featuredb.render.draw_loops")
-    if len(rows) == 0:
-        return np.full((1, 1), np.inf, np.float32), np.zeros(2), 1.0
-    low, high = nodes.box_min[rows], nodes.box_max[rows]
-    # The plan covers the fine nodes, which are small; coarse ones that reach far out of it keep their own.
-    fine = nodes.level[rows] == nodes.level[rows].max()
-    corner = low[fine, :2].min(axis=0).astype(np.float64)
-    extent = float((high[fine, :2].max(axis=0) - corner).max())
-    cell_m = max(extent, 1e-3) / (_PLAN_CELLS - 1)
-    plan = loops.finest_spacing(low, high, nodes.spacing_m[rows], corner, cell_m, _PLAN_CELLS)
-    return plan, corner, cell_m
-
-
-def _balanced(rows: NDArray[np.intp], count: NDArray[np.int64], parts: int) -> list[NDArray[np.intp]]:
-    """Rows cut into runs of about equally many points."""
-    ends = np.cumsum(count[rows])
-    if len(ends) == 0 or parts == 1:
-        return [rows]
-    cuts = np.searchsorted(ends, ends[-1] * np.arange(1, parts) / parts)
-    return np.split(rows, cuts)
-
-
-def _mapped(function: Callable[[Any], Any], items: list[Any], threads: int) -> Iterable[Any]:
-    """Results in order. Plain threads, since the loops hold no lock and OpenMP's threads forbid a fork."""
-    if threads == 1 or len(items) == 1:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(threads) as pool:
-        return list(pool.map(function, items))
-
-
-def _thread_count(wanted: int) -> int:
-    if wanted < 0:
-        raise InvalidValueError(f"RenderOptions.threads: expected 0 or more, found {wanted}")
-    return wanted or min(len(os.sched_getaffinity(0)), 4)
+def _finished(splats: Splats, surfaces: Surfaces, threads: int) -> NDArray[np.float32]:
+    """Depth (h, w); marks closed holes in the index."""
+    loops = compiled_module("featuredb.render.picture_loops")
+    depth = np.empty(splats.index.shape, np.float32)
+    over_rows(
+        lambda first, end: loops.finish(surfaces.filled, surfaces.source, splats.index, depth, first, end),
+        len(depth),
+        threads,
+    )
+    return depth
