@@ -65,6 +65,10 @@ class ControlFileError(FeatureDbError):
     """A control point file cannot be used; the message names the lines and what to do."""
 
 
+class RegistrationError(FeatureDbError):
+    """A map cannot be registered as asked: its photos are missing, no scan covers it, a file of picks is broken."""
+
+
 class ServiceError(FeatureDbError):
     """The server answered with an error; `code` is one of the wire's error codes."""
 
@@ -73,3 +77,15 @@ class ServiceError(FeatureDbError):
         self.code = code
         self.message = message
         self.request_id = request_id
+
+
+class ScanError(FeatureDbError):
+    """A scan cannot be added or loaded as asked."""
+
+
+class ScanFileError(ScanError):
+    """A scan's file cannot be used: not LAS or LAZ, empty, truncated, broken."""
+
+
+class ScanNotFoundError(StoreError):
+    """The database has no such scan, or none at all."""

@@ -1,0 +1,231 @@
+"""Which frames of a map are worth registering first."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from ingest.register.frame_registration import FramePrior
+
+PhotoReader = Callable[[MapImage], NDArray[np.uint8]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProposalOptions:
+    """How frames are ranked.
+
+    Attributes:
+        view_width_px: of the renders that tell coverage; figures change by a hundredth with twice as many.
+        grid: cells along each side of the photo in which texture and map points are counted.
+        min_coverage: frames that see less of the scan are not proposed; scans have holes (brighton's frames
+            see 0.4 to 0.65), but a quarter of a photo must have something to match.
+        cell_contrast: standard deviation of the grey values (0 to 255) of a cell that has texture: above the
+            noise of sky, water and out-of-focus lawn (2 to 4 in the photos of brighton and lewis).
+        enough_points: map points seen by a frame after which more do not help: structure projection works
+            with hundreds.
+        max_photos_read: so many photos, best by geometry, are opened for their sharpness.
+        photo_side_px: they are shrunk to this side for it.
+        overlap_penalty: the score of a frame is multiplied by 1 - penalty times the share of its map points
+            that frames chosen before see already: frames side by side tell of the same corner of the map.
+    """
+
+    view_width_px: int = 200
+    grid: int = 8
+    min_coverage: float = 0.25
+    cell_contrast: float = 6.0
+    enough_points: int = 300
+    max_photos_read: int = 40
+    photo_side_px: int = 800
+    overlap_penalty: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameScore:
+    """How likely a frame registers, with the figures behind it, each from 0 to 1 unless it says otherwise.
+
+    Attributes:
+        score: product of the others' square roots.
+        coverage: share of the photo that shows the scan, from the prior.
+        downward: mean cosine between viewing rays and the vertical: airborne scans see roofs and ground well,
+            walls hardly.
+        points: map points seen, a number.
+        spread: share of the photo's cells that see map points.
+        texture: share of the photo's cells with texture; NaN where the photo was not opened.
+        sharpness: energy of fine detail over that of coarser detail, of the best frame; NaN likewise.
+    """
+
+    score: float
+    coverage: float
+    downward: float
+    points: int
+    spread: float
+    texture: float
+    sharpness: float
+
+    def as_figures(self) -> dict[str, float]:
+        """JSON-able."""
+        return asdict(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameProposal:
+    """A frame with its rank's reasons and the prior that its registration starts from."""
+
+    image: MapImage
+    score: FrameScore
+    prior: FramePrior
+
+
+def propose_frames(
+    feature_map: FeatureMap,
+    cloud: PointCloud,
+    priors: Mapping[int, FramePrior],
+    read_gray: PhotoReader | None,
+    options: ProposalOptions | None = None,
+) -> list[FrameProposal]:
+    """All frames that see enough of the scan, the most promising first.
+
+    The first few are made to see different parts of the map: each next frame is the one with the
+    best score after its overlap with those before it is counted against it.
+
+    Args:
+        priors: of the images to be ranked, by image id, in the cloud's frame.
+        read_gray: gives the photo's grey pixels (h, w) uint8, at any size; None ranks by geometry alone.
+    """
+    options = options or ProposalOptions()
+    rough = []
+    for image in feature_map.images:
+        if image.image_id in priors:
+            score = _geometry_score(feature_map, image, priors[image.image_id], cloud, options)
+            if score.coverage >= options.min_coverage:
+                rough.append(FrameProposal(image=image, score=score, prior=priors[image.image_id]))
+    rough.sort(key=lambda p: (-p.score.score, p.image.image_id))
+    if read_gray is not None:
+        read = [_photo_figures(read_gray(p.image), options) for p in rough[: options.max_photos_read]]
+        best = max((sharpness for _, sharpness in read), default=1.0) or 1.0
+        rough = [
+            _with_photo(p, *(read[i] if i < len(read) else (np.nan, np.nan)), best)
+            for i, p in enumerate(rough)
+        ]
+    return _spread_out(feature_map, rough, options)
+
+
+def _geometry_score(
+    feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud, options: ProposalOptions
+) -> FrameScore:
+    camera = feature_map.cameras[image.camera_id]
+    small = small_camera(camera, options.view_width_px)
+    seen = render(cloud, small, prior.cam_from_local, RenderOptions(attributes=False))
+    valid = seen.valid
+    coverage = float(valid.mean())
+    mine = feature_map.observations.image_id == image.image_id
+    points = len(np.unique(feature_map.observations.point_index[mine]))
+    cells = feature_map.observations.xy[mine] / [camera.width, camera.height] * options.grid
+    spread = len(np.unique(np.floor(cells).clip(0, options.grid - 1), axis=0)) / options.grid**2
+    return _scored(
+        FrameScore(
+            score=0.0,
+            coverage=coverage,
+            downward=_downward(small, prior.cam_from_local, valid),
+            points=points,
+            spread=spread,
+            texture=float("nan"),
+            sharpness=float("nan"),
+        ),
+        options,
+    )
+
+
+def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
+    """Mean cosine between the rays of valid pixels and straight down, 0 where it is negative."""
+    rows, columns = np.nonzero(valid)
+    if not len(rows):
+        return 0.0
+    step = max(1, len(rows) // 2000)
+    rays = camera.unproject(np.column_stack([columns, rows])[::step] + 0.5)
+    rays = np.column_stack([rays, np.ones(len(rays))])
+    up = rays @ pose.rotation[:, 2] / np.linalg.norm(rays, axis=1)
+    return float(np.maximum(-up[np.isfinite(up)], 0.0).mean())
+
+
+def _scored(score: FrameScore, options: ProposalOptions) -> FrameScore:
+    factors = [
+        score.coverage,
+        score.downward,
+        min(score.points / options.enough_points, 1.0),
+        score.spread,
+        score.texture,
+        score.sharpness,
+    ]
+    value = float(np.prod([np.sqrt(f) for f in factors if np.isfinite(f)]))
+    return FrameScore(**{**asdict(score), "score": value})
+
+
+def _photo_figures(gray: NDArray[np.uint8], options: ProposalOptions) -> tuple[float, float]:
+    """Share of textured cells, and the energy of the finest detail over that of twice as coarse detail."""
+    shrink = options.photo_side_px / max(gray.shape)
+    small = cv2.resize(gray, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA).astype(np.float32)
+    blocks = [np.array_split(band, options.grid, axis=1) for band in np.array_split(small, options.grid)]
+    contrast = np.array([[block.std() for block in row] for row in blocks])
+    fine = small - cv2.GaussianBlur(small, (0, 0), 1.0)
+    coarse = cv2.GaussianBlur(small, (0, 0), 1.0) - cv2.GaussianBlur(small, (0, 0), 2.0)
+    sharpness = float(fine.std() / max(float(coarse.std()), 1e-6))
+    return float((contrast >= options.cell_contrast).mean()), sharpness
+
+
+def _with_photo(proposal: FrameProposal, texture: float, sharpness: float, best: float) -> FrameProposal:
+    figures = asdict(proposal.score) | {"texture": texture, "sharpness": sharpness / best}
+    score = _scored(FrameScore(**figures), ProposalOptions())
+    return FrameProposal(image=proposal.image, score=score, prior=proposal.prior)
+
+
+def _spread_out(
+    feature_map: FeatureMap, proposals: Sequence[FrameProposal], options: ProposalOptions
+) -> list[FrameProposal]:
+    """Order by score and by what frames before have not seen."""
+    observations = feature_map.observations
+    sees = {
+        p.image.image_id: np.unique(observations.point_index[observations.image_id == p.image.image_id])
+        for p in proposals
+    }
+    seen = np.zeros(len(feature_map.points), bool)
+    left, ordered = list(proposals), []
+    while left:
+        values = [
+            p.score.score * (1.0 - options.overlap_penalty * _mean(seen[sees[p.image.image_id]]))
+            for p in left
+        ]
+        chosen = left.pop(int(np.argmax(values)))
+        seen[sees[chosen.image.image_id]] = True
+        ordered.append(chosen)
+    return ordered
+
+
+def _mean(values: NDArray[np.bool_]) -> float:
+    return float(values.mean()) if len(values) else 0.0
+
+
+def small_camera(camera: Camera, width_px: int) -> Camera:
+    """The same lens for a smaller picture of about that width, never a larger one.
+
+    The height is rounded to whole pixels; widths that keep the aspect within a tenth of a percent are found
+    for any camera of usual size.
+    """
+    width = min(width_px, camera.width)
+    while (
+        width < camera.width
+        and abs(_height(camera, width) * camera.width / (width * camera.height) - 1) > 1e-3
+    ):
+        width += 1
+    return camera.scaled_to(width, _height(camera, width))
+
+
+def _height(camera: Camera, width: int) -> int:
+    return max(1, round(width * camera.height / camera.width))

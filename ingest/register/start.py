@@ -1,0 +1,220 @@
+"""Where the registration of a frame starts: the map's present placement, or a rough pose from a person."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from featuredb.errors import RegistrationError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.render.cloud import PointCloud
+from ingest.register.frame_registration import FramePrior
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartOptions:
+    """How far a start is trusted.
+
+    Attributes:
+        min_sigma_horizontal_m: scans and maps of different makers disagree by that much without anyone's
+            fault (datum realisations, plate motion).
+        min_sigma_vertical_m: after the heights of map and scan have been compared.
+        min_sigma_angle_deg: bent reconstructions turn single frames by some tenths of a degree.
+        shift_reach_m: a map point that finds no scan point within this horizontal distance says nothing of
+            the height; a few times the spacing of sparse airborne scans.
+        min_shift_points: fewer give no height.
+        max_shift_points: more only take longer.
+        min_picks: P3P takes three and a fourth to choose its solution; two more make an outlier visible.
+        pick_sigma_px_rel: how well a person marks a point, as a share of the image's longer side: 3 pixels
+            in 4000.
+        pick_sigma_m: how well a person reads a coordinate off a scan.
+        pick_tolerance_rel: a pick that misses by more is an outlier: 20 pixels in 4000, six sigmas.
+        min_pick_share: with fewer picks that agree, nobody knows which ones are right.
+        max_pick_sigma_m, max_pick_sigma_deg: picks on a line or close together leave the pose open.
+    """
+
+    min_sigma_horizontal_m: float = 1.0
+    min_sigma_vertical_m: float = 1.0
+    min_sigma_angle_deg: float = 1.0
+    shift_reach_m: float = 3.0
+    min_shift_points: int = 30
+    max_shift_points: int = 5000
+    min_picks: int = 6
+    pick_sigma_px_rel: float = 0.00075
+    pick_sigma_m: float = 0.2
+    pick_tolerance_rel: float = 0.005
+    min_pick_share: float = 0.6
+    max_pick_sigma_m: float = 20.0
+    max_pick_sigma_deg: float = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeightShift:
+    """What the heights of a map lack to those of a scan.
+
+    Attributes:
+        shift_m: median of scan minus map, metres; to be added to the map's heights.
+        sigma_m: robust standard deviation of one point's difference (roughness, slope times horizontal
+            error, vegetation).
+        points: map points that had a scan point near.
+        share: of the map's points.
+    """
+
+    shift_m: float
+    sigma_m: float
+    points: int
+    share: float
+
+
+def height_shift(feature_map: FeatureMap, cloud: PointCloud, options: StartOptions) -> HeightShift | None:
+    """Compare heights where map points and scan points lie above each other; None where they hardly do.
+
+    The surface at a place is the scan point nearest in plan. Horizontal errors of some metres only widen the
+    spread of the differences where the ground is not a cliff, and the median forgives houses and trees.
+    """
+    if not len(cloud):
+        return None
+    points = feature_map.points_local(cloud.frame)
+    step = max(1, len(points) // options.max_shift_points)
+    points = points[::step]
+    low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
+    near = (
+        (cloud.xyz[:, :2] >= low - options.shift_reach_m) & (cloud.xyz[:, :2] <= high + options.shift_reach_m)
+    ).all(axis=1)
+    if not near.any():
+        return None
+    scan = cloud.xyz[near].astype(np.float64)
+    scan = scan[:: max(1, len(scan) // 1_000_000)]  # a point in half a metre is enough for a height
+    distance, nearest = cKDTree(scan[:, :2]).query(points[:, :2], distance_upper_bound=options.shift_reach_m)
+    found = np.isfinite(distance)
+    if found.sum() < options.min_shift_points:
+        return None
+    difference = scan[np.asarray(nearest)[found], 2] - points[found, 2]
+    median = float(np.median(difference))
+    return HeightShift(
+        shift_m=median,
+        sigma_m=float(1.4826 * np.median(np.abs(difference - median))),
+        points=int(found.sum()),
+        share=float(found.mean()),
+    )
+
+
+def prior_from_map(
+    feature_map: FeatureMap,
+    image: MapImage,
+    shift: HeightShift | None,
+    options: StartOptions,
+) -> FramePrior:
+    """The pose that the map's present placement gives, with the placement's uncertainty.
+
+    Args:
+        shift: moves the prior to the scan's heights, and takes the place of the placement's vertical sigma.
+    """
+    covariance = feature_map.placement.covariance
+    pose = image.cam_from_local
+    center = pose.center
+    jacobian = point_jacobian(center)
+    spread = jacobian @ covariance @ jacobian.T
+    vertical = float(np.sqrt(spread[2, 2]))
+    if shift is not None:
+        center = center + np.array([0.0, 0.0, shift.shift_m])
+        pose = Rigid3(rotation=pose.rotation, translation=-pose.rotation @ center)
+        vertical = shift.sigma_m
+    return FramePrior(
+        cam_from_local=pose,
+        sigma_horizontal_m=max(
+            float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])), options.min_sigma_horizontal_m
+        ),
+        sigma_vertical_m=max(vertical, options.min_sigma_vertical_m),
+        sigma_heading_deg=max(float(np.degrees(np.sqrt(covariance[3, 3]))), options.min_sigma_angle_deg),
+        sigma_tilt_deg=max(
+            float(np.degrees(np.sqrt(max(covariance[1, 1], covariance[2, 2])))), options.min_sigma_angle_deg
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RoughPose:
+    """A pose that a person gives for one photo.
+
+    Attributes:
+        image: the photo's name.
+        utm: (3,) easting, northing, height of the camera, in the map's zone and the scan's datum.
+        yaw_deg: clockwise from grid north: where the optical axis points in plan; of a camera that looks
+            straight down, where the top of the photo points.
+        pitch_deg: of the optical axis above the horizon; -90 looks straight down.
+        roll_deg: of the camera about its optical axis, clockwise as the camera sees it.
+        sigma_horizontal_m, sigma_vertical_m, sigma_heading_deg, sigma_tilt_deg: how rough.
+    """
+
+    image: str
+    utm: FloatArray
+    yaw_deg: float
+    pitch_deg: float
+    roll_deg: float = 0.0
+    sigma_horizontal_m: float = 10.0
+    sigma_vertical_m: float = 10.0
+    sigma_heading_deg: float = 10.0
+    sigma_tilt_deg: float = 5.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "utm", frozen_array("RoughPose.utm", self.utm, (3,)))
+
+
+def prior_from_rough_pose(rough: RoughPose, feature_map: FeatureMap) -> FramePrior:
+    """The rough pose in the map's local frame."""
+    center = feature_map.frame.enu_from_utm(rough.utm, feature_map.epsg)
+    grid_from_local = feature_map.frame.grid_from_enu(center, feature_map.epsg)
+    rotation = cam_from_grid(rough.yaw_deg, rough.pitch_deg, rough.roll_deg) @ grid_from_local
+    return FramePrior(
+        cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
+        sigma_horizontal_m=rough.sigma_horizontal_m,
+        sigma_vertical_m=rough.sigma_vertical_m,
+        sigma_heading_deg=rough.sigma_heading_deg,
+        sigma_tilt_deg=rough.sigma_tilt_deg,
+    )
+
+
+def cam_from_grid(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
+    """Rotation (3, 3) from east, north, up to camera axes; angles as in RoughPose."""
+    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks north
+    yaw = so3_exp([0.0, 0.0, np.radians(yaw_deg)])  # turns the world left, so the camera right
+    pitch = so3_exp([-np.radians(pitch_deg), 0.0, 0.0])
+    roll = so3_exp([0.0, 0.0, -np.radians(roll_deg)])
+    return np.asarray(roll @ pitch @ level @ yaw, dtype=np.float64)
+
+
+def look_at_angles(utm: FloatArray, target_utm: FloatArray) -> tuple[float, float]:
+    """Yaw and pitch in degrees of a camera at `utm` (3,) that looks at `target_utm` (3,).
+
+    Raises:
+        RegistrationError: both are the same place.
+    """
+    east, north, up = np.asarray(target_utm, dtype=np.float64) - np.asarray(utm, dtype=np.float64)
+    if np.hypot(np.hypot(east, north), up) < 1e-3:
+        raise RegistrationError("pose: look_at is the camera's own position; give a point that it looks at")
+    return float(np.degrees(np.arctan2(east, north))), float(
+        np.degrees(np.arctan2(up, np.hypot(east, north)))
+    )
+
+
+def image_named(feature_map: FeatureMap, name: str) -> MapImage:
+    """The image of a map by its name, or by the last part of it where only one image has that.
+
+    Raises:
+        RegistrationError: none, or more than one.
+    """
+    exact = [image for image in feature_map.images if image.name == name]
+    found = exact or [image for image in feature_map.images if image.name.rsplit("/", 1)[-1] == name]
+    if len(found) != 1:
+        names = ", ".join(image.name for image in (found or feature_map.images)[:6])
+        what = "several images are" if found else "no image is"
+        raise RegistrationError(
+            f"map {feature_map.map_id}: {what} called {name!r}; "
+            f"{'write its whole name' if found else 'its images'}: {names}, ..."
+        )
+    return found[0]
