@@ -172,7 +172,7 @@ def _judge(
             None,
         )
     noise = noise_variance_factor(weighted, freedom, options.noise_confidence)
-    bias = _bias_shares(residuals[inliers] / sigmas[inliers], noise, freedom, options.noise_confidence)
+    bias = _bias_shares(residuals[inliers] / sigmas[inliers], freedom)
     covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise, bias)
     figures["noise_variance_factor"] = noise
     figures["bias_sigma_m"] = (np.median(sigmas[inliers], axis=0) * np.sqrt(bias)).tolist()
@@ -198,21 +198,22 @@ def _covariance(
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def _bias_shares(normalised: FloatArray, noise_factor: float, freedom: int, confidence: float) -> FloatArray:
-    """(3,) share of each axis' variance that is taken for bias, east, north, up.
+def _bias_shares(normalised: FloatArray, freedom: int) -> FloatArray:
+    """(3,) share of each axis' variance that is taken for bias, east, north, up: what the noise leaves.
 
     A height is often off by metres and yet steady to decimetres, steadier than the position: by one noise
     factor for all axes, part of its bias would pass for noise, which averages out. So the height's own
-    factor counts where it leaves more to the bias, and likewise that of the horizontal axes.
+    factor counts where it leaves more to the bias, and likewise that of the horizontal axes. The noise is
+    counted as measured here: its upper limit would take from the bias what may be the bias's.
 
     Args:
         normalised: (n, 3) residuals over sigmas.
-        noise_factor, freedom: of all of them together; the degrees of freedom are shared out evenly.
+        freedom: degrees of freedom of all of them together; they are shared out evenly.
     """
     squared = (normalised**2).sum(axis=0)
-    horizontal = noise_variance_factor(float(squared[:2].sum()), freedom * 2 / 3, confidence)
-    vertical = noise_variance_factor(float(squared[2]), freedom / 3, confidence)
-    noise = np.minimum(noise_factor, np.array([horizontal, horizontal, vertical]))
+    horizontal = float(squared[:2].sum()) / (freedom * 2 / 3)
+    vertical = float(squared[2]) / (freedom / 3)
+    noise = np.minimum(float(squared.sum()) / freedom, np.array([horizontal, horizontal, vertical]))
     return np.asarray(np.maximum(0.0, 1.0 - noise), dtype=np.float64)
 
 
