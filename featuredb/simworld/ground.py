@@ -65,6 +65,51 @@ def paint_ground(plan: GroundPlan, texel_m: float) -> Texture:
     return Texture.from_image(_with_shadows(painter, image), texel_m)
 
 
+# Reflectance at 1064 nm, strength of its coarse and its fine noise: grass outshines stone, asphalt is dark.
+_INFRARED = {
+    "grass": (0.46, 0.14, 0.10),
+    "asphalt": (0.11, 0.10, 0.05),
+    "pavement": (0.27, 0.06, 0.05),
+    "gravel": (0.30, 0.08, 0.12),
+    "soil": (0.24, 0.18, 0.12),
+    "cobbles": (0.20, 0.08, 0.08),
+    "bank": (0.34, 0.20, 0.14),
+}
+_PAINT_GAMMA = 1.5  # what is painted over a material differs from it in the infrared more than in light
+
+
+def paint_infrared(plan: GroundPlan, texel_m: float) -> NDArray[np.float32]:
+    """Reflectance (h, w) float32 of the ground in the near infrared, texel for texel that of `paint_ground`.
+
+    The same materials, markings, cracks and litter lie at the same places; noise is its own, and there are no
+    shadows.
+    """
+    painter = _Painter(plan, texel_m)
+    _paint_labels(painter)
+    _colours(painter)  # for its random numbers, which come before those of the markings
+    greys, levels = np.zeros(256, np.uint8), np.zeros((3, 256), np.float32)
+    for name, label in _LABEL.items():
+        greys[label] = round(sum(_KINDS[name][0]) / 3)
+        levels[:, label] = _INFRARED[name]
+    before = cv2.LUT(painter.labels, greys)
+    image = cv2.merge([before] * 3)
+    _paint_marks(painter, image)
+    _scatter(painter, image)
+    factors = (np.arange(256, dtype=np.float32)[None] / np.maximum(greys[:, None], 1)) ** _PAINT_GAMMA
+    rng = np.random.default_rng((plan.seed, 32))
+    h, w = painter.shape
+    coarse, fine = fractal(h, w, rng, octaves=8, gain=1.4), rng.standard_normal((h, w), dtype=np.float32)
+    result = np.empty((h, w), np.float32)
+    for r in range(0, h, 256):  # in bands, for memory's sake
+        rows = slice(r, min(r + 256, h))
+        labels = painter.labels[rows]
+        base, low, high = (cv2.LUT(labels, table) for table in levels)
+        result[rows] = (
+            base * (1.0 + low * coarse[rows] + high * fine[rows]) * factors[labels, image[rows, :, 1]]
+        )
+    return np.clip(result, 0.01, 0.95)
+
+
 def _paint_labels(p: _Painter) -> None:
     plan = p.plan
     for garden in plan.gardens:

@@ -102,11 +102,16 @@ class Faces:
 
     def shaded(self, to_sun: ArrayLike, ambient: float = 0.55) -> "Faces":
         """The same faces with Lambert's light from the unit vector `to_sun` multiplied into `tint`."""
+        light = self.sunlight(to_sun, ambient)
+        columns = {n: getattr(self, n) for n, _, _ in _FACE_COLUMNS}
+        return Faces(**{**columns, "tint": self.tint * light[:, None]})
+
+    def sunlight(self, to_sun: ArrayLike, ambient: float = 0.55) -> FloatArray:
+        """Lambert's light (n,) from the unit vector `to_sun`, between `ambient` and 1.1."""
         normal = np.cross(self.edge_s, self.edge_t)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         light = ambient + (1.1 - ambient) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0)
-        columns = {n: getattr(self, n) for n, _, _ in _FACE_COLUMNS}
-        return Faces(**{**columns, "tint": self.tint * light[:, None]})
+        return np.asarray(light, dtype=np.float64)
 
 
 _FACE_COLUMNS: tuple[tuple[str, int, Any], ...] = (

@@ -27,7 +27,7 @@ OTHER_TOWN_PLACE = (-33.4512, -70.6215, 611.0, 32719)
 GROUND_ID, WATER_ID, BRIDGE_ID = 1, 2, 3
 _LAND_M = 1500.0  # how far the land goes on around the town
 _ROAD_M = 6.5
-_BUILDING_ID, _TREE_ID = 10_000, 20_000
+BUILDING_ID, TREE_ID = 10_000, 20_000
 
 
 def make_town(
@@ -55,8 +55,8 @@ def make_town(
     enu_from_town = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
     plan, layout = _lay_out(seed, rng, size_m)
     parts = [_ground_faces(plan), _water_and_bridges(plan), *layout.small]
-    parts += [house(b, float(plan.height(b.y)), _BUILDING_ID + i) for i, b in enumerate(plan.buildings)]
-    parts += [_chimney(b, _BUILDING_ID + i) for i, b in enumerate(plan.buildings) if b.ridge > 0]
+    parts += [house(b, float(plan.height(b.y)), BUILDING_ID + i) for i, b in enumerate(plan.buildings)]
+    parts += [_chimney(b, BUILDING_ID + i) for i, b in enumerate(plan.buildings) if b.ridge > 0]
     trunks, crowns = _trees(plan, rng, enu_from_town)
     faces = Faces.concatenate([*parts, trunks]).shaded(plan.to_sun).moved(enu_from_town, np.zeros(3))
     return Scene(
@@ -251,7 +251,7 @@ def _trees(plan: GroundPlan, rng: np.random.Generator, enu_from_town: FloatArray
     for i, (x, y, radius) in enumerate(plan.trees):
         ground = float(plan.height(y))
         trunks.append(
-            box(x, y, ground - 0.1, (0.3, 0.3, 1.6 * radius), _TREE_ID + i, texture="wood", detail=(x, y))
+            box(x, y, ground - 0.1, (0.3, 0.3, 1.6 * radius), TREE_ID + i, texture="wood", detail=(x, y))
         )
         tint = rng.uniform(0.7, 1.15) * np.array([rng.uniform(0.8, 1.25), 1.0, rng.uniform(0.7, 1.0)])
         for _ in range(3):
@@ -259,7 +259,7 @@ def _trees(plan: GroundPlan, rng: np.random.Generator, enu_from_town: FloatArray
             centres.append(enu_from_town @ (np.array([x, y, ground + 1.9 * radius]) + offset))
             radii.append(radius * rng.uniform(0.6, 0.95) * np.array([1, 1, rng.uniform(0.8, 1.2)]))
             tints.append(tint)
-            ids.append(_TREE_ID + i)
+            ids.append(TREE_ID + i)
     n = len(centres)
     crowns = Ellipsoids(
         center=np.reshape(centres, (n, 3)),
