@@ -15,7 +15,7 @@ from featuredb.render.threads import over_rows
 
 _MOMENTS = 9  # of picture_loops.plane_moments
 _BLOCK_PER_SPACING = 1.5  # blocks of three by three then hold about twenty points for a plane
-_WORTH_TILTING_PX = 1.5  # points closer together leave less than a pixel of slope to make good
+_SMALLEST_BLOCK_PX = 4  # smaller ones cost more and see only the points' noise
 _RADII_PX = (1, 2, 3, 4, 6, 8, 12, 16)  # of closings; each is tried from the largest down
 
 
@@ -74,7 +74,7 @@ def surfaces_of(
         threads,
     )
     apart_px = _apart_px(splats, nearness, camera.focal_px)
-    if options.tilt_splats and np.median(apart_px) > _WORTH_TILTING_PX:
+    if options.tilt_splats and len(apart_px):
         _tilt(xyz, splats, camera, pose, float(np.median(apart_px)), nearness, threads)
     source = np.zeros(nearness.shape, np.int32)
     if not options.close_holes or not len(apart_px):
@@ -122,7 +122,7 @@ def _tilt(
     """Give each splat the slope of the plane through the points around it."""
     loops = compiled_module("featuredb.render.picture_loops")
     lens, index = lens_vector(camera), splats.index
-    side = int(np.ceil(_BLOCK_PER_SPACING * apart_px))
+    side = max(int(np.ceil(_BLOCK_PER_SPACING * apart_px)), _SMALLEST_BLOCK_PX)
     blocks = -(-camera.height // side), -(-camera.width // side)
     moments = np.zeros((*blocks, _MOMENTS))
     over_rows(

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rays import pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.rays import pixel_rays
 from featuredb.simworld.scene import SKY_ID, Ellipsoids, Faces
 from featuredb.simworld.shading import Float32, Look, ellipsoid_colour, face_colour, sky_colour
 from featuredb.simworld.texture import Image8

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rays import pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.rays import pixel_rays
 from featuredb.simworld.scene import Ellipsoids, Faces
 
 _NEAR_M = 0.1  # nothing closer is drawn; a camera never stands in a wall

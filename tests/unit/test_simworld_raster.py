@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rays import pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.raster import render
-from featuredb.simworld.rays import pixel_rays
 from featuredb.simworld.scene import SKY_ID, TEXTURES, Ellipsoids, Faces, Scene
 from featuredb.simworld.shading import Look
 from featuredb.simworld.shot import look_pose
