@@ -1,0 +1,77 @@
+"""Compiled loop of the local consistency; import it through `featuredb.render.compiled.compiled_module`."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.render.compiled import compiled
+
+
+@compiled
+def neighbour_support(
+    photo: FloatArray,
+    reference: FloatArray,
+    neighbour: NDArray[np.int64],
+    min_gap: float,
+    tolerance: float,
+    floor: float,
+    max_turn: float,
+    max_log_zoom: float,
+    area: float,
+) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Largest number of neighbours of each match that one similarity moves to where they are.
+
+    Args:
+        photo, reference: (m, 2) pixels. neighbour: (m, k) rows, -1 where there are fewer.
+        min_gap, floor: pixels. tolerance: share of the distance. max_turn: radians.
+        area: square pixels over which false matches are spread.
+
+    Returns:
+        Support (m,); expected number of chance hits at the winning similarity (m,); log scale and rotation
+        (m, 2) of that similarity.
+    """
+    m, k = neighbour.shape
+    support = np.zeros(m, np.int64)
+    expected = np.zeros(m)
+    log_z = np.zeros((m, 2))
+    px, py, qx, qy = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
+    reach = np.empty(k)
+    for i in range(m):
+        n = 0
+        for c in range(k):
+            j = neighbour[i, c]
+            if j < 0 or j == i:
+                continue
+            dx, dy = photo[j, 0] - photo[i, 0], photo[j, 1] - photo[i, 1]
+            far = np.sqrt(dx * dx + dy * dy)
+            if far < min_gap:
+                continue
+            px[n], py[n] = dx, dy
+            qx[n], qy[n] = reference[j, 0] - reference[i, 0], reference[j, 1] - reference[i, 1]
+            reach[n] = max(tolerance * far, floor)
+            n += 1
+        for h in range(n):
+            square = px[h] * px[h] + py[h] * py[h]
+            a = (qx[h] * px[h] + qy[h] * py[h]) / square
+            b = (qy[h] * px[h] - qx[h] * py[h]) / square
+            size = a * a + b * b
+            if size <= 0.0:
+                continue
+            zoom, turn = 0.5 * np.log(size), np.arctan2(b, a)
+            if abs(zoom) > max_log_zoom or abs(turn) > max_turn:
+                continue
+            scale = np.sqrt(size)
+            count = 0
+            for c in range(n):
+                ex = a * px[c] - b * py[c] - qx[c]
+                ey = b * px[c] + a * py[c] - qy[c]
+                limit = reach[c] * scale
+                if ex * ex + ey * ey <= limit * limit:
+                    count += 1
+            if count > support[i]:
+                support[i] = count
+                log_z[i, 0], log_z[i, 1] = zoom, turn
+        scale = np.exp(log_z[i, 0])
+        for c in range(n):
+            expected[i] += np.pi * (reach[c] * scale) ** 2 / area
+    return support, expected, log_z
