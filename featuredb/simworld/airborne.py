@@ -26,6 +26,7 @@ _GPS_START_S = 396_871_234.0  # adjusted standard GPS time of a day in spring
 _DETECTED = 0.012  # weakest echo, as share of a white wall's
 _MIRROR_DEG = 2.5  # within this angle off the nadir calm water throws the beam back
 _WATER_SEEN = 0.08  # share of beams that water answers beyond it
+_HIGH_M = 20.0  # above the ground: where noise counts as high
 _COUNTS = 5200.0  # intensity of a white wall at nadir from the flying height
 
 
@@ -362,5 +363,5 @@ def _classes(
     height_class = np.select([above > 2.0, above > 0.5], [HIGH_VEGETATION, MEDIUM_VEGETATION], LOW_VEGETATION)
     classes[tree] = height_class[tree]
     labelled = outlier & (rng.random(len(xyz)) < strip.options.noise_labelled)
-    classes[labelled] = np.where(above[labelled] > 0, HIGH_NOISE, LOW_NOISE)
+    classes[labelled] = np.where(above[labelled] > _HIGH_M, HIGH_NOISE, LOW_NOISE)
     return classes

@@ -92,8 +92,7 @@ def hit_faces(beams: Beams, faces: Faces) -> Hits:
         toward = d @ normal[i]
         start_x = beams.start_x(*window)
         offset = float(normal[i] @ faces.origin[i]) - normal[i, 2] * beams.height - normal[i, 0] * start_x
-        with np.errstate(divide="ignore", invalid="ignore"):
-            r = offset / toward
+        r = offset / np.where(toward < 0, toward, -1.0)  # beams that see the inside are left out below
         q0 = start_x - faces.origin[i, 0]
         q1, q2 = -faces.origin[i, 1], beams.height - faces.origin[i, 2]
         s, t = (q0 * a[0] + (q1 * a[1] + q2 * a[2]) + r * (d @ a) for a in (along_s[i], along_t[i]))
