@@ -28,6 +28,7 @@ GROUND_ID, WATER_ID, BRIDGE_ID = 1, 2, 3
 _LAND_M = 1500.0  # how far the land goes on around the town
 _ROAD_M = 6.5
 BUILDING_ID, TREE_ID = 10_000, 20_000
+WATER_LEVEL_M = -1.9
 
 
 def make_town(
@@ -193,7 +194,7 @@ def _ground_faces(plan: GroundPlan) -> Faces:
 def _water_and_bridges(plan: GroundPlan) -> Faces:
     w, h = plan.size
     y0, y1 = plan.river
-    level = -1.9
+    level = WATER_LEVEL_M
     parts = [
         face(
             (-_LAND_M, y0, level),
