@@ -81,10 +81,10 @@ class Database:
             StoreError: a database is there and `exist_ok` is false, or the place cannot be written.
         """
         database = cls(str(url), storage_options)
-        if not exist_ok and Table.exists(database._table_url(MAPS), database._storage_options):
+        if not exist_ok and Table.exists(database.table_url(MAPS), database._storage_options):
             raise StoreError(f"there is a database at {database.url} already")
         for name in (*CHILD_TABLES, MAPS):
-            Table.create(database._table_url(name), SPECS[name], database._storage_options)
+            Table.create(database.table_url(name), SPECS[name], database._storage_options)
         database.table(MAPS)
         return database
 
@@ -105,9 +105,14 @@ class Database:
         """Last part of the URL, which names the database on the network."""
         return self.url.rstrip("/").rsplit("/", 1)[-1]
 
+    @property
+    def storage_options(self) -> dict[str, str] | None:
+        """What deltalake is told beside the URL."""
+        return self._storage_options
+
     def table(self, name: str, version: int | None = None) -> Table:
         """A table at its newest or the given version; for maintenance and tests."""
-        return Table.load(self._table_url(name), SPECS[name], self._storage_options, version)
+        return Table.load(self.table_url(name), SPECS[name], self._storage_options, version)
 
     def snapshot(self, as_of: int | datetime | None = None) -> Snapshot:
         """The newest version, that of a number, or the one that was newest at a time (aware datetime).
@@ -279,7 +284,8 @@ class Database:
                 self.table(name).append(rows)
         return encoded
 
-    def _table_url(self, name: str) -> str:
+    def table_url(self, name: str) -> str:
+        """Where a table lies."""
         return f"{self.url}/{name}"
 
 

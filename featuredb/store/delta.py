@@ -215,8 +215,8 @@ class Table:
             for entry in entries
         ]
 
-    def append(self, rows: pa.Table) -> None:
-        """Append child rows; concurrent appends rebase and all land.
+    def append(self, rows: pa.Table | pa.RecordBatchReader) -> None:
+        """Append child rows, of a table or as a stream; concurrent appends rebase and all land.
 
         Raises:
             ConflictError, StoreError
@@ -264,7 +264,11 @@ class Table:
         return [str(path) for path in removed]
 
     def _write(
-        self, rows: pa.Table, *, mode: Literal["append", "overwrite"], properties: CommitProperties
+        self,
+        rows: pa.Table | pa.RecordBatchReader,
+        *,
+        mode: Literal["append", "overwrite"],
+        properties: CommitProperties,
     ) -> None:
         try:
             write_deltalake(

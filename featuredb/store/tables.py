@@ -2,7 +2,8 @@
 
 `maps` has one row per map and decides what is visible. The child tables hold the rows of images, points and
 observations; each row names the `write_id` of the commit attempt that wrote it, and counts only when a row of
-`maps` names that `write_id`. See docs/store.md.
+`maps` names that `write_id`. `lidar` and `lidar_points` hold scans in the same way, and are made when the first
+scan is added. See docs/store.md.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ POINTS = "points"
 OBSERVATIONS = "observations"
 CHILD_TABLES = (IMAGES, POINTS, OBSERVATIONS)
 TABLES = (MAPS, *CHILD_TABLES)
+LIDAR = "lidar"
+LIDAR_POINTS = "lidar_points"
+LIDAR_TABLES = (LIDAR, LIDAR_POINTS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +152,71 @@ _OBSERVATIONS_SCHEMA = pa.schema(
     ]
 )
 
+_SCAN_FILE = pa.struct(
+    [
+        _required("name", pa.string()),
+        _required("sha256", pa.string()),
+        _required("size_bytes", pa.int64()),
+        _required("points", pa.int64()),
+        _required("crs", pa.string()),
+        _required("transformation", pa.string()),
+        pa.field("transformation_accuracy_m", pa.float64()),
+    ]
+)
+_CLASS_COUNT = pa.struct([_required("classification", pa.int32()), _required("points", pa.int64())])
+
+_LIDAR_SCHEMA = pa.schema(
+    [
+        _required("scan_id", pa.string()),
+        _required("write_id", pa.string()),
+        _required("points_checksum", pa.string()),
+        _required("name", pa.string()),
+        _required("status", pa.string()),
+        _required("status_reason", pa.string()),
+        _required("created_at", pa.timestamp("us", tz="UTC")),
+        _required("files", pa.list_(pa.field("element", _SCAN_FILE, nullable=False))),
+        _required("epsg", pa.int32()),
+        _required("height_datum", pa.string()),
+        *(_required(name, pa.float64()) for name in BOUNDS),
+        _required("tiles", _STRINGS),
+        _required("points", pa.int64()),
+        _required("points_in_files", pa.int64()),
+        _required("dropped_noise", pa.int64()),
+        _required("dropped_withheld", pa.int64()),
+        _required("dropped_outliers", pa.int64()),
+        _required("level_points", pa.list_(pa.field("element", pa.int64(), nullable=False))),
+        _required("spacing_m", pa.float64()),
+        _required("classes", pa.list_(pa.field("element", _CLASS_COUNT, nullable=False))),
+        _required("colour", pa.string()),
+        _required("has_intensity", pa.bool_()),
+        pa.field("intensity_low", pa.float64()),
+        pa.field("intensity_high", pa.float64()),
+        _required("crs_source", pa.string()),
+        _required("horizontal_unit", pa.string()),
+        _required("vertical_crs", pa.string()),
+        _required("height_unit", pa.string()),
+        _required("height_unit_m", pa.float64()),
+        _required("height_unit_reason", pa.string()),
+        _required("notes", _STRINGS),
+        _required("options", pa.string()),
+        _required("source", pa.string()),
+        _required("licence", pa.string()),
+    ]
+)
+
+_LIDAR_POINTS_SCHEMA = pa.schema(
+    [
+        _required("write_id", pa.string()),
+        *_UTM,
+        *(pa.field(name, pa.int16()) for name in ("red", "green", "blue", "intensity")),
+        _required("classification", pa.int16()),
+        _required("node", pa.int64()),
+        _required("node_spacing_m", pa.float32()),
+        *_PARTITION,
+        _required("level", pa.int32()),
+    ]
+)
+
 SPECS: dict[str, TableSpec] = {
     MAPS: TableSpec(name=MAPS, schema=_MAPS_SCHEMA, statistics=("map_id", "write_id")),
     IMAGES: TableSpec(
@@ -168,5 +237,12 @@ SPECS: dict[str, TableSpec] = {
         partition_by=("zone", "tile"),
         statistics=("write_id", "observation_index"),
         plain_bytes=("descriptor",),
+    ),
+    LIDAR: TableSpec(name=LIDAR, schema=_LIDAR_SCHEMA, statistics=("scan_id", "write_id")),
+    LIDAR_POINTS: TableSpec(
+        name=LIDAR_POINTS,
+        schema=_LIDAR_POINTS_SCHEMA,
+        partition_by=("zone", "tile", "level"),
+        statistics=("write_id", "easting", "northing"),
     ),
 }

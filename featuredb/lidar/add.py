@@ -1,0 +1,272 @@
+"""A scan from files into the database, in bounded memory: read and sort by tile, then tile by tile, then publish.
+
+Everything before the last step happens in a work folder. A job that was killed goes on there: what is finished is
+not done again. Files that are wrong in any way are found in the first step, which leaves nothing behind.
+"""
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from featuredb.errors import GeodesyError, ScanError
+from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
+from featuredb.lidar.clean import clean_block
+from featuredb.lidar.intensity import stretch_of
+from featuredb.lidar.las import ScanFile, open_scan_file, read_points
+from featuredb.lidar.levels import finest_level
+from featuredb.lidar.options import AddOptions, ScanLabels
+from featuredb.lidar.spill import Spill
+from featuredb.lidar.staged import BlockPlan, Staged
+from featuredb.lidar.work import WorkFolder, work_folder
+from featuredb.store import Database
+from featuredb.store.encode import Row
+from featuredb.store.scans import ScanSummary, commit_scan, find_scan, list_scans
+from featuredb.store.tables import BOUNDS
+
+logger = logging.getLogger(__name__)
+
+_LARGEST_8_BIT = 255
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Progress:
+    """How far a job is: points done of all, in a step ("read", "clean", "write")."""
+
+    step: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddResult:
+    """What became of a scan.
+
+    Attributes:
+        created: False if the scan was there already and nothing was done.
+        scan: as it is in the database now.
+    """
+
+    created: bool
+    scan: ScanSummary
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanInput:
+    """One file of a scan, its CRS, and the way to UTM."""
+
+    file: ScanFile
+    crs: ScanCrs
+    to_utm: UtmTransform
+
+
+OnProgress = Callable[[Progress], None]
+
+
+def add_scan(
+    database: Database,
+    files: Sequence[Path],
+    options: AddOptions | None = None,
+    labels: ScanLabels | None = None,
+    *,
+    work: Path | None = None,
+    on_progress: OnProgress = lambda progress: None,
+) -> AddResult:
+    """Add the scan that one or several LAS, LAZ or COPC files make.
+
+    The same files with the same options are the same scan: adding it twice changes nothing.
+
+    Args:
+        files: the files of one survey; they may differ in CRS, but not in the datum of their heights.
+        work: where unfinished work is kept; by default `_work` in a local database.
+
+    Raises:
+        ScanFileError: a file is not LAS, empty, truncated or broken; nothing is left behind.
+        GeodesyError: a CRS is missing, broken or wrong.
+        ScanError: the files do not fit each other, or nothing is left of them.
+        StoreError: the database cannot be written.
+        MissingExtraError: the packages of the extra `lidar` are not installed.
+    """
+    options, labels = options or AddOptions(), labels or ScanLabels()
+    opened = _open_all(files)
+    scan_id = options.scan_id([file.sha256 for file in opened])
+    for scan in list_scans(database):
+        if scan.scan_id == scan_id:
+            return AddResult(created=False, scan=scan)
+    inputs = _place_all(opened, options)
+    with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
+        plan = _read_all(folder, inputs, options, on_progress)
+        staged = _clean_all(folder, plan, options, on_progress)
+        row = _row(scan_id, inputs, plan, staged, options, labels)
+        created, _ = commit_scan(
+            database,
+            row,
+            staged.groups(),
+            lambda points: on_progress(Progress(step="write", done=points, total=row["points"])),
+        )
+        folder.finished()
+    return AddResult(created=created, scan=find_scan(database, scan_id))
+
+
+def crs_of_file(file: ScanFile, options: AddOptions) -> ScanCrs:
+    """The CRS of one file, under the options.
+
+    Raises:
+        GeodesyError: as featuredb.geo.crs.scan_crs; the message names the file.
+    """
+    # The header says which of the two counts; where that one is missing, it is the other.
+    wkt = file.wkt if file.wkt_counts or not file.geo_keys else None
+    try:
+        return scan_crs(
+            wkt=wkt,
+            geo_keys=None if wkt else file.geo_keys,
+            override=options.crs,
+            height_unit=options.height_unit,
+            height_datum=options.height_datum,
+        )
+    except GeodesyError as error:
+        raise GeodesyError(f"{file.path}: {error}") from error
+
+
+def _open_all(files: Sequence[Path]) -> list[ScanFile]:
+    if not files:
+        raise ScanError("expected at least one LAS, LAZ or COPC file, found none")
+    opened: dict[str, ScanFile] = {}
+    for path in files:
+        file = open_scan_file(Path(path))
+        if file.sha256 in opened:
+            logger.warning("%s is the same file as %s and counts once", path, opened[file.sha256].path)
+        opened.setdefault(file.sha256, file)
+    return list(opened.values())
+
+
+def _place_all(files: Sequence[ScanFile], options: AddOptions) -> list[ScanInput]:
+    """The CRS of each file and its way to one UTM zone, that of the first."""
+    inputs: list[ScanInput] = []
+    epsg = options.epsg
+    for file in files:
+        crs = crs_of_file(file, options)
+        try:
+            to_utm = utm_transform(crs, file.low, file.high, epsg)
+        except GeodesyError as error:
+            raise GeodesyError(f"{file.path}: {error}") from error
+        epsg = to_utm.epsg
+        inputs.append(ScanInput(file=file, crs=crs, to_utm=to_utm))
+        if crs.height_datum != inputs[0].crs.height_datum:
+            raise ScanError(
+                f"expected files with heights of one datum, found {inputs[0].crs.height_datum} in "
+                f"{inputs[0].file.path} and {crs.height_datum} in {file.path}; add them as two scans"
+            )
+    return inputs
+
+
+def _read_all(
+    folder: WorkFolder, inputs: Sequence[ScanInput], options: AddOptions, on_progress: OnProgress
+) -> BlockPlan:
+    """Read all files into blocks, or find that this was done."""
+    done = folder.read("spill.json")
+    if done is not None:
+        return BlockPlan.from_json(done)
+    total = sum(item.file.points for item in inputs)
+    spill = Spill(folder.path / "spill")
+    spill.clear()
+    for number, item in enumerate(inputs):
+        spill.add_file(
+            number,
+            read_points(item.file.path, options.chunk_points),
+            item.to_utm.apply,
+            lambda read: on_progress(Progress(step="read", done=read, total=total)),
+        )
+    counts = spill.counts
+    if counts.kept == 0:
+        raise ScanError(
+            f"expected points to keep, found none in {', '.join(str(item.file.path) for item in inputs)}: "
+            f"{counts.noise} are classified as noise and {counts.withheld} are withheld"
+        )
+    spacing_m = spill.spacing_m()
+    plan = BlockPlan(
+        read=counts.read,
+        noise=counts.noise,
+        withheld=counts.withheld,
+        spacing_m=spacing_m,
+        finest_level=finest_level(spacing_m),
+        stretch=stretch_of(counts.intensity, options.intensity_low_percent, options.intensity_high_percent),
+        colour_bits=tuple(_colour_bits(largest) for largest in counts.largest_rgb),
+        blocks=tuple(spill.split(options.block_points)),
+    )
+    folder.write("spill.json", plan.to_json())
+    folder.keep = True
+    return plan
+
+
+def _colour_bits(largest: int) -> int:
+    """8 or 16 for the range that a file's colours use, 0 for none: some formats have the field and leave it black."""
+    return 0 if largest <= 0 else 8 if largest <= _LARGEST_8_BIT else 16
+
+
+def _clean_all(folder: WorkFolder, plan: BlockPlan, options: AddOptions, on_progress: OnProgress) -> Staged:
+    """Clean, stretch and order block by block; finished ones are left alone."""
+    spill, staged = Spill(folder.path / "spill"), Staged(folder.path / "staged", plan)
+    total, done = sum(block.points for block in plan.blocks), 0
+    for block in plan.blocks:
+        if not staged.has(block):
+            staged.put(block, *clean_block(spill, plan, block, options.outliers))
+        done += block.points
+        on_progress(Progress(step="clean", done=done, total=total))
+    return staged
+
+
+def _row(
+    scan_id: str,
+    inputs: Sequence[ScanInput],
+    plan: BlockPlan,
+    staged: Staged,
+    options: AddOptions,
+    labels: ScanLabels,
+) -> Row:
+    """The scan's row in `lidar`."""
+    crs, counts = inputs[0].crs, staged.counts()
+    notes = [note for item in inputs for note in (*item.crs.notes, *item.to_utm.notes)]
+    return {
+        "scan_id": scan_id,
+        "name": labels.name_of(inputs[0].file.path),
+        "files": [_file_row(item) for item in inputs],
+        "epsg": inputs[0].to_utm.epsg,
+        "height_datum": crs.height_datum,
+        **dict(zip(BOUNDS, (*counts.low, *counts.high), strict=True)),
+        "tiles": sorted({block.tile for block in plan.blocks}),
+        "points": counts.points,
+        "points_in_files": plan.read,
+        "dropped_noise": plan.noise,
+        "dropped_withheld": plan.withheld,
+        "dropped_outliers": counts.outliers,
+        "level_points": list(counts.level_points),
+        "spacing_m": plan.spacing_m,
+        "classes": [{"classification": c, "points": n} for c, n in sorted(counts.classes.items())],
+        "colour": "file" if any(plan.colour_bits) else "",
+        "has_intensity": plan.stretch is not None,
+        "intensity_low": None if plan.stretch is None else plan.stretch.low,
+        "intensity_high": None if plan.stretch is None else plan.stretch.high,
+        "crs_source": crs.source,
+        "horizontal_unit": crs.horizontal_unit,
+        "vertical_crs": crs.vertical_name,
+        "height_unit": crs.height_unit,
+        "height_unit_m": crs.height_unit_m,
+        "height_unit_reason": crs.height_unit_reason,
+        "notes": list(dict.fromkeys(notes)),
+        "options": options.as_json(),
+        "source": labels.source,
+        "licence": labels.licence,
+    }
+
+
+def _file_row(item: ScanInput) -> Row:
+    return {
+        "name": item.file.path.name,
+        "sha256": item.file.sha256,
+        "size_bytes": item.file.size_bytes,
+        "points": item.file.points,
+        "crs": item.crs.name,
+        "transformation": item.to_utm.description,
+        "transformation_accuracy_m": item.to_utm.accuracy_m,
+    }

@@ -1,0 +1,293 @@
+"""LAS 1.2 to 1.4, LAZ and COPC files: what the header says, and the points, chunk by chunk. The home of laspy.
+
+A file is read as a stream, so its size does not matter. Whatever is wrong with it becomes a `ScanFileError` that
+names the file: what was expected, what was found, what to do.
+"""
+
+import hashlib
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import MissingExtraError, ScanFileError
+from featuredb.geo.geotiff_keys import GeoKeys
+from featuredb.geometry.arrays import FloatArray
+
+NOISE_CLASSES = (7, 18)  # ASPRS: low noise, high noise
+_UNCLASSIFIED = 1
+_WKT_RECORD, _KEYS_RECORD = 2112, 34735
+_HASH_BYTES = 1 << 20
+# The longest coordinate that any CRS in metres or feet has, generously; beyond it scale or offset are broken.
+_LONGEST_COORDINATE = 1e9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanFile:
+    """What a file says before its points are read.
+
+    Attributes:
+        path: of the file.
+        sha256: of its bytes.
+        size_bytes: of the file.
+        version: of LAS, "1.2" to "1.4".
+        compression: "none", "LAZ" or "COPC".
+        point_format: 0 to 10.
+        points: number of points by the header.
+        low, high: (3,) box in file coordinates, by the header or, where that is wrong, by the points.
+        wkt: the WKT record, or None.
+        geo_keys: GeoTIFF keys, or None.
+        wkt_counts: the header says that the WKT is the CRS and not the keys.
+        has_rgb: the point format has colours (they may all be zero).
+    """
+
+    path: Path
+    sha256: str
+    size_bytes: int
+    version: str
+    compression: str
+    point_format: int
+    points: int
+    low: FloatArray
+    high: FloatArray
+    wkt: str | None
+    geo_keys: GeoKeys | None
+    wkt_counts: bool
+    has_rgb: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawPoints:
+    """Some points as the file has them.
+
+    Attributes:
+        xyz: (n, 3) float64, file coordinates.
+        rgb: (n, 3) uint16, or None.
+        intensity: (n,) uint16.
+        classification: (n,) uint8; 0, "never classified", is given as 1, "unclassified".
+        withheld: (n,) bool, marked by the file's writer as not to be used.
+    """
+
+    xyz: FloatArray
+    rgb: NDArray[np.uint16] | None
+    intensity: NDArray[np.uint16]
+    classification: NDArray[np.uint8]
+    withheld: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+def open_scan_file(path: Path) -> ScanFile:
+    """Read a file's header, check it, and take its SHA-256.
+
+    Raises:
+        ScanFileError: no such file, not LAS or LAZ, no points, truncated, or a header that contradicts itself.
+        MissingExtraError: laspy is not installed.
+    """
+    if not path.is_file():
+        raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found none; check the path")
+    size = path.stat().st_size
+    _check_magic(path, size)
+    with _reading(path), _laspy().open(path) as reader:
+        header = reader.header
+        if header.point_count == 0:
+            raise ScanFileError(f"{path}: expected points, found a header that says 0; the scan is empty")
+        _check_header(path, header, size)
+        wkt, keys = _crs_records(header)
+        low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
+        first = _raw_points(reader.read_points(min(int(header.point_count), 10_000)))
+        names = {vlr.user_id for vlr in header.vlrs}
+        compression = "COPC" if "copc" in names else "LAZ" if header.are_points_compressed else "none"
+        version, point_format = str(header.version), int(header.point_format.id)
+        points, wkt_counts = int(header.point_count), bool(header.global_encoding.wkt)
+    slack = 1e-6 * (1.0 + np.abs(np.concatenate([low, high])).max())
+    if not (
+        np.isfinite([low, high]).all()
+        and (low <= high).all()
+        and (first.xyz >= low - slack).all()
+        and (first.xyz <= high + slack).all()
+    ):
+        low, high = _measured_box(path)
+    return ScanFile(
+        path=path,
+        sha256=_sha256(path),
+        size_bytes=size,
+        version=version,
+        compression=compression,
+        point_format=point_format,
+        points=points,
+        low=low,
+        high=high,
+        wkt=wkt,
+        geo_keys=keys,
+        wkt_counts=wkt_counts,
+        has_rgb=first.rgb is not None,
+    )
+
+
+def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
+    """The points of a file in its own order, at most `chunk_points` at a time.
+
+    Raises:
+        ScanFileError: the file ends before the header's number of points, or is broken.
+    """
+    found = 0
+    with _reading(path), _laspy().open(path) as reader:
+        expected = int(reader.header.point_count)
+        for chunk in reader.chunk_iterator(chunk_points):
+            points = _raw_points(chunk)
+            if len(points) and not (np.abs(points.xyz) < _LONGEST_COORDINATE).all():
+                raise ScanFileError(
+                    f"{path}: expected coordinates below 1e9, found others after point {found}; the file is broken"
+                )
+            found += len(points)
+            yield points
+    if found != expected:
+        raise ScanFileError(
+            f"{path}: expected {expected} points by the header, found {found}; the file is truncated, fetch it again"
+        )
+
+
+def _laspy() -> ModuleType:
+    try:
+        import laspy
+        import lazrs  # type: ignore[import-not-found, unused-ignore]  # noqa: F401  # laspy's reader of LAZ
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"Reading scans needs the package {error.name}, which is not installed: pip install 'featuredb[lidar]'"
+        ) from error
+    module: ModuleType = laspy
+    return module
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Errors of laspy, lazrs and the system as ScanFileError."""
+    import lazrs
+    from laspy.errors import LaspyException
+
+    try:
+        yield
+    except ScanFileError:
+        raise
+    except (
+        LaspyException, lazrs.LazrsError, OSError, EOFError, ValueError, TypeError, KeyError, IndexError,
+        AttributeError, OverflowError, MemoryError, RuntimeError, struct.error,
+    ) as error:  # fmt: skip
+        raise ScanFileError(
+            f"{path}: expected a readable LAS, LAZ or COPC file, found one that is truncated or broken "
+            f"({type(error).__name__}: {' '.join(str(error).split())[:200]}); fetch it again"
+        ) from error
+
+
+def _check_magic(path: Path, size: int) -> None:
+    if size == 0:
+        raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found an empty file; fetch it again")
+    with path.open("rb") as stream:
+        start = stream.read(227)
+    if start[:4] != b"LASF":
+        raise ScanFileError(
+            f"{path}: expected a LAS, LAZ or COPC file, which begins with 'LASF', found {start[:4]!r}; "
+            "convert it, e.g. with PDAL"
+        )
+    if len(start) < 227:
+        raise ScanFileError(
+            f"{path}: expected a header of at least 227 bytes, found {len(start)}; the file is truncated"
+        )
+
+
+def _check_header(path: Path, header: Any, size: int) -> None:
+    version = (header.version.major, header.version.minor)
+    if not (1, 0) <= version <= (1, 4):
+        raise ScanFileError(f"{path}: expected LAS 1.2 to 1.4, found {header.version}; convert it")
+    scales, offsets = np.array(header.scales), np.array(header.offsets)
+    if not (np.isfinite([scales, offsets]).all() and (scales > 0).all()):
+        raise ScanFileError(
+            f"{path}: expected positive scales and finite offsets, found {scales.tolist()} and {offsets.tolist()}; "
+            "the header is broken"
+        )
+    if not header.are_points_compressed:
+        needed = header.offset_to_point_data + header.point_count * header.point_format.size
+        if size < needed:
+            raise ScanFileError(
+                f"{path}: expected {needed} bytes for {header.point_count} points, found {size}; the file is "
+                "truncated, fetch it again"
+            )
+
+
+def _crs_records(header: Any) -> tuple[str | None, GeoKeys | None]:
+    """The WKT and the GeoTIFF keys of a file."""
+    wkt, keys, text = None, None, ""
+    doubles: tuple[float, ...] = ()
+    for vlr in [*header.vlrs, *(header.evlrs or [])]:
+        if vlr.user_id != "LASF_Projection":
+            continue
+        if vlr.record_id == _WKT_RECORD and hasattr(vlr, "string"):
+            wkt = str(vlr.string).strip("\x00 \n\r\t") or None
+        elif vlr.record_id == _KEYS_RECORD:
+            keys = list(getattr(vlr, "geo_keys", []))
+        elif vlr.record_id == _KEYS_RECORD + 1:
+            data = vlr.record_data_bytes()
+            doubles = tuple(np.frombuffer(data[: len(data) // 8 * 8], "<f8").tolist())
+        elif vlr.record_id == _KEYS_RECORD + 2:
+            text = vlr.record_data_bytes().decode("latin-1")
+    return wkt, None if keys is None else _key_values(keys, doubles, text)
+
+
+def _key_values(keys: list[Any], doubles: tuple[float, ...], text: str) -> GeoKeys:
+    values: dict[int, int | float | str] = {}
+    for key in keys:
+        start, count = int(key.value_offset), int(key.count)
+        if key.id == 0 or key.id in values:
+            continue
+        if key.tiff_tag_location == 0:
+            values[int(key.id)] = start
+        elif key.tiff_tag_location == _KEYS_RECORD + 1 and count == 1 and start < len(doubles):
+            values[int(key.id)] = doubles[start]
+        elif key.tiff_tag_location == _KEYS_RECORD + 2:
+            values[int(key.id)] = text[start : start + count].strip("|\x00 ")
+    return values
+
+
+def _raw_points(points: Any) -> RawPoints:
+    names = set(points.point_format.dimension_names)
+    classification = np.array(points["classification"], dtype=np.uint8)
+    classification[classification == 0] = _UNCLASSIFIED
+    rgb = None
+    if {"red", "green", "blue"} <= names:
+        rgb = np.stack([np.asarray(points[name], np.uint16) for name in ("red", "green", "blue")], axis=1)
+    scales, offsets = points.scales, points.offsets
+    xyz = np.empty((len(points), 3))
+    for axis, name in enumerate("XYZ"):
+        xyz[:, axis] = np.asarray(points[name], np.float64) * scales[axis] + offsets[axis]
+    return RawPoints(
+        xyz=xyz,
+        rgb=rgb,
+        intensity=np.array(points["intensity"], dtype=np.uint16),
+        classification=classification,
+        withheld=np.asarray(points["withheld"]).astype(bool),
+    )
+
+
+def _measured_box(path: Path) -> tuple[FloatArray, FloatArray]:
+    """The box of the points themselves."""
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for points in read_points(path, 1_000_000):
+        if len(points):
+            low, high = np.minimum(low, points.xyz.min(axis=0)), np.maximum(high, points.xyz.max(axis=0))
+    return low, high
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(_HASH_BYTES):
+            digest.update(block)
+    return digest.hexdigest()

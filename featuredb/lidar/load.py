@@ -1,0 +1,212 @@
+"""Scans of a database, or parts of them, as a point cloud in a local frame."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from featuredb.errors import ScanError, ScanNotFoundError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.near_frame import near_enu_from_utm
+from featuredb.geo.utm import utm_from_geodetic
+from featuredb.render.cloud import CloudNodes, PointCloud
+from featuredb.store import Database
+from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
+
+_UTM = ("easting", "northing", "height")
+_RGB = ("red", "green", "blue")
+
+PlanBox = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoadOptions:
+    """How much of a scan is loaded.
+
+    Attributes:
+        largest_points: finer levels are left out from the one on that would exceed this many points.
+    """
+
+    # About 30 bytes each in memory, and what two cores draw ten times a second.
+    largest_points: int = 20_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One level of one scan."""
+
+    level: int
+    utm: NDArray[np.float64]
+    epsg: int
+    columns: pa.Table
+
+
+def scan_frame(scan: ScanSummary) -> LocalFrame:
+    """A local frame at the centre of a scan, at its lowest height."""
+    box = scan.box
+    return LocalFrame.from_utm(
+        (box.min_easting + box.max_easting) / 2.0,
+        (box.min_northing + box.max_northing) / 2.0,
+        box.min_height,
+        scan.epsg,
+    )
+
+
+def load_cloud(
+    database: Database | str | Path,
+    frame: LocalFrame,
+    box_local: PlanBox | None = None,
+    *,
+    scan_ids: Sequence[str] | None = None,
+    options: LoadOptions | None = None,
+) -> PointCloud:
+    """The points of all scans, or of some, around a place.
+
+    Colours or intensities are in the cloud if all of the loaded scans have them.
+
+    Args:
+        frame: local frame of the result; anywhere near the scans.
+        box_local: (east0, north0, east1, north1) metres in `frame`; what lies in the box is loaded, and a
+            little around it where the frame is turned against the UTM grid. None for everything.
+        scan_ids: the scans to load; None for all that are not retired.
+
+    Returns:
+        The cloud, with levels as they are stored: level l has a point every 4 m / 2^l. Without any point where no
+        scan reaches into the box.
+
+    Raises:
+        ScanNotFoundError: the database has no scan, or not one of those.
+        ScanError: the scans' heights are of different datums, or even the coarsest level has too many points.
+        StoreError: the points cannot be read.
+    """
+    if not isinstance(database, Database):
+        database = Database.open(database)
+    options = options or LoadOptions()
+    scans = _chosen(database, scan_ids)
+    boxes = {scan.scan_id: _utm_box(frame, box_local, scan.epsg) for scan in scans}
+    touched = [s for s in scans if (b := boxes[s.scan_id]) is None or s.box.touches(*b)]
+    rgb = bool(touched) and all(scan.colour for scan in touched)
+    intensity = bool(touched) and all(scan.has_intensity for scan in touched)
+    columns = (*_UTM, *(_RGB if rgb else ()), *(("intensity",) if intensity else ()))
+    parts: list[_Part] = []
+    total = 0
+    for level in range(max((len(scan.level_points) for scan in touched), default=0)):
+        total += sum(count_points(database, scan, level, boxes[scan.scan_id]) for scan in touched)
+        if total > options.largest_points:
+            if level == 0:
+                raise ScanError(
+                    f"expected at most {options.largest_points} points, found {total} in the coarsest level alone; "
+                    "ask for a smaller area"
+                )
+            break
+        for scan in touched:
+            table = scan_points(
+                database,
+                scan,
+                level,
+                boxes[scan.scan_id],
+                (*columns, "classification", "node", "node_spacing_m"),
+            )
+            if len(table):
+                utm = np.stack([table[name].to_numpy() for name in _UTM], axis=1)
+                parts.append(_Part(level, utm, scan.epsg, table))
+    return _cloud(frame, scans[0].height_datum, parts, rgb, intensity)
+
+
+def _chosen(database: Database, scan_ids: Sequence[str] | None) -> list[ScanSummary]:
+    scans = list_scans(database)
+    if scan_ids is not None:
+        missing = sorted(set(scan_ids) - {scan.scan_id for scan in scans})
+        if missing:
+            raise ScanNotFoundError(
+                f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
+            )
+        scans = [scan for scan in scans if scan.scan_id in scan_ids]
+    if not scans:
+        raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
+    datums = sorted({scan.height_datum for scan in scans})
+    if len(datums) > 1:
+        raise ScanError(
+            f"expected scans with heights of one datum, found {', '.join(datums)}; choose among the scans"
+        )
+    return scans
+
+
+def _utm_box(frame: LocalFrame, box: PlanBox | None, epsg: int) -> PlanBox | None:
+    """The upright box in a zone around a box of the local frame."""
+    if box is None:
+        return None
+    e0, n0, e1, n1 = box
+    steps = np.linspace(0.0, 1.0, 5)
+    edge = [(e0 + t * (e1 - e0), n) for t in steps for n in (n0, n1)]
+    edge += [(e, n0 + t * (n1 - n0)) for t in steps for e in (e0, e1)]
+    geodetic = frame.geodetic_from_enu(np.array([(e, n, 0.0) for e, n in edge]))
+    utm = utm_from_geodetic(geodetic, epsg)
+    low, high = utm[:, :2].min(axis=0), utm[:, :2].max(axis=0)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, intensity: bool) -> PointCloud:
+    """The parts one after the other, in the frame, with their nodes."""
+    starts = np.concatenate([[0], np.cumsum([len(part.utm) for part in parts], dtype=np.int64)])
+    xyz = np.empty((int(starts[-1]), 3), np.float32)
+    for epsg in {part.epsg for part in parts}:
+        ours = [(part, start) for part, start in zip(parts, starts[:-1], strict=True) if part.epsg == epsg]
+        enu = near_enu_from_utm(frame, np.concatenate([part.utm for part, _ in ours]), epsg)
+        row = 0
+        for part, start in ours:
+            n = len(part.utm)
+            xyz[start : start + n] = enu[row : row + n]
+            row += n
+    return PointCloud(
+        frame=frame,
+        height_datum=datum,
+        xyz=xyz,
+        rgb=_bytes(parts, _RGB) if rgb else None,
+        intensity=np.ascontiguousarray(_bytes(parts, ("intensity",))[:, 0]) if intensity else None,
+        classification=np.ascontiguousarray(_bytes(parts, ("classification",))[:, 0]),
+        nodes=_nodes(xyz, parts),
+    )
+
+
+def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
+    """Columns of all parts as (n, columns) uint8; 0 where a point has no value."""
+    values = np.empty((sum(len(part.utm) for part in parts), len(names)), np.uint8)
+    for axis, name in enumerate(names):
+        row = 0
+        for part in parts:
+            column: Any = part.columns[name]
+            if column.null_count:
+                column = column.fill_null(0)
+            values[row : row + len(part.utm), axis] = column.to_numpy()
+            row += len(part.utm)
+    return values
+
+
+def _nodes(xyz: NDArray[np.float32], parts: Sequence[_Part]) -> CloudNodes:
+    """Runs of equal node keys, and the boxes around their points."""
+    starts, levels, spacings = [], [], []
+    row = 0
+    for part in parts:
+        node, spacing = (part.columns[name].to_numpy() for name in ("node", "node_spacing_m"))
+        new = np.ones(len(node), np.bool_)
+        new[1:] = (node[1:] != node[:-1]) | (spacing[1:] != spacing[:-1])
+        first = np.flatnonzero(new)
+        starts.append(row + first)
+        levels.append(np.full(len(first), part.level, np.int16))
+        spacings.append(spacing[first])
+        row += len(node)
+    empty = np.empty(0)
+    start = np.concatenate([empty.astype(np.int64), *starts])
+    return CloudNodes(
+        start=start,
+        count=np.diff(start, append=len(xyz)),
+        level=np.concatenate([empty.astype(np.int16), *levels]),
+        spacing_m=np.concatenate([empty.astype(np.float32), *spacings]),
+        box_min=np.minimum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),
+        box_max=np.maximum.reduceat(xyz, start, axis=0) if len(start) else np.empty((0, 3), np.float32),
+    )

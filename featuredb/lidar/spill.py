@@ -1,0 +1,233 @@
+"""First pass over a scan: its points in UTM, sorted into temporary files by tile, and what one pass can count.
+
+Tiles with too many points for the memory are split into quarters until each piece, a `Block`, is small enough. Edges
+of blocks are edges of the store's tiles halved again and again, and so never cut a voxel of the levels of detail.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.tiles import TILE_SIZE_M, tile_bounds, tile_of
+from featuredb.geometry.arrays import FloatArray
+from featuredb.lidar.las import NOISE_CLASSES, RawPoints
+
+SPILLED = np.dtype(
+    [
+        ("utm", "f8", 3),
+        ("rgb", "u2", 3),
+        ("intensity", "u2"),
+        ("classification", "u1"),
+        ("file", "u2"),  # which of the scan's files: their colours may be stretched differently
+    ]
+)
+_CHUNK_ROWS = 500_000
+_CELL_M = 2.0
+_CELLS = int(TILE_SIZE_M / _CELL_M)
+_SMALLEST_BLOCK_M = 1.0  # below it a block is taken as it is; no scan has a million points in a square metre
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Block:
+    """A square of one tile and the file that holds its points.
+
+    Attributes:
+        key: name of the file without suffix, e.g. "E000963_N009527-02" (quarters of quarters).
+        tile: the store's tile.
+        e0, n0: south-west corner, metres.
+        size_m: length of its edge.
+        points: how many it holds.
+    """
+
+    key: str
+    tile: str
+    e0: float
+    n0: float
+    size_m: float
+    points: int
+
+    def near(self, other: "Block", margin_m: float) -> bool:
+        """Whether the other block reaches into this one's surroundings."""
+        return (
+            other.e0 <= self.e0 + self.size_m + margin_m
+            and self.e0 - margin_m <= other.e0 + other.size_m
+            and other.n0 <= self.n0 + self.size_m + margin_m
+            and self.n0 - margin_m <= other.n0 + other.size_m
+        )
+
+
+@dataclass(slots=True)
+class SpillCounts:
+    """What the first pass counts; grows while it runs.
+
+    Attributes:
+        read, noise, withheld: points of the files, and those dropped for their class or flag.
+        intensity: (65536,) histogram of the raw intensities of points that are kept.
+        largest_rgb: largest colour value of each file; -1 where the format has none.
+    """
+
+    read: int = 0
+    noise: int = 0
+    withheld: int = 0
+    intensity: NDArray[np.int64] = field(default_factory=lambda: np.zeros(65536, np.int64))
+    largest_rgb: list[int] = field(default_factory=list)
+
+    @property
+    def kept(self) -> int:
+        return self.read - self.noise - self.withheld
+
+
+class Spill:
+    """The folder of spilled points: one file per tile while writing, one per block after `split`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.counts = SpillCounts()
+        self._tiles: dict[str, int] = {}
+        self._occupied: dict[str, NDArray[np.bool_]] = {}
+
+    def clear(self) -> None:
+        """Remove what an earlier, unfinished pass has left."""
+        for path in self.folder.glob("*.points"):
+            path.unlink()
+
+    def add_file(
+        self,
+        number: int,
+        chunks: Iterator[RawPoints],
+        to_utm: Callable[[FloatArray], FloatArray],
+        on_progress: Callable[[int], None] = lambda points: None,
+    ) -> None:
+        """Read a file's chunks, drop noise and withheld points, and sort the rest into tiles."""
+        counts = self.counts
+        counts.largest_rgb.append(-1)
+        for points in chunks:
+            noise = np.isin(points.classification, NOISE_CLASSES)
+            kept = ~(noise | points.withheld)
+            counts.read += len(points)
+            counts.noise += int(noise.sum())
+            counts.withheld += int((points.withheld & ~noise).sum())
+            if points.rgb is not None:
+                largest = int(points.rgb.max(initial=0))
+                counts.largest_rgb[number] = max(counts.largest_rgb[number], largest)
+            counts.intensity += np.bincount(points.intensity[kept], minlength=65536)
+            rows = np.zeros(int(kept.sum()), SPILLED)
+            rows["utm"] = to_utm(points.xyz[kept])
+            if points.rgb is not None:
+                rows["rgb"] = points.rgb[kept]
+            rows["intensity"] = points.intensity[kept]
+            rows["classification"] = points.classification[kept]
+            rows["file"] = number
+            self._append(rows)
+            on_progress(counts.read)
+
+    def split(self, largest_points: int) -> list[Block]:
+        """Split what is too large; returns all blocks, ordered by tile."""
+        blocks: list[Block] = []
+        for tile in sorted(self._tiles):
+            e0, n0, e1, _ = tile_bounds(tile)
+            whole = Block(key=tile, tile=tile, e0=e0, n0=n0, size_m=e1 - e0, points=self._tiles[tile])
+            blocks += self._split(whole, largest_points)
+        return blocks
+
+    def rows(self, block: Block) -> NDArray[Any]:
+        """(n,) SPILLED, all points of a block."""
+        return np.fromfile(self._path(block.key), SPILLED)
+
+    def chunks(self, block: Block) -> Iterator[NDArray[Any]]:
+        """The points of a block, piece by piece."""
+        with self._path(block.key).open("rb") as stream:
+            while len(rows := np.fromfile(stream, SPILLED, _CHUNK_ROWS)):
+                yield rows
+
+    def with_margin(
+        self, block: Block, blocks: Sequence[Block], margin_m: float
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        """The points of a block, and those of other blocks at most `margin_m` away in plan."""
+        low = np.array([block.e0, block.n0]) - margin_m
+        high = np.array([block.e0, block.n0]) + block.size_m + margin_m
+        around = [np.empty(0, SPILLED)]
+        for other in blocks:
+            if other.key == block.key or not block.near(other, margin_m):
+                continue
+            for rows in self.chunks(other):
+                plan = rows["utm"][:, :2]
+                around.append(rows[((plan >= low) & (plan <= high)).all(axis=1)])
+        return self.rows(block), np.concatenate(around)
+
+    def spacing_m(self) -> float:
+        """Typical distance between neighbouring points in plan: the root of the area that one point has.
+
+        The area is that of the smallest plan cells, 2 m or larger by powers of two, that hold eight points on average:
+        holes and surroundings without points do not count.
+        """
+        points = sum(self._tiles.values())
+        cells, edge = self._occupied, _CELL_M
+        while True:
+            occupied = sum(int(tile.sum()) for tile in cells.values())
+            if points >= 8 * occupied or edge >= TILE_SIZE_M:
+                return float(edge * np.sqrt(occupied / points))
+            cells = {
+                name: tile[::2, ::2] | tile[1::2, ::2] | tile[::2, 1::2] | tile[1::2, 1::2]
+                for name, tile in cells.items()
+            }
+            edge *= 2.0
+
+    def _append(self, rows: NDArray[Any]) -> None:
+        if not len(rows):
+            return
+        east, north = np.floor(rows["utm"][:, :2] / TILE_SIZE_M).astype(np.int64).T
+        number = east * 10_000_000 + north
+        order = np.argsort(number, kind="stable")
+        starts = np.flatnonzero(np.diff(number[order], prepend=number[order[0]] - 1))
+        for part in np.split(rows[order], starts[1:]):
+            name = str(tile_of(part["utm"][:1])[0])
+            with self._path(name).open("ab" if name in self._tiles else "wb") as stream:
+                part.tofile(stream)
+            self._tiles[name] = self._tiles.get(name, 0) + len(part)
+            cells = self._occupied.setdefault(name, np.zeros((_CELLS, _CELLS), np.bool_))
+            i, j = (part["utm"][:, :2] % TILE_SIZE_M // _CELL_M).astype(np.int64).T
+            cells[np.minimum(i, _CELLS - 1), np.minimum(j, _CELLS - 1)] = True
+
+    def _split(self, block: Block, largest_points: int) -> list[Block]:
+        half = block.size_m / 2.0
+        if block.points <= largest_points or half < _SMALLEST_BLOCK_M:
+            return [block]
+        separator = "" if "-" in block.key else "-"
+        keys = [f"{block.key}{separator}{quarter}" for quarter in range(4)]
+        counts = [0, 0, 0, 0]
+        for key in keys:
+            self._path(key).write_bytes(b"")
+        for rows in self.chunks(block):
+            east = rows["utm"][:, 0] >= block.e0 + half
+            north = rows["utm"][:, 1] >= block.n0 + half
+            quarter = east.astype(np.int64) + 2 * north
+            for number, key in enumerate(keys):
+                part = rows[quarter == number]
+                counts[number] += len(part)
+                with self._path(key).open("ab") as stream:
+                    part.tofile(stream)
+        self._path(block.key).unlink()
+        pieces: list[Block] = []
+        for number, key in enumerate(keys):
+            if not counts[number]:
+                self._path(key).unlink()
+                continue
+            piece = Block(
+                key=key,
+                tile=block.tile,
+                e0=block.e0 + half * (number % 2),
+                n0=block.n0 + half * (number // 2),
+                size_m=half,
+                points=counts[number],
+            )
+            pieces += self._split(piece, largest_points)
+        return pieces
+
+    def _path(self, key: str) -> Path:
+        return self.folder / f"{key}.points"

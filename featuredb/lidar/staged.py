@@ -1,0 +1,156 @@
+"""Finished blocks of a scan, waiting in the work folder to be published together."""
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ScanError
+from featuredb.lidar.intensity import IntensityStretch
+from featuredb.lidar.spill import Block
+from featuredb.store.scans import TilePoints
+
+# Tiles are committed together until they have this many points: fewer, larger commits.
+_POINTS_PER_COMMIT = 5_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BlockPlan:
+    """What the first pass has found, and the blocks that the second one works through.
+
+    Attributes:
+        read, noise, withheld: points in the files, and those that were dropped at once.
+        spacing_m: typical distance between neighbouring points in plan.
+        finest_level: number of the last level.
+        stretch: of the intensities; None where there are none.
+        colour_bits: 0, 8 or 16 for each file.
+        blocks: ordered by tile.
+    """
+
+    read: int
+    noise: int
+    withheld: int
+    spacing_m: float
+    finest_level: int
+    stretch: IntensityStretch | None
+    colour_bits: tuple[int, ...]
+    blocks: tuple[Block, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """As JSON can hold it."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> "BlockPlan":
+        """The inverse of `to_json`."""
+        stretch = value["stretch"]
+        return cls(
+            **{
+                **value,
+                "stretch": None if stretch is None else IntensityStretch(**stretch),
+                "colour_bits": tuple(value["colour_bits"]),
+                "blocks": tuple(Block(**block) for block in value["blocks"]),
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StagedCounts:
+    """What all finished blocks hold together; low and high are the corners of their box, UTM."""
+
+    points: int
+    outliers: int
+    level_points: tuple[int, ...]
+    classes: dict[int, int]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+
+
+class Staged:
+    """The folder of finished blocks; a block is finished when its JSON is there."""
+
+    def __init__(self, folder: Path, plan: BlockPlan) -> None:
+        self._folder = folder
+        self._plan = plan
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def has(self, block: Block) -> bool:
+        """Whether a block is finished."""
+        return self._path(block, "json").is_file()
+
+    def put(self, block: Block, rows: NDArray[Any], outliers: int) -> None:
+        """Keep a finished block.
+
+        Args:
+            rows: (n,) POINT_ROW, by level and node.
+            outliers: how many were dropped.
+        """
+        np.save(self._path(block, "npy"), rows)
+        classes, counts = np.unique(rows["classification"], return_counts=True)
+        utm = rows["utm"]
+        done = self._path(block, "tmp")
+        done.write_text(
+            json.dumps(
+                {
+                    "points": len(rows),
+                    "outliers": outliers,
+                    "levels": np.bincount(rows["level"], minlength=self._plan.finest_level + 1).tolist(),
+                    "classes": dict(zip(classes.tolist(), counts.tolist(), strict=True)),
+                    "low": utm.min(axis=0).tolist() if len(utm) else None,
+                    "high": utm.max(axis=0).tolist() if len(utm) else None,
+                }
+            )
+        )
+        done.replace(self._path(block, "json"))
+
+    def counts(self) -> StagedCounts:
+        """Counts and box of all blocks.
+
+        Raises:
+            ScanError: no point is left.
+        """
+        facts = [json.loads(self._path(block, "json").read_text()) for block in self._plan.blocks]
+        classes: Counter[int] = Counter()
+        for fact in facts:
+            classes.update({int(c): n for c, n in fact["classes"].items()})
+        points, outliers = sum(f["points"] for f in facts), sum(f["outliers"] for f in facts)
+        if points == 0:
+            raise ScanError(
+                f"expected points that have neighbours, found {outliers} that are all outliers; add the scan with "
+                "--keep-outliers if they are meant"
+            )
+        low = np.min([f["low"] for f in facts if f["low"]], axis=0)
+        high = np.max([f["high"] for f in facts if f["high"]], axis=0)
+        return StagedCounts(
+            points=points,
+            outliers=outliers,
+            level_points=tuple(np.sum([f["levels"] for f in facts], axis=0).tolist()),
+            classes=dict(classes),
+            low=tuple(low.tolist()),
+            high=tuple(high.tolist()),
+        )
+
+    def groups(self) -> list[Callable[[], Iterator[TilePoints]]]:
+        """What is to be committed, tile after tile."""
+        groups: list[list[Block]] = [[]]
+        for _, blocks in groupby(self._plan.blocks, key=lambda block: block.tile):
+            tile = list(blocks)
+            if groups[-1] and sum(b.points for b in (*groups[-1], *tile)) > _POINTS_PER_COMMIT:
+                groups.append([])
+            groups[-1] += tile
+        return [lambda group=group: self._points(group) for group in groups]  # type: ignore[misc]
+
+    def _points(self, blocks: list[Block]) -> Iterator[TilePoints]:
+        for block in blocks:
+            rows = np.load(self._path(block, "npy"))
+            if len(rows):
+                yield TilePoints(tile=block.tile, rows=rows, has_intensity=self._plan.stretch is not None)
+
+    def _path(self, block: Block, suffix: str) -> Path:
+        return self._folder / f"{block.key}.{suffix}"

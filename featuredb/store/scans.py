@@ -1,0 +1,387 @@
+"""The LiDAR scans of a database: tables `lidar` and `lidar_points`, in the manner of `maps` and its children.
+
+Points are written first, under a fresh `write_id`, tile by tile; the row in `lidar` that names it is written last,
+by compare-and-swap. A database without these tables has no scans; the first one makes them. Scans have versions of
+their own: a rollback of maps leaves them alone.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+from numpy.typing import NDArray
+
+from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
+from featuredb.geo.tiles import tiles_touching
+from featuredb.geometry.arrays import FloatArray
+from featuredb.store.changes import RETIRED
+from featuredb.store.database import (
+    CHANGED,
+    LONGEST_COMMIT,
+    OPERATION,
+    REASON,
+    Database,
+    new_write_id,
+    read_rows,
+)
+from featuredb.store.delta import Table, retry_stale
+from featuredb.store.encode import Row
+from featuredb.store.snapshot import UtmBox
+from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, LIDAR_TABLES, SPECS
+
+# One row of `lidar_points` in memory, without the columns that are the same for a whole tile.
+POINT_ROW = np.dtype(
+    [
+        ("utm", "f8", 3),
+        ("rgb", "u1", 3),
+        ("has_rgb", "?"),
+        ("intensity", "u1"),
+        ("classification", "u1"),
+        ("level", "u1"),
+        ("node", "i8"),
+        ("node_spacing_m", "f4"),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TilePoints:
+    """Points of one tile on their way into the store.
+
+    Attributes:
+        tile: name of the tile.
+        rows: (n,) POINT_ROW, by level and then node.
+        has_intensity: whether the intensities mean something.
+    """
+
+    tile: str
+    rows: NDArray[Any]
+    has_intensity: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanSummary:
+    """A scan as its row in `lidar` describes it.
+
+    Attributes:
+        box: of the points, UTM.
+        points, points_in_files: stored, and before anything was dropped.
+        level_points: stored points of each level, coarsest first.
+        spacing_m: typical distance between neighbouring points in plan.
+        classes: points of each ASPRS class.
+        colour: "file", "ortho", or "" for none.
+        row: everything, by the columns of `lidar`.
+    """
+
+    scan_id: str
+    write_id: str
+    name: str
+    status: str
+    status_reason: str
+    created_at: datetime
+    epsg: int
+    height_datum: str
+    box: UtmBox
+    points: int
+    points_in_files: int
+    level_points: tuple[int, ...]
+    spacing_m: float
+    classes: dict[int, int]
+    colour: str
+    has_intensity: bool
+    licence: str
+    row: Row
+
+
+def has_scans(database: Database) -> bool:
+    """Whether the tables of scans exist."""
+    return Table.exists(database.table_url(LIDAR), database.storage_options)
+
+
+def scan_rows(database: Database) -> list[Row]:
+    """All rows of `lidar`, oldest first; none where the table does not exist."""
+    if not has_scans(database):
+        return []
+    rows = read_rows(database.table(LIDAR))
+    return sorted(rows, key=lambda row: (row["created_at"], row["scan_id"]))
+
+
+def list_scans(database: Database, *, include_retired: bool = False) -> list[ScanSummary]:
+    """The scans of the newest version, oldest first."""
+    return [_summary(r) for r in scan_rows(database) if include_retired or r["status"] != RETIRED]
+
+
+def find_scan(database: Database, scan_id: str) -> ScanSummary:
+    """One scan by its id, retired or not.
+
+    Raises:
+        ScanNotFoundError: no such scan.
+    """
+    for row in scan_rows(database):
+        if row["scan_id"] == scan_id:
+            return _summary(row)
+    raise ScanNotFoundError(f"no scan {scan_id}; `featuredb lidar list` lists what there is")
+
+
+def commit_scan(
+    database: Database,
+    row: Row,
+    groups: Iterable[Callable[[], Iterator[TilePoints]]],
+    on_progress: Callable[[int], None] = lambda points: None,
+) -> tuple[bool, str]:
+    """Write a scan's points and then its row; a scan that is visible already is left alone.
+
+    Args:
+        row: columns of `lidar` but `write_id`, `points_checksum`, `status`, `status_reason`, `created_at`.
+        groups: each gives the points of some tiles when called; one commit to `lidar_points` each.
+        on_progress: is told how many points have been written.
+
+    Returns:
+        Whether this call made the scan visible, and the `write_id` of its points.
+
+    Raises:
+        ConflictError: other writers were faster too many times.
+        StoreError: the store failed.
+    """
+    for name in reversed(LIDAR_TABLES):
+        Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    visible = _live(scan_rows(database), row["scan_id"])
+    if visible is not None:
+        return False, visible["write_id"]
+    started = datetime.now(UTC)
+    write_id = new_write_id(started)
+    checksum = _Checksum()
+    written = 0
+
+    def batches(group: Callable[[], Iterator[TilePoints]]) -> Iterator[pa.RecordBatch]:
+        nonlocal written
+        for points in group():
+            table = _point_rows(points, row["epsg"], write_id)
+            checksum.add(points.rows["utm"])
+            written += len(points.rows)
+            on_progress(written)
+            yield from table.to_batches()
+
+    points_table = database.table(LIDAR_POINTS)
+    for group in groups:
+        points_table.append(pa.RecordBatchReader.from_batches(SPECS[LIDAR_POINTS].schema, batches(group)))
+    if datetime.now(UTC) - started > LONGEST_COMMIT:
+        raise ConflictError(f"commit of scan {row['scan_id']} took over {LONGEST_COMMIT}; add it again")
+    if written != row["points"]:
+        raise StoreError(f"scan {row['scan_id']}: expected {row['points']} points, {written} were written")
+    full = {
+        **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason": "",
+        "created_at": datetime.now(UTC),
+    }  # fmt: skip
+    winner = retry_stale(f"commit of scan {row['scan_id']}", lambda: _add_row(database, full))
+    return winner == write_id, winner
+
+
+def retire_scan(database: Database, scan_id: str, reason: str) -> bool:
+    """Take a scan out of service; False if it was already.
+
+    Raises:
+        ScanNotFoundError: no such scan.
+        StoreError: no reason given.
+    """
+    if not reason.strip():
+        raise StoreError(f"retire {scan_id}: expected a reason, for those who will ask later")
+    find_scan(database, scan_id)
+
+    def attempt() -> bool:
+        table = database.table(LIDAR)
+        rows = read_rows(table)
+        if _live(rows, scan_id) is None:
+            return False
+        changed = [
+            {**r, "status": RETIRED, "status_reason": reason} if r["scan_id"] == scan_id else r for r in rows
+        ]
+        table.swap(
+            scan_rows_table(changed),
+            mode="overwrite",
+            metadata={OPERATION: "retire", CHANGED: scan_id, REASON: reason},
+        )
+        return True
+
+    return retry_stale(f"retire {scan_id}", attempt)
+
+
+def scan_points(
+    database: Database,
+    scan: ScanSummary,
+    level: int,
+    box: tuple[float, float, float, float] | None,
+    columns: Sequence[str],
+) -> pa.Table:
+    """The points of one level of a scan, in the order they were written.
+
+    Args:
+        box: (e0, n0, e1, n1), closed, metres in the scan's zone; None for all.
+        columns: of `lidar_points`.
+
+    Raises:
+        StoreError: they cannot be read.
+    """
+    dataset, wanted = _level_rows(database, scan, level, box)
+    try:
+        return dataset.to_table(list(columns), filter=wanted)
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(
+            f"scan {scan.scan_id}: cannot read its points ({error}); run `featuredb verify`"
+        ) from error
+
+
+def count_points(
+    database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
+) -> int:
+    """How many points of a level lie in a box; see `scan_points`."""
+    if box is None or level >= len(scan.level_points):
+        return scan.level_points[level] if level < len(scan.level_points) else 0
+    dataset, wanted = _level_rows(database, scan, level, box)
+    return int(dataset.count_rows(filter=wanted))
+
+
+def points_dataset(database: Database, *, include_retired: bool = True) -> ds.Dataset | None:
+    """The rows of `lidar_points` that rows of `lidar` name, or None where there are no tables."""
+    if not has_scans(database):
+        return None
+    named = [s.write_id for s in list_scans(database, include_retired=include_retired)]
+    return (
+        database.table(LIDAR_POINTS).dataset().filter(ds.field("write_id").isin(pa.array(named, pa.string())))
+    )
+
+
+def scan_rows_table(rows: Sequence[Row]) -> pa.Table:
+    """Rows of `lidar` as an Arrow table."""
+    return pa.Table.from_pylist(list(rows), schema=SPECS[LIDAR].schema)
+
+
+def points_checksum(batches: Iterable[FloatArray]) -> str:
+    """The checksum of UTM coordinates (n, 3) float64 that come in pieces, in any order."""
+    checksum = _Checksum()
+    for utm in batches:
+        checksum.add(utm)
+    return checksum.text()
+
+
+class _Checksum:
+    """Sum over all points of a hash of each, so that the order, which compaction changes, does not count."""
+
+    def __init__(self) -> None:
+        self._sums = [0, 0]
+        self._count = 0
+
+    def add(self, utm: FloatArray) -> None:
+        bits = np.ascontiguousarray(utm, dtype="<f8").view("<u8")
+        h = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+        for axis, factor in ((1, 0xC2B2AE3D27D4EB4F), (2, 0x165667B19E3779F9)):
+            h = ((h ^ (h >> np.uint64(29))) + bits[:, axis]) * np.uint64(factor)
+        h ^= h >> np.uint64(32)
+        for i, values in enumerate((h, h * h)):
+            self._sums[i] = (self._sums[i] + int(values.sum(dtype=np.uint64))) % 2**64
+        self._count += len(bits)
+
+    def text(self) -> str:
+        return hashlib.sha256(f"{self._sums} {self._count}".encode()).hexdigest()
+
+
+def _live(rows: Iterable[Row], scan_id: str) -> Row | None:
+    return next((r for r in rows if r["scan_id"] == scan_id and r["status"] != RETIRED), None)
+
+
+def _add_row(database: Database, row: Row) -> str:
+    """Add the row unless the scan is visible; a retired row of the same id gives way. Returns the write id."""
+    table = database.table(LIDAR)
+    rows = read_rows(table)
+    visible = _live(rows, row["scan_id"])
+    if visible is not None:
+        return str(visible["write_id"])
+    kept = [r for r in rows if r["scan_id"] != row["scan_id"]]
+    metadata = {OPERATION: "lidar add", CHANGED: row["scan_id"], REASON: ""}
+    if len(kept) == len(rows):
+        table.swap(scan_rows_table([row]), mode="append", metadata=metadata)
+    else:
+        table.swap(scan_rows_table([*kept, row]), mode="overwrite", metadata=metadata)
+    return str(row["write_id"])
+
+
+def _point_rows(points: TilePoints, epsg: int, write_id: str) -> pa.Table:
+    rows, n = points.rows, len(points.rows)
+    no_rgb = ~rows["has_rgb"]
+    columns: dict[str, Any] = {
+        "classification": rows["classification"].astype(np.int16),
+        "node": rows["node"],
+        "node_spacing_m": rows["node_spacing_m"],
+        "level": rows["level"].astype(np.int32),
+    }
+    for axis, name in enumerate(("easting", "northing", "height")):
+        columns[name] = np.ascontiguousarray(rows["utm"][:, axis])
+    for axis, name in enumerate(("red", "green", "blue")):
+        if not no_rgb.all():
+            columns[name] = pa.array(rows["rgb"][:, axis].astype(np.int16), mask=no_rgb)
+    if points.has_intensity:
+        columns["intensity"] = rows["intensity"].astype(np.int16)
+    constants = {"write_id": write_id, "zone": epsg, "tile": points.tile}
+    arrays = []
+    for field in SPECS[LIDAR_POINTS].schema:
+        if field.name in constants:
+            arrays.append(pa.repeat(pa.scalar(constants[field.name], type=field.type), n))
+        elif field.name in columns:
+            arrays.append(pa.array(columns[field.name], type=field.type))
+        else:
+            arrays.append(pa.nulls(n, type=field.type))
+    return pa.Table.from_arrays(arrays, schema=SPECS[LIDAR_POINTS].schema)
+
+
+def _level_rows(
+    database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
+) -> tuple[ds.Dataset, ds.Expression]:
+    """The files that can hold a level's points in a box, and what picks the rows."""
+    wanted = (
+        (ds.field("zone") == scan.epsg)
+        & (ds.field("level") == level)
+        & (ds.field("write_id") == scan.write_id)
+    )
+    pruning: list[tuple[str, str, Any]] = [("zone", "=", scan.epsg), ("level", "=", level)]
+    pruning.append(("write_id", "=", scan.write_id))
+    if box is not None:
+        e0, n0, e1, n1 = box
+        tiles = sorted(set(tiles_touching(*box)) & set(scan.row["tiles"]))
+        pruning += [
+            ("easting", ">=", e0),
+            ("easting", "<=", e1),
+            ("northing", ">=", n0),
+            ("northing", "<=", n1),
+        ]
+        wanted &= ds.field("tile").isin(pa.array(tiles, pa.string()))
+        wanted &= (ds.field("easting") >= e0) & (ds.field("easting") <= e1)
+        wanted &= (ds.field("northing") >= n0) & (ds.field("northing") <= n1)
+    return database.table(LIDAR_POINTS).dataset(pruning), wanted
+
+
+def _summary(row: Row) -> ScanSummary:
+    return ScanSummary(
+        scan_id=row["scan_id"],
+        write_id=row["write_id"],
+        name=row["name"],
+        status=row["status"],
+        status_reason=row["status_reason"],
+        created_at=row["created_at"],
+        epsg=row["epsg"],
+        height_datum=row["height_datum"],
+        box=UtmBox(**{name: row[name] for name in BOUNDS}),
+        points=row["points"],
+        points_in_files=row["points_in_files"],
+        level_points=tuple(row["level_points"]),
+        spacing_m=row["spacing_m"],
+        classes={c["classification"]: c["points"] for c in row["classes"]},
+        colour=row["colour"],
+        has_intensity=row["has_intensity"],
+        licence=row["licence"],
+        row=row,
+    )
