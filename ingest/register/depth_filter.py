@@ -1,0 +1,163 @@
+"""Which depths of a rendered scan can be trusted, and the surface patch behind a pixel.
+
+A rendered depth is that of a splat: invalid where nothing is seen (the far plane), wrong where a hole was
+closed across a gap, ambiguous along silhouettes, and amplified by every pixel of misregistration where the
+surface is seen at a grazing angle (structure-projection paper, 3.1: "not all depth values are valid").
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.render.cloud import PointCloud
+from featuredb.render.rendering import Rendering
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DepthFilterOptions:
+    """Which depths are taken.
+
+    Attributes:
+        max_depth_m: far plane; nothing beyond it is believed. An airborne scan's own accuracy, seen at a
+            shallow angle from further away, is a matter of metres along the ray.
+        max_step_rel: largest change of depth within the window, relative to the depth, over what a tilted
+            plane explains: 1.5 % is 0.6 m at 40 m, above the roughness of grass and kerbs and below an
+            eave.
+        max_grazing_deg: largest angle between ray and normal; at 75 degrees a pixel across the ray is four
+            along the surface.
+        window_px: side of the window (odd) around a pixel, in pixels of the rendering.
+        min_window_points: different scan points in the window; three make any plane fit.
+        min_window_share: pixels of the window with a depth; a window over a hole's edge has fewer.
+    """
+
+    max_depth_m: float = 1000.0
+    max_step_rel: float = 0.015
+    max_grazing_deg: float = 75.0
+    window_px: int = 7
+    min_window_points: int = 5
+    min_window_share: float = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SurfaceHits:
+    """Where rays meet the scan.
+
+    Attributes:
+        valid: (n,) bool; other rows of the arrays below hold NaN.
+        points: (n, 3) local frame of the cloud, metres.
+        normals: (n, 3) unit, towards the camera.
+        sigma_ray_m: (n,) standard deviation along the ray from the surface's roughness in the window.
+        depths: (n,) along the optical axis, metres.
+    """
+
+    valid: NDArray[np.bool_]
+    points: FloatArray
+    normals: FloatArray
+    sigma_ray_m: FloatArray
+    depths: FloatArray
+
+
+def reliable_depth(rendering: Rendering, options: DepthFilterOptions) -> NDArray[np.bool_]:
+    """(h, w) bool: depths that are no closed holes, nor across a silhouette, nor beyond the far plane.
+
+    The step across a silhouette is told from a slope by inverse depth, which is affine over the image of a
+    plane: its second differences vanish there and stand out at a discontinuity.
+    """
+    seen = rendering.valid & (rendering.depth <= options.max_depth_m)
+    inverse = np.where(seen, 1.0 / np.where(seen, rendering.depth, 1.0), 0.0).astype(np.float32)
+    reach = options.window_px // 2 + 1
+    kernel = np.zeros((2 * reach + 1, 1), np.float32)
+    kernel[0, 0] = kernel[-1, 0] = 0.5
+    kernel[reach, 0] = -1.0
+    bend = np.maximum(
+        np.abs(cv2.filter2D(inverse, -1, kernel)), np.abs(cv2.filter2D(inverse, -1, kernel.T))
+    )
+    flat = bend * np.where(seen, rendering.depth, 0.0) <= options.max_step_rel
+    return np.asarray(seen & flat & (rendering.index >= 0))
+
+
+def surface_at(
+    rendering: Rendering, cloud: PointCloud, pixels: FloatArray, options: DepthFilterOptions
+) -> SurfaceHits:
+    """The points where the rays of pixels (n, 2) of the rendering meet planes through the scan's points.
+
+    The plane is that of the scan points that the window around the pixel shows, so that the hit lies on the
+    surface and not at the depth of the nearest splat's centre.
+    """
+    good = reliable_depth(rendering, options)
+    height, width = good.shape
+    column, row = np.floor(pixels).astype(np.int64).T
+    reach = options.window_px // 2
+    inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
+    rows = np.flatnonzero(inside)
+    rows = rows[good[row[rows], column[rows]]]
+    offset = np.arange(-reach, reach + 1)
+    window = (
+        row[rows, None, None] + offset[None, :, None],
+        column[rows, None, None] + offset[None, None, :],
+    )
+    index = rendering.index[window].reshape(len(rows), -1)
+    depth = rendering.depth[window].reshape(len(rows), -1)
+    centre = rendering.depth[row[rows], column[rows]]
+    near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * options.max_step_rel)
+    index = np.where(near, index, -1)
+    ordered = np.sort(index, axis=1)
+    first = np.concatenate(
+        [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
+    )
+    enough = (first.sum(axis=1) >= options.min_window_points) & (
+        near.mean(axis=1) >= options.min_window_share
+    )
+    rows, ordered, first = rows[enough], ordered[enough], first[enough]
+    return _intersect(rendering, cloud, pixels, rows, ordered, first, options)
+
+
+def _intersect(
+    rendering: Rendering,
+    cloud: PointCloud,
+    pixels: FloatArray,
+    rows: NDArray[np.intp],
+    index: NDArray[np.int32],
+    weight: NDArray[np.bool_],
+    options: DepthFilterOptions,
+) -> SurfaceHits:
+    """Planes through the weighted scan points of each row, met by the rays of `pixels[rows]`."""
+    total = len(pixels)
+    valid = np.zeros(total, dtype=bool)
+    points, normals = np.full((total, 3), np.nan), np.full((total, 3), np.nan)
+    sigma, depths = np.full(total, np.nan), np.full(total, np.nan)
+    hits = SurfaceHits(valid=valid, points=points, normals=normals, sigma_ray_m=sigma, depths=depths)
+    if len(rows) == 0:
+        return hits
+    pose = rendering.cam_from_local
+    neighbours = cloud.xyz[np.maximum(index, 0)].astype(np.float64)
+    count = weight.sum(axis=1)
+    mean = (neighbours * weight[:, :, None]).sum(axis=1) / count[:, None]
+    centred = (neighbours - mean[:, None]) * weight[:, :, None]
+    values, vectors = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred / count[:, None, None])
+    normal = vectors[:, :, 0]
+    rays_cam = np.column_stack([rendering.camera.unproject(pixels[rows]), np.ones(len(rows))])
+    rays = rays_cam @ pose.rotation
+    facing = np.einsum("ij,ij->i", normal, rays)
+    depth = np.einsum("ij,ij->i", normal, mean - pose.center) / np.where(facing == 0, np.nan, facing)
+    length = np.linalg.norm(rays, axis=1)
+    cosine = np.abs(facing) / length
+    rough = np.sqrt(np.maximum(values[:, 0], 0.0) * count / np.maximum(count - 3, 1))
+    rendered = rendering.depth[tuple(np.floor(pixels[rows]).astype(np.int64).T[::-1])]
+    ok = (
+        np.isfinite(depth)
+        & (cosine >= np.cos(np.radians(options.max_grazing_deg)))
+        & (np.abs(depth / rendered - 1.0) <= 2 * options.max_step_rel)
+        # A line of points (one scan line in the window) makes no plane.
+        & (values[:, 1] > 0.01 * values[:, 2])
+    )
+    rows, depth = rows[ok], depth[ok]
+    valid[rows] = True
+    points[rows] = pose.center + depth[:, None] * rays[ok]
+    normals[rows] = -normal[ok] * np.sign(facing[ok])[:, None]
+    sigma[rows] = rough[ok] / cosine[ok]
+    depths[rows] = depth
+    return hits

@@ -1,0 +1,235 @@
+"""Similarity between paired points: vectorised RANSAC, robust refinement on SIM(3), honest covariance.
+
+Equation: scan_i = S map_i + e_i + J_i xi_f. The e_i belong to the pair (pixel, roughness of the surface, the
+map point's own error); xi_f is the pose error of the frame that made the pair and is shared by all its pairs.
+Umeyama, Least-squares estimation of transformation parameters between two point patterns, 1991;
+structure-projection paper, 2.4 and eq. 7-9.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+
+_CHI2_3_95 = 7.815  # 95 % of the squared Mahalanobis length of three normal coordinates
+_CHI2_3_MEDIAN = 2.366
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimilarityOptions:
+    """How the similarity is estimated.
+
+    Attributes:
+        samples: of three pairs. With half of the pairs wrong, 300 miss all-inlier samples once in 10^17.
+        score_pairs: pairs that score a sample; more only take longer.
+        rounds: of reweighting; the weights settle within ten.
+        seed: of the samples.
+    """
+
+    samples: int = 300
+    score_pairs: int = 800
+    rounds: int = 20
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pairs:
+    """3D/3D pairs of a map and a scan, in the scan's local frame, metres.
+
+    Attributes:
+        point_index: (n,) row of the map's points.
+        frame_of: (n,) index of the registered frame.
+        source: (n, 3) map point at its present place.
+        target: (n, 3) where the frame sees it on the scan.
+        normals: (n, 3) of the scan's surface there.
+        covariance: (n, 3, 3) of the pair's own error, square metres.
+        by_frame: (n, 3, 6) derivative of `target` by the left perturbation of the frame's pose.
+        cell_of: (n,) neighbourhood of the pair; errors within one are correlated.
+        frame_covariance: (f, 6, 6) of the frames' left perturbations.
+    """
+
+    point_index: NDArray[np.int64]
+    frame_of: NDArray[np.int64]
+    source: FloatArray
+    target: FloatArray
+    normals: FloatArray
+    covariance: FloatArray
+    by_frame: FloatArray
+    cell_of: NDArray[np.int64]
+    frame_covariance: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SimilarityFit:
+    """A robust similarity.
+
+    Attributes:
+        target_from_source: the similarity.
+        covariance: (7, 7) of its left perturbation.
+        inliers: (n,) bool.
+        weights: (n,) of the last round, 1 for pairs that fit perfectly.
+        residuals_m: (n, 3) target, moved by its frame's correction, minus placed source.
+        frame_corrections: (f, 6) left perturbations of the frames' poses that were estimated along.
+        spread: how many times its claimed sigma the typical residual is.
+        neighbours_factor: how many times larger the variance of cell means is than independence predicts.
+    """
+
+    target_from_source: Sim3
+    covariance: FloatArray
+    inliers: NDArray[np.bool_]
+    weights: FloatArray
+    residuals_m: FloatArray
+    frame_corrections: FloatArray
+    spread: float
+    neighbours_factor: float
+
+
+def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray, options: SimilarityOptions) -> Sim3 | None:
+    """The similarity of three pairs with the smallest truncated sum of squared distances, or None.
+
+    Args:
+        tolerance_m: (n,) distance beyond which a pair does not count.
+    """
+    n = len(pairs)
+    if n < 3:
+        return None
+    generator = np.random.default_rng(options.seed)
+    samples = generator.integers(0, n, (options.samples, 3))
+    samples = samples[(np.diff(np.sort(samples, axis=1), axis=1) > 0).all(axis=1)]
+    scale, rotation, translation, usable = similarities(pairs.source[samples], pairs.target[samples])
+    if not usable.any():
+        return None
+    scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
+    rows = (
+        np.arange(n) if n <= options.score_pairs else generator.choice(n, options.score_pairs, replace=False)
+    )
+    placed = np.einsum("kij,nj->kni", scale[:, None, None] * rotation, pairs.source[rows])
+    squared = ((placed + translation[:, None] - pairs.target[rows]) ** 2).sum(axis=2)
+    cost = np.minimum(squared / tolerance_m[rows] ** 2, 1.0).sum(axis=1)
+    best = int(np.argmin(cost))
+    return Sim3(scale=float(scale[best]), rotation=rotation[best], translation=translation[best])
+
+
+def similarities(
+    source: FloatArray, target: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Umeyama's solution for k sets of m pairs at once.
+
+    Args:
+        source, target: (k, m, 3).
+
+    Returns:
+        scale (k,), rotation (k, 3, 3), translation (k, 3), and which sets determine them (k,).
+    """
+    source_mean, target_mean = source.mean(axis=1), target.mean(axis=1)
+    a, b = source - source_mean[:, None], target - target_mean[:, None]
+    u, values, vt = np.linalg.svd(np.swapaxes(b, 1, 2) @ a)
+    sign = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    values[:, 2] *= sign
+    u[:, :, 2] *= sign[:, None]
+    rotation = u @ vt
+    variance = (a**2).sum(axis=(1, 2))
+    scale = values.sum(axis=1) / np.where(variance > 0, variance, 1.0)
+    # Collinear points leave the rotation about their line open.
+    usable = (variance > 1e-12) & (values[:, 1] > 1e-3 * values[:, 0]) & (scale > 0)
+    translation = target_mean - scale[:, None] * np.einsum("kij,kj->ki", rotation, source_mean)
+    return scale, rotation, translation, usable
+
+
+def refine_similarity(start: Sim3, pairs: Pairs, options: SimilarityOptions) -> SimilarityFit:
+    """Robust least squares over the similarity (exp on the left) and, with their priors, the frames' poses.
+
+    The frames' pose errors are estimated along with the similarity: pairs of one frame then count for no
+    more than its pose allows, and the inverse of the normal equations is an honest covariance. Pairs carry
+    Geman-McClure weights at their robust spread; how far neighbours err alike dilutes them all.
+    """
+    information = np.linalg.inv(pairs.covariance)
+    sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
+    dilution = 1.0
+    for _ in range(2):  # the dilution is known after the first
+        for _ in range(options.rounds):
+            residual = _residuals(sim, frames, pairs)
+            weights, spread = _weights(residual, information)
+            normal, gradient = _equations(sim, frames, residual, pairs, information, weights / dilution)
+            step = np.linalg.solve(normal, gradient)
+            sim = Sim3.exp(step[:7]) @ sim
+            frames = frames + step[7:].reshape(-1, 6)
+            if np.abs(step[4:7]).max() < 1e-5 and np.abs(step[:4]).max() < 1e-8:
+                break
+        factor = _neighbours_factor(residual, information, weights, pairs, spread)
+        dilution = max(spread, 1.0) ** 2 * factor
+    normal, _ = _equations(sim, frames, residual, pairs, information, weights / dilution)
+    covariance = np.linalg.inv(normal)[:7, :7]
+    residual = _residuals(sim, frames, pairs)
+    squared = np.einsum("ni,nij,nj->n", residual, information, residual)
+    return SimilarityFit(
+        target_from_source=sim,
+        covariance=np.asarray((covariance + covariance.T) / 2),
+        inliers=squared <= 2 * _CHI2_3_95 * spread**2,  # 99.9 % of honest pairs
+        weights=weights,
+        residuals_m=residual,
+        frame_corrections=frames,
+        spread=spread,
+        neighbours_factor=factor,
+    )
+
+
+def _residuals(sim: Sim3, frames: FloatArray, pairs: Pairs) -> FloatArray:
+    """(n, 3) target, moved by its frame's correction, minus placed source."""
+    moved = np.einsum("nij,nj->ni", pairs.by_frame, frames[pairs.frame_of])
+    return np.asarray(pairs.target + moved - sim.act(pairs.source))
+
+
+def _weights(residual: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
+    squared = np.einsum("ni,nij,nj->n", residual, information, residual)
+    spread = float(np.sqrt(max(np.median(squared) / _CHI2_3_MEDIAN, 1e-12)))
+    return 1.0 / (1.0 + squared / (_CHI2_3_95 * spread**2)) ** 2, spread
+
+
+def _equations(
+    sim: Sim3,
+    frames: FloatArray,
+    residual: FloatArray,
+    pairs: Pairs,
+    information: FloatArray,
+    weights: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Normal matrix and gradient over (similarity, frame 0, frame 1, ...), (7 + 6 f)."""
+    size = 7 + 6 * len(frames)
+    normal, gradient = np.zeros((size, size)), np.zeros(size)
+    jacobian = point_jacobian(sim.act(pairs.source))
+    for frame, prior in enumerate(pairs.frame_covariance):
+        at = np.r_[0:7, 7 + 6 * frame : 13 + 6 * frame]
+        rows = pairs.frame_of == frame
+        both = np.concatenate([jacobian[rows], -pairs.by_frame[rows]], axis=2)
+        weighted = (weights[rows, None, None] * information[rows]) @ both
+        normal[np.ix_(at, at)] += np.tensordot(both, weighted, axes=([0, 1], [0, 1]))
+        gradient[at] += np.einsum("nij,ni->j", weighted, residual[rows])
+        knowledge = np.linalg.inv(prior)
+        own = at[7:]
+        normal[np.ix_(own, own)] += knowledge
+        gradient[own] -= knowledge @ frames[frame]
+    return normal, gradient
+
+
+def _neighbours_factor(
+    residual: FloatArray, information: FloatArray, weights: FloatArray, pairs: Pairs, spread: float
+) -> float:
+    """Design effect: variance of weighted sums over cells, over that of independent errors; at least 1."""
+    cell = np.unique(pairs.cell_of, return_inverse=True)[1]
+    root = np.linalg.cholesky(information)
+    whitened = np.sqrt(weights)[:, None] * np.einsum("nji,nj->ni", root, residual) / spread
+    sums = np.stack([np.bincount(cell, weights=whitened[:, k]) for k in range(3)], axis=1)
+    expected = float((whitened**2).sum())
+    cells = len(sums)
+    if cells < 2 or expected <= 0:
+        return 1.0
+    # The fit takes seven of the cells' degrees of freedom.
+    freedom = max(1.0 - 7.0 / (3.0 * cells), 0.2)
+    return max(1.0, float((sums**2).sum()) / expected / freedom)
