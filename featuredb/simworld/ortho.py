@@ -1,7 +1,7 @@
 """An ortho image of the town, taken from an aircraft on another day and laid over the terrain.
 
-As ordinary ortho images do, it knows the terrain and not what stands on it: roofs lean away from the point below
-each aerial photo, hide what is behind them, and jump at the seams between photos.
+As ordinary ortho images do, it knows the terrain and not what stands on it: roofs lean away from the point
+below each aerial photo, hide what is behind them, and jump at the seams between photos.
 """
 
 from dataclasses import dataclass, field
