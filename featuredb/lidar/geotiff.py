@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
-from rasterio.transform import from_origin
 
 from featuredb.errors import InvalidValueError
 
@@ -43,7 +42,7 @@ def write_geotiff(
         count=bands,
         dtype=image.dtype,
         crs=f"EPSG:{epsg}",
-        transform=from_origin(west, north, pixel_m, pixel_m),
+        transform=rasterio.Affine(pixel_m, 0.0, west, 0.0, -pixel_m, north),
         nodata=nodata,
         tiled=True,
         blockxsize=256,
