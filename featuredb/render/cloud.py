@@ -70,6 +70,9 @@ class PointCloud:
         classification: (n,) uint8, ASPRS classes; UNCLASSIFIED where the file says nothing. Noise (7, 18) is
             not in here.
         nodes: levels of detail and culling.
+        spacing_m: (n,) float32, distance between neighbouring points of the whole scan around each point
+            (see featuredb.render.levels.point_spacing), or None: the nodes' spacings are taken, which are
+            those of the dense parts where a node holds dense and sparse surfaces, as roofs and walls.
     """
 
     frame: LocalFrame
@@ -79,6 +82,7 @@ class PointCloud:
     intensity: NDArray[np.uint8] | None
     classification: NDArray[np.uint8]
     nodes: CloudNodes
+    spacing_m: NDArray[np.float32] | None = None
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -88,9 +92,10 @@ class PointCloud:
             ("rgb", (n, 3), np.uint8),
             ("intensity", (n,), np.uint8),
             ("classification", (n,), np.uint8),
+            ("spacing_m", (n,), np.float32),
         ):
             value = getattr(self, name)
-            if value is None and name in ("rgb", "intensity"):
+            if value is None and name in ("rgb", "intensity", "spacing_m"):
                 continue
             if value.shape != shape or value.dtype != dtype:
                 raise InvalidValueError(

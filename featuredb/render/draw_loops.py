@@ -44,54 +44,37 @@ def project_many(points: Float64, lens: Float64) -> Float64:
 
 
 @compiled
-def finest_spacing(
-    low: Float32, high: Float32, spacing: Float32, corner: Float64, cell_m: float, size: int
-) -> Float32:
-    """Plan (size, size), rows north: spacing of the finest node drawn over each cell; infinity over none."""
-    plan = np.full((size, size), np.inf, np.float32)
-    for k in range(len(low)):
-        x0 = int((low[k, 0] - corner[0]) / cell_m)
-        x1 = int((high[k, 0] - corner[0]) / cell_m)
-        y0 = int((low[k, 1] - corner[1]) / cell_m)
-        y1 = int((high[k, 1] - corner[1]) / cell_m)
-        for y in range(max(y0, 0), min(y1, size - 1) + 1):
-            for x in range(max(x0, 0), min(x1, size - 1) + 1):
-                plan[y, x] = min(plan[y, x], spacing[k])
-    return plan
-
-
-@compiled
 def draw(
     xyz: Float32,
     runs: Int64,
     spacing: Float32,
-    plan: Float32,
-    corner: Float64,
-    cell_m: float,
+    by_run: bool,
+    planes: Float64,
+    side: int,
     pose: Float64,
     lens: Float64,
-    near_m: float,
-    radius_per_spacing: float,
-    max_radius_px: float,
+    sizes: Float64,
     key: Float32,
     index: Int32,
     apart_m: Float32,
 ) -> int:
     """Draw runs of points into a depth buffer; returns how many fell into the image.
 
-    A splat is a disc. Its key grows from the point's depth at the middle by half a spacing at the rim, so
-    that of two splats of one surface each pixel takes the nearer middle, and a nearer surface still wins.
+    A splat is a disc in the surface that `planes` tells, or facing the camera where they tell none. Its key
+    grows from the disc's depth at the middle by half a spacing at the rim, so that of two splats of one
+    surface each pixel takes the nearer middle, and a nearer surface still wins.
 
     Args:
         runs: (k, 2) first row and count.
-        spacing: (k,) metres, of the runs' own nodes.
-        plan, corner, cell_m: see `finest_spacing`.
+        spacing: metres between points, (n,) for each point, or (k,) for each run if `by_run`.
+        planes, side: see `picture_loops.plane_slopes`; of shape (0, 0, 3) before anything is known.
         pose: (3, 4) of cam_from_local.
+        sizes: nearest depth in metres, radius per spacing, smallest spacing and largest radius in pixels.
         key, index, apart_m: (h, w), changed: infinity, -1 and anything where nothing was drawn yet; `apart_m`
             becomes the distance between points of the surface that the pixel shows.
     """
     height, width = key.shape
-    size = len(plan)
+    near_m, per_spacing, finest_px, widest = sizes[0], sizes[1], sizes[2], sizes[3]
     focal = 0.5 * (lens[0] + lens[1])
     drawn = 0
     for k in range(len(runs)):
@@ -103,35 +86,59 @@ def draw(
             x = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz + pose[0, 3]
             y = pose[1, 0] * px + pose[1, 1] * py + pose[1, 2] * pz + pose[1, 3]
             u, v = project(x, y, z, lens)
-            if not (
-                u > -max_radius_px
-                and v > -max_radius_px
-                and u < width + max_radius_px
-                and v < height + max_radius_px
-            ):
+            if not (u > -widest and v > -widest and u < width + widest and v < height + widest):
                 continue
             drawn += 1
-            column = min(max(int((px - corner[0]) / cell_m), 0), size - 1)
-            row = min(max(int((py - corner[1]) / cell_m), 0), size - 1)
-            apart = min(spacing[k], plan[row, column])
-            radius = min(radius_per_spacing * apart * focal / z, max_radius_px)
+            # What a coarser level leaves out is drawn larger by what there is.
+            apart = np.float32(max(spacing[k if by_run else i], finest_px * z / focal))
             middle_x, middle_y = int(np.floor(u)), int(np.floor(v))
             if 0 <= middle_x < width and 0 <= middle_y < height:
                 _put(key, index, apart_m, middle_y, middle_x, np.float32(z), i, apart)
+            radius = min(per_spacing * apart * focal / z, widest)
             if radius <= 0.5:
                 continue
+            a, b = _slopes(planes, side, u, v, z, apart, focal)
             bias = 0.5 * apart / (radius * radius)
             for ty in range(
                 max(int(np.ceil(v - radius - 0.5)), 0), min(int(v + radius - 0.5), height - 1) + 1
             ):
-                dy2 = (ty + 0.5 - v) ** 2
+                dy = ty + 0.5 - v
                 for tx in range(
                     max(int(np.ceil(u - radius - 0.5)), 0), min(int(u + radius - 0.5), width - 1) + 1
                 ):
-                    d2 = (tx + 0.5 - u) ** 2 + dy2
+                    dx = tx + 0.5 - u
+                    rise = a * dx + b * dy  # of nearness, as share of it
+                    d2 = dx * dx + dy * dy + (rise * focal) ** 2
                     if d2 <= radius * radius:
-                        _put(key, index, apart_m, ty, tx, np.float32(z + bias * d2), i, apart)
+                        _put(key, index, apart_m, ty, tx, np.float32(z / (1.0 + rise) + bias * d2), i, apart)
     return drawn
+
+
+@compiled
+def _slopes(
+    planes: Float64, side: int, u: float, v: float, z: float, apart: np.float32, focal: float
+) -> tuple[float, float]:
+    """Slopes of nearness per pixel, as share of the point's own; zero off its block's plane."""
+    row, column = int(v) // side, int(u) // side
+    if not (0 <= row < planes.shape[0] and 0 <= column < planes.shape[1]):
+        return 0.0, 0.0
+    plane = planes[row, column]
+    if not lies_on(plane, side, row, column, u, v, 1.0 / z, float(apart), focal):
+        return 0.0, 0.0
+    return plane[1] * z, plane[2] * z
+
+
+@compiled
+def lies_on(
+    plane: Float64, side: int, row: int, column: int, u: float, v: float, w: float, apart: float, focal: float
+) -> bool:
+    """Whether a point lies on the plane of a block, to half a spacing at right angles to the plane."""
+    there = plane[0] + plane[1] * (u - (column + 0.5) * side) + plane[2] * (v - (row + 0.5) * side)
+    # The slope of depth per metre across the line of sight is that of nearness per pixel, times focal / w.
+    steep2 = (plane[1] * plane[1] + plane[2] * plane[2]) * (focal / w) ** 2
+    if not steep2 < 225.0:  # 86 degrees, or no plane at all
+        return False
+    return bool(abs(there - w) < 0.5 * apart * w * w * np.sqrt(1.0 + steep2))
 
 
 @compiled

@@ -116,6 +116,35 @@ def node_runs(
 
 
 @compiled
+def spacing_of_codes(codes: Int64, cell_m: float, enough: int) -> NDArray[np.float32]:
+    """(n,) metres between neighbours, for points sorted by code.
+
+    Each point takes the smallest cell around it that holds `enough` points, as if they lay on a surface
+    through it. Points without so many around them keep the widest spacing.
+    """
+    spacing = np.zeros(len(codes), np.float32)
+    for level in range(21):
+        edge = cell_m * 2.0**level
+        first, open_points = 0, False
+        while first < len(codes):
+            cell = codes[first] >> (3 * level)
+            end = first
+            while end < len(codes) and codes[end] >> (3 * level) == cell:
+                end += 1
+            value = edge / np.sqrt(end - first)
+            if end - first >= enough or level == 20:
+                for i in range(first, end):
+                    if spacing[i] == 0.0:
+                        spacing[i] = value
+            else:
+                open_points = True
+            first = end
+        if not open_points:
+            break
+    return spacing
+
+
+@compiled
 def node_boxes(
     xyz: NDArray[np.float32], start: Int64, count: Int64
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

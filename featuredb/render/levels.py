@@ -10,6 +10,9 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.render.cloud import UNCLASSIFIED, CloudNodes, PointCloud
 from featuredb.render.compiled import compiled_module
 
+# In a cell that tells a point's spacing: fewer make it uncertain by more than a third, more blur the step
+# from a dense roof to a sparse wall.
+_NEIGHBOURS = 8
 _CODE_BITS = 21  # per axis in a 63-bit code
 _PROBE_POINTS = 16.0  # points per probing cell: enough that its spacing is known to an eighth or so
 
@@ -61,7 +64,7 @@ def build_cloud(
         raise InvalidValueError(f"build_cloud: expected points (n, 3) with n >= 1, found {points.shape}")
     if not np.isfinite(points).all():
         raise InvalidValueError("build_cloud: expected finite coordinates, found NaN or infinity")
-    order, nodes = _order(points, options)
+    order, nodes, spacing = _order(points, options)
     n = len(points)
     classes = np.full(n, UNCLASSIFIED, np.uint8) if classification is None else classification
     return PointCloud(
@@ -72,7 +75,29 @@ def build_cloud(
         intensity=None if intensity is None else _bytes("intensity", intensity, (n,))[order],
         classification=_bytes("classification", classes, (n,))[order],
         nodes=nodes,
+        spacing_m=spacing,
     )
+
+
+def point_spacing(xyz: ArrayLike) -> NDArray[np.float32]:
+    """(n,) float32 metres: how far apart neighbouring points are around each of the points (n, 3).
+
+    What PointCloud.spacing_m holds; `build_cloud` fills it. Points in any order.
+    """
+    points = np.ascontiguousarray(xyz, dtype=np.float32)
+    if len(points) == 0:
+        return np.empty(0, np.float32)
+    origin = points.min(axis=0).astype(np.float64)
+    by_code, codes, cell_m = _sorted_by_code(points, origin, float((points.max(axis=0) - origin).max()))
+    spacing = np.empty(len(points), np.float32)
+    spacing[by_code] = _spacing(codes, cell_m)
+    return spacing
+
+
+def _spacing(codes: NDArray[np.int64], cell_m: float) -> NDArray[np.float32]:
+    loops = compiled_module("featuredb.render.level_loops")
+    spacing: NDArray[np.float32] = loops.spacing_of_codes(codes, cell_m, _NEIGHBOURS)
+    return spacing
 
 
 def _bytes(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.uint8]:
@@ -84,8 +109,10 @@ def _bytes(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.ui
     return array
 
 
-def _order(points: NDArray[np.float32], options: LevelOptions) -> tuple[NDArray[np.int64], CloudNodes]:
-    """The rows in drawing order, and the nodes."""
+def _order(
+    points: NDArray[np.float32], options: LevelOptions
+) -> tuple[NDArray[np.int64], CloudNodes, NDArray[np.float32]]:
+    """The rows in drawing order, the nodes, and the spacing around each row in that order."""
     loops = compiled_module("featuredb.render.level_loops")
     origin = points.min(axis=0).astype(np.float64)
     extent = float((points.max(axis=0) - origin).max())
@@ -96,7 +123,8 @@ def _order(points: NDArray[np.float32], options: LevelOptions) -> tuple[NDArray[
         loops.node_runs(codes, level, current, finest, options.node_bits, cell_m)
         for current in range(finest + 1)
     ]
-    order = by_code[np.argsort(level, kind="stable")]
+    by_level = np.argsort(level, kind="stable")
+    order = by_code[by_level]
     count = np.concatenate([counts for counts, _ in runs])
     start = np.concatenate([[0], np.cumsum(count)[:-1]]).astype(np.int64)
     low, high = loops.node_boxes(points[order], start, count)
@@ -108,7 +136,7 @@ def _order(points: NDArray[np.float32], options: LevelOptions) -> tuple[NDArray[
         box_min=low,
         box_max=high,
     )
-    return order, nodes
+    return order, nodes, _spacing(codes, cell_m)[by_level]
 
 
 def _sorted_by_code(

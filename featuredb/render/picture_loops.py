@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.render.compiled import compiled
-from featuredb.render.draw_loops import project
+from featuredb.render.draw_loops import lies_on, project
 
 Bytes = NDArray[np.uint8]
 Float32 = NDArray[np.float32]
@@ -86,42 +86,57 @@ def _seen_at(xyz: Float32, i: int, pose: Float64, lens: Float64) -> tuple[float,
 
 
 @compiled
-def plane_slopes(moments: Float64, side: int) -> Float64:
-    """(blocks down, blocks across, 3): nearness at each block's middle and its slopes across and down.
+def plane_slopes(moments: Float64, side: int, planes: Float64, first: int, end: int) -> None:
+    """Fit each block's plane of nearness to the points of the block and those around it.
 
-    Fitted to the points of the block and its eight neighbours; NaN where they are too few.
+    Args:
+        planes: (blocks down, blocks across, 3) changed: nearness at the block's middle and its slopes across
+            and down; NaN where even three blocks around hold too few points.
+        first, end: rows of blocks.
     """
-    down, across = moments.shape[0], moments.shape[1]
-    planes = np.full((down, across, 3), np.nan)
-    for by in range(down):
-        for bx in range(across):
-            t = np.zeros(9)
-            for ny in range(max(by - 1, 0), min(by + 2, down)):
-                for nx in range(max(bx - 1, 0), min(bx + 2, across)):
-                    m = moments[ny, nx]
-                    du, dv = (nx - bx) * side, (ny - by) * side
-                    t[0] += m[0]
-                    t[1] += m[1] + du * m[0]
-                    t[2] += m[2] + dv * m[0]
-                    t[3] += m[3] + 2.0 * du * m[1] + du * du * m[0]
-                    t[4] += m[4] + du * m[2] + dv * m[1] + du * dv * m[0]
-                    t[5] += m[5] + 2.0 * dv * m[2] + dv * dv * m[0]
-                    t[6] += m[6]
-                    t[7] += m[7] + du * m[6]
-                    t[8] += m[8] + dv * m[6]
-            if t[0] < 6.0:
+    for by in range(first, end):
+        for bx in range(moments.shape[1]):
+            planes[by, bx] = np.nan
+            for reach in range(1, 4):
+                t = _moments_around(moments, side, by, bx, reach)
+                if t[0] >= 8.0:  # three make a plane; with eight one stray point does not turn it
+                    _fit_plane(t, planes[by, bx])
+                    break
+
+
+@compiled
+def _moments_around(moments: Float64, side: int, by: int, bx: int, reach: int) -> Float64:
+    """Sum of the moments of the blocks within `reach`, about the middle of block (by, bx)."""
+    t = np.zeros(9)
+    for ny in range(max(by - reach, 0), min(by + reach + 1, moments.shape[0])):
+        for nx in range(max(bx - reach, 0), min(bx + reach + 1, moments.shape[1])):
+            m = moments[ny, nx]
+            if m[0] == 0.0:
                 continue
-            n = t[0]
-            suu, suv, svv = t[3] - t[1] * t[1] / n, t[4] - t[1] * t[2] / n, t[5] - t[2] * t[2] / n
-            suw, svw = t[7] - t[1] * t[6] / n, t[8] - t[2] * t[6] / n
-            det = suu * svv - suv * suv
-            if det <= 1e-3 * suu * svv:
-                continue
-            a, b = (svv * suw - suv * svw) / det, (suu * svw - suv * suw) / det
-            planes[by, bx, 0] = (t[6] - a * t[1] - b * t[2]) / n
-            planes[by, bx, 1] = a
-            planes[by, bx, 2] = b
-    return planes
+            du, dv = (nx - bx) * side, (ny - by) * side
+            t[0] += m[0]
+            t[1] += m[1] + du * m[0]
+            t[2] += m[2] + dv * m[0]
+            t[3] += m[3] + 2.0 * du * m[1] + du * du * m[0]
+            t[4] += m[4] + du * m[2] + dv * m[1] + du * dv * m[0]
+            t[5] += m[5] + 2.0 * dv * m[2] + dv * dv * m[0]
+            t[6] += m[6]
+            t[7] += m[7] + du * m[6]
+            t[8] += m[8] + dv * m[6]
+    return t
+
+
+@compiled
+def _fit_plane(t: Float64, plane: Float64) -> None:
+    """Least squares from moments; the plane stays as it is where the points lie on a line."""
+    n = t[0]
+    suu, suv, svv = t[3] - t[1] * t[1] / n, t[4] - t[1] * t[2] / n, t[5] - t[2] * t[2] / n
+    suw, svw = t[7] - t[1] * t[6] / n, t[8] - t[2] * t[6] / n
+    det = suu * svv - suv * suv
+    if det > 1e-3 * suu * svv:
+        plane[1] = (svv * suw - suv * svw) / det
+        plane[2] = (suu * svw - suv * suw) / det
+        plane[0] = (t[6] - plane[1] * t[1] - plane[2] * t[2]) / n
 
 
 @compiled
@@ -138,6 +153,7 @@ def tilt_splats(
     end: int,
 ) -> None:
     """Tilt each splat along its block's plane, where its own point lies on that plane."""
+    focal = 0.5 * (lens[0] + lens[1])
     for y in range(first, end):
         for x in range(index.shape[1]):
             i = index[y, x]
@@ -145,12 +161,10 @@ def tilt_splats(
             if i < 0 or not np.isfinite(plane[0]):
                 continue
             u, v, w = _seen_at(xyz, i, pose, lens)
-            middle_x, middle_y = (x // side + 0.5) * side, (y // side + 0.5) * side
-            there = plane[0] + plane[1] * (u - middle_x) + plane[2] * (v - middle_y)
-            tolerance = 0.5 * apart_m[y, x] * w * w  # half a spacing in depth
-            change = plane[1] * (x + 0.5 - u) + plane[2] * (y + 0.5 - v)
-            if abs(there - w) < tolerance and abs(change) < 2.0 * tolerance:
-                nearness[y, x] = w + change
+            if lies_on(plane, side, y // side, x // side, u, v, w, apart_m[y, x], focal):
+                # Beyond half of its own, a change of nearness comes from a plane that does not reach so far.
+                change = plane[1] * (x + 0.5 - u) + plane[2] * (y + 0.5 - v)
+                nearness[y, x] = w + max(-0.5 * w, min(0.5 * w, change))
 
 
 @compiled
@@ -201,8 +215,11 @@ def _surface_around(
 ) -> tuple[float, float]:
     """Weighted mean nearness of the pixels around that lie on the surface at `level`, and their spacing."""
     total, value, apart = 0.0, 0.0, 0.0
-    for ny in range(max(y - radius, 0), min(y + radius + 1, nearness.shape[0])):
-        for nx in range(max(x - radius, 0), min(x + radius + 1, nearness.shape[1])):
+    step = 1 + radius // 5
+    for ny in range(y - radius, y + radius + 1, step):
+        for nx in range(x - radius, x + radius + 1, step):
+            if not (0 <= ny < nearness.shape[0] and 0 <= nx < nearness.shape[1]):
+                continue
             w = nearness[ny, nx]
             if w > 0.0 and abs(1.0 / w - 1.0 / level) < _SAME_SURFACE * apart_m[ny, nx]:
                 weight = _weight(ny - y, nx - x)
@@ -242,8 +259,11 @@ def paint(
                 continue
             weights = 0.0
             total[:] = 0.0
-            for ny in range(max(y - radius, 0), min(y + radius + 1, index.shape[0])):
-                for nx in range(max(x - radius, 0), min(x + radius + 1, index.shape[1])):
+            step = 1 + radius // 5  # a hundred or so of the pixels around are enough
+            for ny in range(y - radius, y + radius + 1, step):
+                for nx in range(x - radius, x + radius + 1, step):
+                    if not (0 <= ny < index.shape[0] and 0 <= nx < index.shape[1]):
+                        continue
                     j, w = index[ny, nx], nearness[ny, nx]
                     if j < 0 or abs(1.0 / w - 1.0 / filled[y, x]) >= 2.0 * _SAME_SURFACE * apart_m[ny, nx]:
                         continue

@@ -12,8 +12,11 @@ from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.rendering import Rendering
 from featuredb.render.splats import SplatOptions, Splats, draw_splats
-from featuredb.render.surfaces import SurfaceOptions, Surfaces, surfaces_of
+from featuredb.render.surfaces import SurfaceOptions, Surfaces, apart_px, block_planes, surfaces_of
 from featuredb.render.threads import over_rows, thread_count
+
+# Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
+_WORTH_REDRAWING_PX = 2.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,13 +25,10 @@ class RenderOptions:
 
     Attributes:
         attributes: colour and intensity too; False draws depth and index only.
-        finest_px: points closer together than this in the picture are left to coarser levels.
         threads: 0 takes as many as the process may use, up to four.
     """
 
     attributes: bool = True
-    # Two to three points a pixel at most: more cost time and show nothing.
-    finest_px: float = 0.6
     threads: int = 0
     splats: SplatOptions = field(default_factory=SplatOptions)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -46,11 +46,15 @@ def render(
     """
     options = options or RenderOptions()
     threads = thread_count(options.threads)
-    rows = visible_nodes(
-        cloud.nodes, camera, cam_from_local, near_m=options.splats.near_m, finest_px=options.finest_px
-    )
+    near_m, finest_px = options.splats.near_m, options.splats.finest_px
+    rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)
     splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads)
-    surfaces = surfaces_of(cloud.xyz, splats, camera, cam_from_local, options.surfaces, threads)
+    planes = None
+    if options.surfaces.tilt_splats:
+        planes = block_planes(cloud.xyz, splats, camera, cam_from_local, threads)
+        if planes is not None and np.quantile(apart_px(splats, camera.focal_px), 0.95) > _WORTH_REDRAWING_PX:
+            splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads, planes)
+    surfaces = surfaces_of(cloud.xyz, splats, planes, camera, cam_from_local, options.surfaces, threads)
     rgb = intensity = None
     if options.attributes and cloud.rgb is not None:
         rgb = _painted(cloud.rgb, splats, surfaces, threads)

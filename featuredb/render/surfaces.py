@@ -10,13 +10,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.compiled import compiled_module
 from featuredb.render.lens import lens_vector
-from featuredb.render.splats import Splats
+from featuredb.render.splats import BlockPlanes, Splats
 from featuredb.render.threads import over_rows
 
 _MOMENTS = 9  # of picture_loops.plane_moments
 _BLOCK_PER_SPACING = 1.5  # blocks of three by three then hold about twenty points for a plane
 _SMALLEST_BLOCK_PX = 4  # smaller ones cost more and see only the points' noise
-_RADII_PX = (1, 2, 3, 4, 6, 8, 12, 16)  # of closings; each is tried from the largest down
+_RADII_PX = (1, 2, 3, 4, 6, 9, 14, 21, 32)  # of closings; each is tried from the largest down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -25,7 +25,7 @@ class SurfaceOptions:
 
     Attributes:
         close_holes: close what lies between the splats of one surface.
-        tilt_splats: give splats the slope of the surface around them, instead of one depth each.
+        tilt_splats: lay splats into the surface that the points around them make.
         reach_per_spacing: holes are closed within this share of the distance between points.
     """
 
@@ -53,6 +53,7 @@ class Surfaces:
 def surfaces_of(
     xyz: NDArray[np.float32],
     splats: Splats,
+    surface: BlockPlanes | None,
     camera: Camera,
     cam_from_local: Rigid3,
     options: SurfaceOptions,
@@ -67,34 +68,30 @@ def surfaces_of(
     """
     loops = compiled_module("featuredb.render.picture_loops")
     pose, height = cam_from_local.matrix()[:3], camera.height
-    nearness = np.empty(splats.index.shape, np.float32)
+    index, apart = splats.index, splats.apart_m
+    nearness = np.empty(index.shape, np.float32)
     over_rows(
-        lambda first, end: loops.nearness_of_index(xyz, splats.index, pose, nearness, first, end),
-        height,
-        threads,
+        lambda first, end: loops.nearness_of_index(xyz, index, pose, nearness, first, end), height, threads
     )
-    apart_px = _apart_px(splats, nearness, camera.focal_px)
-    if options.tilt_splats and len(apart_px):
-        _tilt(xyz, splats, camera, pose, float(np.median(apart_px)), nearness, threads)
-    source = np.zeros(nearness.shape, np.int32)
-    if not options.close_holes or not len(apart_px):
+    if surface is not None:
+        lens, planes, side = lens_vector(camera), surface.planes, surface.side
+        over_rows(
+            lambda first, end: loops.tilt_splats(
+                xyz, index, apart, pose, lens, planes, side, nearness, first, end
+            ),
+            height,
+            threads,
+        )
+    source = np.zeros(index.shape, np.int32)
+    if not options.close_holes or splats.points_drawn == 0:
         return Surfaces(nearness=nearness, filled=nearness, source=source)
-    largest = options.reach_per_spacing * float(apart_px.max())
-    radii = np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < largest + 0.5], np.int32)
+    reach, focal = options.reach_per_spacing, camera.focal_px
+    radii = _radii(splats, reach, focal)
     closed = np.stack([_closing(nearness, int(r)) for r in radii])
     filled = np.empty_like(nearness)
     over_rows(
         lambda first, end: loops.close_holes(
-            nearness,
-            splats.apart_m,
-            closed,
-            radii,
-            camera.focal_px,
-            options.reach_per_spacing,
-            filled,
-            source,
-            first,
-            end,
+            nearness, apart, closed, radii, focal, reach, filled, source, first, end
         ),
         height,
         threads,
@@ -102,42 +99,39 @@ def surfaces_of(
     return Surfaces(nearness=nearness, filled=filled, source=source)
 
 
-def _apart_px(splats: Splats, nearness: NDArray[np.float32], focal_px: float) -> NDArray[np.float32]:
-    """Distance between points in pixels, of a sample of the pixels that show any."""
+def apart_px(splats: Splats, focal_px: float) -> NDArray[np.float32]:
+    """Distance between points in pixels, of a sixteenth of the pixels that show any."""
     part = slice(None, None, 4), slice(None, None, 4)
     seen = splats.index[part] >= 0
-    apart: NDArray[np.float32] = splats.apart_m[part][seen] * nearness[part][seen] * np.float32(focal_px)
+    apart: NDArray[np.float32] = splats.apart_m[part][seen] / splats.key[part][seen] * np.float32(focal_px)
     return apart
 
 
-def _tilt(
-    xyz: NDArray[np.float32],
-    splats: Splats,
-    camera: Camera,
-    pose: NDArray[np.float64],
-    apart_px: float,
-    nearness: NDArray[np.float32],
-    threads: int,
-) -> None:
-    """Give each splat the slope of the plane through the points around it."""
+def block_planes(
+    xyz: NDArray[np.float32], splats: Splats, camera: Camera, cam_from_local: Rigid3, threads: int
+) -> BlockPlanes | None:
+    """The surfaces that the points in view lie on; None where there are no points."""
+    apart = apart_px(splats, camera.focal_px)
+    if len(apart) == 0:
+        return None
     loops = compiled_module("featuredb.render.picture_loops")
-    lens, index = lens_vector(camera), splats.index
-    side = max(int(np.ceil(_BLOCK_PER_SPACING * apart_px)), _SMALLEST_BLOCK_PX)
+    pose, lens, index = cam_from_local.matrix()[:3], lens_vector(camera), splats.index
+    side = max(int(np.ceil(_BLOCK_PER_SPACING * float(np.median(apart)))), _SMALLEST_BLOCK_PX)
     blocks = -(-camera.height // side), -(-camera.width // side)
-    moments = np.zeros((*blocks, _MOMENTS))
+    moments, planes = np.zeros((*blocks, _MOMENTS)), np.empty((*blocks, 3))
     over_rows(
         lambda first, end: loops.plane_moments(xyz, index, pose, lens, side, moments, first, end),
         blocks[0],
         threads,
     )
-    planes = loops.plane_slopes(moments, side)
-    over_rows(
-        lambda first, end: loops.tilt_splats(
-            xyz, index, splats.apart_m, pose, lens, planes, side, nearness, first, end
-        ),
-        camera.height,
-        threads,
-    )
+    over_rows(lambda first, end: loops.plane_slopes(moments, side, planes, first, end), blocks[0], threads)
+    return BlockPlanes(planes=planes, side=side)
+
+
+def _radii(splats: Splats, reach_per_spacing: float, focal_px: float) -> NDArray[np.int32]:
+    """Radii of closings, up to what the widest spacing in the picture asks for."""
+    widest = reach_per_spacing * float(apart_px(splats, focal_px).max(initial=0.0))
+    return np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < widest + 0.5], np.int32)
 
 
 def _closing(nearness: NDArray[np.float32], radius_px: int) -> NDArray[np.float32]:
