@@ -213,7 +213,7 @@ def utm_transform(crs: ScanCrs, low: FloatArray, high: FloatArray, epsg: int | N
             epsg=epsg, description="none, it is in UTM already", accuracy_m=0.0, z_scale=crs.height_unit_m,
             with_heights=False, notes=tuple(notes), _transformer=None,
         )  # fmt: skip
-    area = AreaOfInterest(west, max(south, -90.0), east, min(north, 90.0))
+    area: Any = AreaOfInterest(west, max(south, -90.0), east, min(north, 90.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a missing grid is said below
         group = TransformerGroup(

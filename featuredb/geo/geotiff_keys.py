@@ -8,14 +8,13 @@ transverse Mercator, Lambert's conformal conic with two parallels, and Albers' e
 from collections.abc import Mapping
 
 from pyproj import CRS
-from pyproj.crs import CompoundCRS, GeographicCRS, ProjectedCRS
+from pyproj.crs import CompoundCRS, CoordinateOperation, Datum, GeographicCRS, ProjectedCRS
 from pyproj.crs.coordinate_operation import (
     AlbersEqualAreaConversion,
     LambertConformalConic2SPConversion,
     TransverseMercatorConversion,
 )
 from pyproj.crs.coordinate_system import Cartesian2DCS
-from pyproj.crs.datum import Datum
 from pyproj.crs.enums import Cartesian2DCSAxis
 from pyproj.exceptions import CRSError
 
@@ -101,7 +100,7 @@ def _own_projection(keys: GeoKeys, demand: str) -> CRS:
             f"the file's GeoTIFF keys define a projection of their own that is not understood: {_shown(keys)}; "
             f"{demand}"
         )
-    conversion: CRS
+    conversion: CoordinateOperation
     if projection == 1:
         conversion = TransverseMercatorConversion(
             latitude_natural_origin=number(3081),

@@ -4,18 +4,20 @@ Everything before the last step happens in a work folder. A job that was killed 
 not done again. Files that are wrong in any way are found in the first step, which leaves nothing behind.
 """
 
+import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from featuredb.errors import GeodesyError, ScanError
 from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
-from featuredb.lidar.clean import clean_block
+from featuredb.lidar.clean import Colouring, clean_block
 from featuredb.lidar.intensity import stretch_of
-from featuredb.lidar.las import ScanFile, open_scan_file, read_points
+from featuredb.lidar.las import ScanFile, file_sha256, open_scan_file, read_points
 from featuredb.lidar.levels import finest_level
-from featuredb.lidar.options import AddOptions, ScanLabels
+from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+from featuredb.lidar.ortho import open_ortho
 from featuredb.lidar.spill import Spill
 from featuredb.lidar.staged import BlockPlan, Staged
 from featuredb.lidar.work import WorkFolder, work_folder
@@ -69,15 +71,17 @@ def add_scan(
     options: AddOptions | None = None,
     labels: ScanLabels | None = None,
     *,
+    ortho: OrthoChoice | None = None,
     work: Path | None = None,
     on_progress: OnProgress = lambda progress: None,
 ) -> AddResult:
-    """Add the scan that one or several LAS, LAZ or COPC files make.
+    """Add the scan that one or several LAS, LAZ or COPC files make; makes the database where there is none.
 
     The same files with the same options are the same scan: adding it twice changes nothing.
 
     Args:
         files: the files of one survey; they may differ in CRS, but not in the datum of their heights.
+        ortho: image that colours what is seen from above.
         work: where unfinished work is kept; by default `_work` in a local database.
 
     Raises:
@@ -89,15 +93,22 @@ def add_scan(
     """
     options, labels = options or AddOptions(), labels or ScanLabels()
     opened = _open_all(files)
-    scan_id = options.scan_id([file.sha256 for file in opened])
+    image = None if ortho is None else open_ortho(ortho.path, ortho.crs)
+    scan_id = options.scan_id([file.sha256 for file in opened], _ortho_identity(ortho))
     for scan in list_scans(database):
         if scan.scan_id == scan_id:
             return AddResult(created=False, scan=scan)
     inputs = _place_all(opened, options)
     with work_folder(database, work, f"lidar-{scan_id}", sum(f.points for f in opened)) as folder:
         plan = _read_all(folder, inputs, options, on_progress)
-        staged = _clean_all(folder, plan, options, on_progress)
+        colouring = None
+        if ortho is not None and image is not None:
+            colouring = Colouring.of_scan(image, ortho.colouring, inputs[0].to_utm.epsg, plan.spacing_m)
+        staged = _clean_all(folder, plan, options, colouring, on_progress)
         row = _row(scan_id, inputs, plan, staged, options, labels)
+        if ortho is not None:
+            row |= {"colour": "ortho", "ortho": json.dumps(_ortho_identity(ortho))}
+        Database.create(database.url, storage_options=database.storage_options)
         created, _ = commit_scan(
             database,
             row,
@@ -126,6 +137,13 @@ def crs_of_file(file: ScanFile, options: AddOptions) -> ScanCrs:
         )
     except GeodesyError as error:
         raise GeodesyError(f"{file.path}: {error}") from error
+
+
+def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
+    """What tells the ortho image and its use from others: name apart, so that a copy is the same."""
+    if ortho is None:
+        return []
+    return [file_sha256(ortho.path), ortho.crs or "", json.dumps(asdict(ortho.colouring), sort_keys=True)]
 
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:
@@ -204,13 +222,19 @@ def _colour_bits(largest: int) -> int:
     return 0 if largest <= 0 else 8 if largest <= _LARGEST_8_BIT else 16
 
 
-def _clean_all(folder: WorkFolder, plan: BlockPlan, options: AddOptions, on_progress: OnProgress) -> Staged:
+def _clean_all(
+    folder: WorkFolder,
+    plan: BlockPlan,
+    options: AddOptions,
+    colouring: Colouring | None,
+    on_progress: OnProgress,
+) -> Staged:
     """Clean, stretch and order block by block; finished ones are left alone."""
     spill, staged = Spill(folder.path / "spill"), Staged(folder.path / "staged", plan)
     total, done = sum(block.points for block in plan.blocks), 0
     for block in plan.blocks:
         if not staged.has(block):
-            staged.put(block, *clean_block(spill, plan, block, options.outliers))
+            staged.put(block, *clean_block(spill, plan, block, options.outliers, colouring))
         done += block.points
         on_progress(Progress(step="clean", done=done, total=total))
     return staged
@@ -244,6 +268,7 @@ def _row(
         "spacing_m": plan.spacing_m,
         "classes": [{"classification": c, "points": n} for c, n in sorted(counts.classes.items())],
         "colour": "file" if any(plan.colour_bits) else "",
+        "ortho": "",
         "has_intensity": plan.stretch is not None,
         "intensity_low": None if plan.stretch is None else plan.stretch.low,
         "intensity_high": None if plan.stretch is None else plan.stretch.high,

@@ -1,33 +1,60 @@
 """One block of a scan: outliers out, colours and intensities as bytes, ordered by level and node."""
 
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.lidar.levels import order_by_level
+from featuredb.lidar.ortho import ColourOptions, OrthoImage, colour_by_ortho
 from featuredb.lidar.outliers import OutlierOptions, find_outliers
-from featuredb.lidar.spill import Block, Spill
+from featuredb.lidar.spill import SPILLED, Block, Spill
 from featuredb.lidar.staged import BlockPlan
 from featuredb.store.scans import POINT_ROW
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Colouring:
+    """An ortho image and how it is laid on the points of a UTM zone."""
+
+    image: OrthoImage
+    options: ColourOptions
+    epsg: int
+
+    @classmethod
+    def of_scan(cls, image: OrthoImage, options: ColourOptions, epsg: int, spacing_m: float) -> "Colouring":
+        """With one spacing for all blocks, so that they do not differ in what they take for hidden."""
+        nadir = options.nadir and replace(options.nadir, spacing_m=options.nadir.spacing_m or spacing_m)
+        return cls(image=image, options=replace(options, nadir=nadir), epsg=epsg)
+
+
 def clean_block(
-    spill: Spill, plan: BlockPlan, block: Block, outliers: OutlierOptions | None
+    spill: Spill,
+    plan: BlockPlan,
+    block: Block,
+    outliers: OutlierOptions | None,
+    colouring: Colouring | None = None,
 ) -> tuple[NDArray[Any], int]:
     """The rows of a block as they go into the store, and how many outliers were dropped.
 
     Returns:
         (n,) POINT_ROW, by level and node; n may be 0.
     """
-    rows, dropped = _without_outliers(spill, plan, block, outliers)
-    cleaned = np.zeros(len(rows), POINT_ROW)
-    if not len(rows):
+    rows, core, dropped = _without_outliers(spill, plan, block, outliers, colouring)
+    rgb, has_rgb = _colours(rows, plan.colour_bits)
+    if colouring is not None:
+        # Where the image does not show a point, it keeps its colour, if it has one.
+        rgb, seen = colour_by_ortho(rows["utm"], colouring.epsg, rgb, colouring.image, colouring.options)
+        has_rgb = has_rgb | seen
+    rows, rgb, has_rgb = rows[:core], rgb[:core], has_rgb[:core]
+    cleaned = np.zeros(core, POINT_ROW)
+    if not core:
         return cleaned, dropped
     order = order_by_level(rows["utm"], plan.finest_level)
     rows = rows[order.order]
     cleaned["utm"] = rows["utm"]
-    cleaned["rgb"], cleaned["has_rgb"] = _colours(rows, plan.colour_bits)
+    cleaned["rgb"], cleaned["has_rgb"] = rgb[order.order], has_rgb[order.order]
     if plan.stretch is not None:
         cleaned["intensity"] = plan.stretch.apply(rows["intensity"])
     cleaned["classification"] = rows["classification"]
@@ -38,19 +65,31 @@ def clean_block(
 
 
 def _without_outliers(
-    spill: Spill, plan: BlockPlan, block: Block, outliers: OutlierOptions | None
-) -> tuple[NDArray[Any], int]:
+    spill: Spill,
+    plan: BlockPlan,
+    block: Block,
+    outliers: OutlierOptions | None,
+    colouring: Colouring | None,
+) -> tuple[NDArray[Any], int, int]:
+    """Points of a block, then those around it that colouring needs; how many are the block's; outliers dropped."""
+    reach_m = 0.0 if outliers is None else outliers.margin_m(plan.spacing_m)
+    colour_m = 0.0 if colouring is None else colouring.options.margin_m
+    around = np.empty(0, SPILLED)
+    core = spill.rows(block)
+    if reach_m + colour_m > 0.0:
+        around = spill.around(block, plan.blocks, reach_m + colour_m)
+    near = block.distance_m(around["utm"]) <= colour_m
+    rows = np.concatenate([core, around[near], around[~near]])
+    asked = len(core) + int(near.sum())
     if outliers is None:
-        return spill.rows(block), 0
-    core, around = spill.with_margin(block, plan.blocks, outliers.margin_m(plan.spacing_m))
-    utm = np.concatenate([core["utm"], around["utm"]])
-    utm -= core["utm"][0]
-    drop = find_outliers(utm, len(core), plan.spacing_m, outliers)
-    return core[~drop], int(drop.sum())
+        return rows[:asked], len(core), 0
+    drop = find_outliers(rows["utm"] - core["utm"][0], asked, plan.spacing_m, outliers)
+    dropped = int(drop[: len(core)].sum())
+    return rows[:asked][~drop], len(core) - dropped, dropped
 
 
 def _colours(rows: NDArray[Any], colour_bits: tuple[int, ...]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours (n, 3) as bytes, by the range that the point's file uses, and which points have one."""
     bits = np.array(colour_bits, np.int64)[rows["file"]]
-    wide = (rows["rgb"] >> np.where(bits == 16, 8, 0).astype(np.uint16)[:, None]).astype(np.uint8)
-    return wide, bits > 0
+    shift = np.where(bits == 16, 8, 0).astype(np.uint16)
+    return (rows["rgb"] >> shift[:, None]).astype(np.uint8), bits > 0

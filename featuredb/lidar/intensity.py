@@ -20,7 +20,7 @@ class IntensityStretch:
     def apply(self, raw: NDArray[np.uint16]) -> NDArray[np.uint8]:
         """(n,) uint8 of raw values (n,) uint16."""
         scaled = (raw.astype(np.float32) - self.low) * np.float32(255.0 / (self.high - self.low))
-        return np.rint(np.clip(scaled, 0.0, 255.0)).astype(np.uint8)
+        return np.asarray(np.rint(np.clip(scaled, 0.0, 255.0)), np.uint8)
 
 
 def stretch_of(

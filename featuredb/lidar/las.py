@@ -117,7 +117,7 @@ def open_scan_file(path: Path) -> ScanFile:
         low, high = _measured_box(path)
     return ScanFile(
         path=path,
-        sha256=_sha256(path),
+        sha256=file_sha256(path),
         size_bytes=size,
         version=version,
         compression=compression,
@@ -158,7 +158,7 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
 def _laspy() -> ModuleType:
     try:
         import laspy
-        import lazrs  # type: ignore[import-not-found, unused-ignore]  # noqa: F401  # laspy's reader of LAZ
+        import lazrs  # noqa: F401  # laspy's reader of LAZ
     except ModuleNotFoundError as error:
         raise MissingExtraError(
             f"Reading scans needs the package {error.name}, which is not installed: pip install 'featuredb[lidar]'"
@@ -285,7 +285,8 @@ def _measured_box(path: Path) -> tuple[FloatArray, FloatArray]:
     return low, high
 
 
-def _sha256(path: Path) -> str:
+def file_sha256(path: Path) -> str:
+    """Digest of a file's bytes, hex."""
     digest = hashlib.sha256()
     with path.open("rb") as stream:
         while block := stream.read(_HASH_BYTES):

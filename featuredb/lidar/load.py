@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from featuredb.errors import ScanError, ScanNotFoundError
@@ -19,6 +20,8 @@ from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_po
 
 _UTM = ("easting", "northing", "height")
 _RGB = ("red", "green", "blue")
+
+_GREY = 128  # of points that have neither colour nor intensity in a cloud that has
 
 PlanBox = tuple[float, float, float, float]
 
@@ -174,14 +177,15 @@ def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, int
 
 
 def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
-    """Columns of all parts as (n, columns) uint8; 0 where a point has no value."""
+    """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity's or a middle grey."""
     values = np.empty((sum(len(part.utm) for part in parts), len(names)), np.uint8)
     for axis, name in enumerate(names):
         row = 0
         for part in parts:
             column: Any = part.columns[name]
             if column.null_count:
-                column = column.fill_null(0)
+                grey = part.columns["intensity"] if "intensity" in part.columns.column_names else None
+                column = pc.coalesce(column, *([] if grey is None else [grey]), pa.scalar(_GREY, pa.int16()))
             values[row : row + len(part.utm), axis] = column.to_numpy()
             row += len(part.utm)
     return values

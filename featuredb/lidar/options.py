@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
+from featuredb.lidar.ortho import ColourOptions
 from featuredb.lidar.outliers import OutlierOptions
 
 
@@ -37,22 +38,37 @@ class AddOptions:
     block_points: int = 1_000_000
     chunk_points: int = 500_000
 
-    def scan_id(self, sha256: Sequence[str], ortho: str = "") -> str:
+    def scan_id(self, sha256: Sequence[str], ortho: Sequence[str] = ()) -> str:
         """Id of the scan that these files make with these options; the order of files does not count.
 
         Args:
             sha256: digest of each file.
-            ortho: digest of the ortho image that colours it, "" without.
+            ortho: what names the ortho image that colours it, if any.
         """
         chosen = asdict(self)
         for name in ("block_points", "chunk_points"):  # do not change the result
             chosen.pop(name)
-        text = json.dumps([_FORMAT, sorted(sha256), ortho, chosen], sort_keys=True)
+        text = json.dumps([_FORMAT, sorted(sha256), list(ortho), chosen], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def as_json(self) -> str:
         """All options, for the scan's row."""
         return json.dumps(asdict(self), sort_keys=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrthoChoice:
+    """The ortho image that colours a scan.
+
+    Attributes:
+        path: an image that GDAL reads.
+        crs: its CRS in place of its own.
+        colouring: how it is laid on the points; the spacing is filled in from the scan.
+    """
+
+    path: Path
+    crs: str | None = None
+    colouring: ColourOptions = field(default_factory=ColourOptions)
 
 
 _FORMAT = 1  # raised when the same files and options give other rows

@@ -1,6 +1,7 @@
 """Statistical outlier removal: points that are much farther from their neighbours than those are from theirs."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,5 +80,6 @@ def _nearest(
     tree: "cKDTree[None]", xyz: FloatArray, neighbours: int, reach_m: float
 ) -> tuple[FloatArray, NDArray[np.intp]]:
     """Distances and rows (n, neighbours) of the nearest other points; infinity and row n beyond the reach."""
-    distance, index = tree.query(xyz, k=neighbours + 1, distance_upper_bound=reach_m)
+    found: Any = tree.query(xyz, k=neighbours + 1, distance_upper_bound=reach_m)
+    distance, index = found
     return distance[:, 1:], index[:, 1:]

@@ -50,6 +50,11 @@ class Block:
     size_m: float
     points: int
 
+    def distance_m(self, utm: FloatArray) -> FloatArray:
+        """(n,) distance in plan, along the farther axis, of points (n, 3) from the block; 0 inside."""
+        beside = np.abs(utm[:, :2] - (np.array([self.e0, self.n0]) + self.size_m / 2.0)) - self.size_m / 2.0
+        return np.asarray(np.maximum(beside.max(axis=1, initial=0.0), 0.0), np.float64)
+
     def near(self, other: "Block", margin_m: float) -> bool:
         """Whether the other block reaches into this one's surroundings."""
         return (
@@ -145,20 +150,13 @@ class Spill:
             while len(rows := np.fromfile(stream, SPILLED, _CHUNK_ROWS)):
                 yield rows
 
-    def with_margin(
-        self, block: Block, blocks: Sequence[Block], margin_m: float
-    ) -> tuple[NDArray[Any], NDArray[Any]]:
-        """The points of a block, and those of other blocks at most `margin_m` away in plan."""
-        low = np.array([block.e0, block.n0]) - margin_m
-        high = np.array([block.e0, block.n0]) + block.size_m + margin_m
-        around = [np.empty(0, SPILLED)]
+    def around(self, block: Block, blocks: Sequence[Block], margin_m: float) -> NDArray[Any]:
+        """(n,) SPILLED, the points of other blocks at most `margin_m` away from a block in plan."""
+        found = [np.empty(0, SPILLED)]
         for other in blocks:
-            if other.key == block.key or not block.near(other, margin_m):
-                continue
-            for rows in self.chunks(other):
-                plan = rows["utm"][:, :2]
-                around.append(rows[((plan >= low) & (plan <= high)).all(axis=1)])
-        return self.rows(block), np.concatenate(around)
+            if other.key != block.key and block.near(other, margin_m):
+                found += [rows[block.distance_m(rows["utm"]) <= margin_m] for rows in self.chunks(other)]
+        return np.concatenate(found)
 
     def spacing_m(self) -> float:
         """Typical distance between neighbouring points in plan: the root of the area that one point has.

@@ -188,6 +188,7 @@ _LIDAR_SCHEMA = pa.schema(
         _required("spacing_m", pa.float64()),
         _required("classes", pa.list_(pa.field("element", _CLASS_COUNT, nullable=False))),
         _required("colour", pa.string()),
+        _required("ortho", pa.string()),
         _required("has_intensity", pa.bool_()),
         pa.field("intensity_low", pa.float64()),
         pa.field("intensity_high", pa.float64()),

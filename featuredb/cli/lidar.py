@@ -1,0 +1,242 @@
+"""The commands for LiDAR scans: lidar add, lidar list, lidar picture."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from featuredb.cli.common import add_database_argument, format_table, open_database, storage_options
+from featuredb.geo.crs import HEIGHT_UNITS
+from featuredb.geo.datum import HEIGHT_DATUMS
+from featuredb.store import Database
+from featuredb.store.scans import ScanSummary, find_scan, list_scans
+
+if TYPE_CHECKING:
+    from featuredb.lidar.add import Progress as Step
+
+_TITLES = {"read": "Reading points", "clean": "Cleaning and ordering", "write": "Writing"}
+
+# ASPRS LAS 1.4 R15, tables 9 and 17.
+_CLASS_NAMES = {
+    1: "unclassified", 2: "ground", 3: "low vegetation", 4: "medium vegetation", 5: "high vegetation",
+    6: "building", 8: "key point", 9: "water", 10: "rail", 11: "road", 12: "overlap", 13: "wire guard",
+    14: "wire", 15: "tower", 16: "wire connector", 17: "bridge deck", 19: "overhead structure",
+    20: "ignored ground", 21: "snow", 22: "temporal exclusion",
+}  # fmt: skip
+
+
+def register(subparsers: Any) -> None:
+    """Add `lidar` with its commands to the parser of `featuredb`."""
+    parser = subparsers.add_parser(
+        "lidar", help="LiDAR scans: add, list, picture", description="LiDAR scans, see docs/lidar.md."
+    )
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    _register_add(commands)
+    listing = _command(commands, "list", run_list, "list the scans")
+    listing.add_argument("--all", action="store_true", help="retired scans, too")
+    listing.add_argument("--json", action="store_true", help="everything that is known, as JSON")
+    picture = _command(commands, "picture", run_picture, "draw a scan from above")
+    picture.add_argument("scan_id", metavar="SCAN")
+    picture.add_argument("out", metavar="PNG", type=Path)
+
+
+def run_add(args: argparse.Namespace) -> int:
+    """Add a scan and say what is in it."""
+    from featuredb.lidar.add import add_scan
+    from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+
+    options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)
+    if args.keep_outliers:
+        options = replace(options, outliers=None)
+    ortho = None if args.ortho is None else OrthoChoice(path=args.ortho, crs=args.ortho_crs)
+    database = Database(args.db, storage_options(args))
+    with _progress(args.quiet) as on_progress:
+        result = add_scan(
+            database,
+            args.files,
+            options,
+            ScanLabels(name=args.name, licence=args.licence, source=args.source),
+            ortho=ortho,
+            work=args.work,
+            on_progress=on_progress,
+        )
+    sys.stdout.write(summary(result.scan, "added" if result.created else "was there already, nothing done"))
+    if args.picture is not None:
+        from featuredb.lidar.picture import write_plan_view
+
+        write_plan_view(database, result.scan, args.picture)
+        sys.stdout.write(f"  {'picture':<12}{args.picture}\n")
+    return 0
+
+
+def run_list(args: argparse.Namespace) -> int:
+    """Print a table of the scans."""
+    scans = list_scans(open_database(args), include_retired=args.all)
+    if args.json:
+        rows = [{**scan.row, "created_at": scan.created_at.isoformat()} for scan in scans]
+        sys.stdout.write(json.dumps({"scans": rows}, indent=2) + "\n")
+        return 0
+    header = (
+        "scan", "name", "status", "epsg", "heights", "points", "spacing_m", "colour", "intensity",
+        "east_m", "north_m", "files", "added",
+    )  # fmt: skip
+    table = [
+        (
+            s.scan_id, s.name, s.status, s.epsg, s.height_datum, s.points, round(s.spacing_m, 3),
+            s.colour or "none", "yes" if s.has_intensity else "none",
+            round(s.box.max_easting - s.box.min_easting, 1),
+            round(s.box.max_northing - s.box.min_northing, 1), len(s.row["files"]), s.created_at,
+        )
+        for s in scans
+    ]  # fmt: skip
+    sys.stdout.write(format_table(header, table))
+    return 0
+
+
+def run_picture(args: argparse.Namespace) -> int:
+    """Draw one scan."""
+    from featuredb.lidar.picture import write_plan_view
+
+    database = open_database(args)
+    write_plan_view(database, find_scan(database, args.scan_id), args.out)
+    sys.stdout.write(f"{args.out}\n")
+    return 0
+
+
+def summary(scan: ScanSummary, outcome: str) -> str:
+    """What a surveyor wants to check: counts, CRS, units, datum, bounds, density, classes, what was dropped."""
+    row, box = scan.row, scan.box
+    area_m2 = scan.points * scan.spacing_m**2
+    lines = [("files", f"{len(row['files'])} with {scan.points_in_files:,} points")]
+    for crs, transformation, accuracy in dict.fromkeys(
+        (f["crs"], f["transformation"], f["transformation_accuracy_m"]) for f in row["files"]
+    ):
+        lines.append(("CRS", f"{crs}, from {row['crs_source']}, in {row['horizontal_unit']}"))
+        stated = "accuracy not stated" if accuracy is None else f"accuracy {accuracy:g} m"
+        lines.append(("stored in", f"EPSG:{scan.epsg}, by: {transformation} ({stated})"))
+    unit = f"{row['height_unit']} of {row['height_unit_m']:.12g} m"
+    vertical = f"{row['vertical_crs']}; " if row["vertical_crs"] else ""
+    lines += [
+        ("heights", f"{vertical}{unit}: {row['height_unit_reason']}"),
+        ("datum", scan.height_datum + ("" if scan.height_datum != "unknown" else _SAY_DATUM)),
+        ("easting", f"{box.min_easting:.2f} to {box.max_easting:.2f} m"),
+        ("northing", f"{box.min_northing:.2f} to {box.max_northing:.2f} m"),
+        ("height", f"{box.min_height:.2f} to {box.max_height:.2f} m"),
+        (
+            "density",
+            f"{scan.points / area_m2:.3g} points per m2 on {area_m2:,.0f} m2, spacing {scan.spacing_m:.3g} m",
+        ),
+        ("classes", ", ".join(_class_count(c, n) for c, n in scan.classes.items())),
+        ("colour", {"file": "of the file", "ortho": "from the ortho image"}.get(scan.colour, "none")),
+        ("intensity", _intensity(scan)),
+        (
+            "dropped",
+            f"{row['dropped_noise']:,} classified as noise, {row['dropped_withheld']:,} withheld, "
+            f"{row['dropped_outliers']:,} outliers; {scan.points:,} points stored",
+        ),
+        (
+            "levels",
+            ", ".join(f"{n:,}" for n in scan.level_points) + " points, 4 m apart and halved each time",
+        ),
+        *(("note", note) for note in row["notes"]),
+    ]
+    body = "".join(f"  {name:<12}{text}\n" for name, text in lines)
+    return f"scan {scan.scan_id} ({scan.name}): {outcome}\n{body}"
+
+
+_SAY_DATUM = "; --height-datum states it: " + ", ".join(d for d in HEIGHT_DATUMS if d != "unknown")
+
+
+def _class_count(number: int, points: int) -> str:
+    return f"{number} {_CLASS_NAMES.get(number, 'other')} {points:,}"
+
+
+def _intensity(scan: ScanSummary) -> str:
+    if not scan.has_intensity:
+        return "none"
+    return f"raw {scan.row['intensity_low']:g} to {scan.row['intensity_high']:g} stretched to 0 to 255"
+
+
+def _register_add(commands: Any) -> None:
+    parser = _command(
+        commands,
+        "add",
+        run_add,
+        "add the scan that LAS, LAZ or COPC files make",
+        epilog="example: featuredb lidar add DB tile1.laz tile2.laz --height-datum navd88 --picture plan.png",
+    )
+    parser.add_argument("files", metavar="FILE", nargs="+", type=Path)
+    where = parser.add_argument_group("where the points are")
+    where.add_argument(
+        "--crs", help="in place of the files': an EPSG code such as EPSG:2949 or EPSG:6556+5703, WKT, or PROJ"
+    )
+    where.add_argument("--height-unit", choices=tuple(HEIGHT_UNITS), help="default: what the CRS says")
+    where.add_argument("--height-datum", choices=HEIGHT_DATUMS, help="default: what the CRS says")
+    look = parser.add_argument_group("how they look")
+    look.add_argument(
+        "--ortho", type=Path, metavar="TIF", help="colour what is seen from above by this image"
+    )
+    look.add_argument("--ortho-crs", metavar="CRS", help="in place of the image's own")
+    look.add_argument("--keep-outliers", action="store_true", help="do not remove outliers")
+    labels = parser.add_argument_group("what is kept with it")
+    labels.add_argument("--name", default="", help="default: the first file's")
+    labels.add_argument("--licence", default="")
+    labels.add_argument("--source", default="", help="who made it, where it is from")
+    job = parser.add_argument_group("how the job runs")
+    job.add_argument(
+        "--work",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help="where unfinished work is kept; default: DB/_work, or a cache folder for object stores",
+    )
+    job.add_argument("--picture", type=Path, metavar="PNG", help="draw the scan from above")
+    job.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def _command(
+    commands: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text, epilog=epilog)
+    add_database_argument(parser)
+    parser.set_defaults(run=run)
+    return parser
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Callable[["Step"], None]]:
+    """A callback that draws bars on stderr, if somebody watches."""
+    console = Console(stderr=True)
+    if quiet or not console.is_terminal:
+        yield lambda step: None
+        return
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(step: "Step") -> None:
+            if step.step not in tasks:
+                tasks[step.step] = bars.add_task(_TITLES[step.step], total=step.total)
+            bars.update(tasks[step.step], completed=step.done, total=step.total)
+
+        yield show
