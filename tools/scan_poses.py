@@ -1,271 +1,256 @@
-"""Poses of photos by registering each one directly to a coloured scan: the truth that maps are judged by.
+"""Poses of photos registered directly to a coloured scan: the truth by which an anchored map is judged.
 
-    python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --poses poses.json [--photos A.JPG B.JPG ...]
-    python -m tools.scan_poses --compare poses.json --answers LOCALISED.jsonl
+    python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --poses poses.json
+    python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --given poses.json --database DB \\
+        --held-out DJI_0020.JPG DJI_0025.JPG DJI_0030.JPG DJI_0033.JPG
 
-It shares no code with the map, anchoring or localisation: laspy reads the scan, PROJ makes the topocentric
-frame, numpy rasters and renders, OpenCV matches and solves. The first pose comes from SIFT between the photo
-and a nadir raster of the scan; then the scan is rendered from that pose, tracked into the photo at thousands
-of places, and all photos' poses are estimated together with one camera (or each alone with a camera given by
---camera). The accuracy is measured, not assumed: poses from two disjoint halves of the correspondences, and
-the camera from two disjoint halves of the photos.
+The first registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
+anchoring or with localisation), estimates one camera over all of them, and measures its own accuracy:
+
+- halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
+- halves of the photos: poses from two disjoint sets of photos, each with a camera of its own. This is the
+  larger one, for it shows how far focal length, principal point and height trade.
+
+The second asks `featuredb localise DB` for the held-out photos and prints how far its answers are from the
+poses: east, north, up, rotation. Exit code 0 if the medians are within the limits, else 1.
 """
 
 import argparse
 import json
-import re
+import subprocess
 import sys
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
-import laspy
 import numpy as np
 import pyproj
-from numpy.typing import NDArray
-from PIL import ExifTags, Image
 
-Floats = NDArray[np.float64]
-RASTER_M = 0.06  # cell of the nadir raster: about the spacing of a dense photogrammetric scan
-RENDER_WIDTH = 1600  # px; finer than the scan's points gains nothing
-BLOCK_PX = 200  # correspondences of one block, in the full photo, stay in one half
+from tools.scan_to_photo import (
+    Floats,
+    Frame,
+    Lens,
+    Photo,
+    adjust,
+    correspond,
+    first_pose,
+    nadir_raster,
+    raster_features,
+    read_scan,
+)
 
-
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """Points in an east-north-up frame at `origin` (easting, northing, height in the file's CRS)."""
-
-    xyz: Floats
-    bgr: NDArray[np.uint8]
-    crs: str
-    origin: tuple[float, float, float]
-
-
-@dataclass(frozen=True, slots=True)
-class Lens:
-    """OpenCV's pinhole with k1, k2; OpenCV's pixels: centre of the top-left pixel at (0, 0)."""
-
-    width: int
-    height: int
-    f: float
-    cx: float
-    cy: float
-    k1: float
-    k2: float
-
-    def matrix(self) -> Floats:
-        return np.array([[self.f, 0, self.cx], [0, self.f, self.cy], [0, 0, 1]])
-
-    def distortion(self) -> Floats:
-        return np.array([self.k1, self.k2, 0.0, 0.0])
-
-    def scaled(self, width: int) -> "Lens":
-        s = width / self.width
-        centre = ((self.cx + 0.5) * s - 0.5, (self.cy + 0.5) * s - 0.5)
-        return Lens(width, round(self.height * s), self.f * s, *centre, self.k1, self.k2)
+_BLOCK_PX = 200  # correspondences of one block, in the full photo, stay in one half
+_ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are free, coarse to fine
 
 
-@dataclass(frozen=True, slots=True)
-class Photo:
-    name: str
-    gray: NDArray[np.uint8]
-    pose: Floats  # (6,) rotation vector and translation, camera from scan
-    world: Floats = field(default_factory=lambda: np.zeros((0, 3)))
-    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    cv2.setNumThreads(1)
+    if args.given is None:
+        found = register(args.scan, args.photos, args.crs, args.focal_px)
+        _print_accuracy(found)
+        if args.poses:
+            args.poses.write_text(json.dumps(found, indent=1) + "\n")
+    else:
+        found = json.loads(args.given.read_text())
+    if args.database is None:
+        return 0
+    names = args.held_out or sorted(found["poses"])
+    return compare(found, args.database, [args.photos / name for name in names], args.max_m, args.max_deg)
 
 
-def read_scan(path: Path, crs: str | None) -> Scan:
-    las = laspy.read(path)
-    found = las.header.parse_crs()
-    if crs is None and found is None:
-        raise SystemExit(f"{path}: the file names no CRS; give --crs")
-    projected = pyproj.CRS.from_user_input(crs or found)
-    grid = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
-    origin = tuple(np.round(np.median(grid, axis=0), 0).tolist())
-    xyz = _topocentric(grid, projected, origin)
-    rgb = np.column_stack([las.red, las.green, las.blue])
-    if rgb.max() > 255:
-        rgb = rgb >> 8
-    return Scan(xyz, np.ascontiguousarray(rgb[:, ::-1].astype(np.uint8)), projected.to_string(), origin)
+def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | None) -> dict[str, Any]:
+    """Poses of all photos of a folder that register, with the camera and the accuracy, JSON-able."""
+    scan = read_scan(scan_path, crs)
+    raster = nadir_raster(scan)
+    features = raster_features(raster)
+    photos, lens = [], None
+    for path in sorted(p for p in folder.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")):
+        gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        height, width = gray.shape
+        if lens is None:
+            # Any focal length will do for a start: over nearly flat ground the height takes it up.
+            lens = Lens(width, height, focal_px or 0.6 * width, width / 2 - 0.5, height / 2 - 0.5)
+        if (width, height) != (lens.width, lens.height):
+            raise SystemExit(
+                f"{path}: {width}x{height}, but one camera of {lens.width}x{lens.height} is assumed"
+            )
+        pose = first_pose(gray, lens, raster, features)
+        _say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
+        if pose is not None:
+            photos.append(Photo(path.name, gray, pose))
+    if lens is None or len(photos) < 2:
+        raise SystemExit(f"{folder}: fewer than two photos register to {scan_path}")
+    for free in _ROUNDS:
+        photos = [correspond(photo, lens, scan) for photo in photos]
+        photos, lens, covariance = adjust(photos, lens, free)
+        _say(f"{sum(len(p.world) for p in photos)} correspondences, focal length {lens.f:.1f} px")
+    return _plain(photos, lens, covariance, scan.frame, scan.origin, pyproj.CRS(crs or scan.crs).to_string())
 
 
-def _topocentric(grid: Floats, crs: pyproj.CRS, origin: tuple[float, float, float]) -> Floats:
-    """East, north, up of projected coordinates, through latitude and longitude and geocentric coordinates."""
-    to_geodetic = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
-    lon0, lat0 = to_geodetic.transform(origin[0], origin[1])
-    pipeline = pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon0!r} +lat_0={lat0!r} +h_0={origin[2]!r}"
-    )
-    lon, lat = to_geodetic.transform(grid[:, 0], grid[:, 1])
-    return np.column_stack(pipeline.transform(lon, lat, grid[:, 2])).astype(np.float64)
+def _plain(
+    photos: list[Photo], lens: Lens, covariance: Floats, frame: Frame, origin: Sequence[float], crs: str
+) -> dict[str, Any]:
+    sigmas = np.sqrt(np.diag(covariance)[-7:])
+    return {
+        "crs": crs,
+        "origin": list(origin),
+        "camera": {
+            "model": "OPENCV",
+            "width": lens.width,
+            "height": lens.height,
+            # COLMAP's pixels: centre of the top-left pixel at (0.5, 0.5).
+            "params": [lens.f, lens.f, lens.cx + 0.5, lens.cy + 0.5, lens.k1, lens.k2, lens.p1, lens.p2],
+            "formal_sigmas": sigmas.tolist(),
+        },
+        "halves_of_correspondences": halves_of_correspondences(photos, lens),
+        "halves_of_photos": halves_of_photos(photos, lens),
+        "poses": {p.name: _pose(p, lens, frame) for p in photos},
+    }
 
 
-def grid_from_topocentric(points: Floats, scan_crs: str, origin: tuple[float, float, float]) -> Floats:
-    """The inverse of the frame that `read_scan` makes."""
-    crs = pyproj.CRS.from_user_input(scan_crs)
-    to_geodetic = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
-    lon0, lat0 = to_geodetic.transform(origin[0], origin[1])
-    pipeline = pyproj.Transformer.from_pipeline(
-        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
-        f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon0!r} +lat_0={lat0!r} +h_0={origin[2]!r}"
-    )
-    lon, lat, h = pipeline.transform(*points.T, direction="INVERSE")
-    east, north = to_geodetic.transform(lon, lat, direction="INVERSE")
-    return np.column_stack([east, north, h]).astype(np.float64)
-
-
-def nadir_raster(scan: Scan) -> tuple[NDArray[np.uint8], Floats, Floats]:
-    """Picture, heights (NaN where empty) and south-west corner of the scan's top seen from above, north up."""
-    low = scan.xyz.min(axis=0)
-    column, row = ((scan.xyz[:, :2] - low[:2]) / RASTER_M).astype(np.int64).T
-    shape = (int(row.max()) + 1, int(column.max()) + 1)
-    order = np.argsort(scan.xyz[:, 2])  # the highest point of a cell is written last
-    heights = np.full(shape, np.nan)
-    heights[row[order], column[order]] = scan.xyz[order, 2]
-    picture = np.zeros(shape, np.uint8)
-    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
-    picture[row[order], column[order]] = gray[order]
-    empty = np.isnan(heights).astype(np.uint8)
-    filled = cv2.inpaint(picture, empty, 3, cv2.INPAINT_TELEA)
-    return filled[::-1].copy(), heights[::-1].copy(), low
-
-
-def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_features: tuple) -> Floats | None:
-    """Pose by SIFT against the raster and RANSAC PnP, or None."""
-    picture, heights, low = raster
-    keypoints, descriptors = scan_features
-    small = cv2.resize(photo, (RENDER_WIDTH // 2, round(photo.shape[0] * RENDER_WIDTH / 2 / photo.shape[1])),
-                       interpolation=cv2.INTER_AREA)
-    found, described = cv2.SIFT_create(6000).detectAndCompute(small, None)
-    matcher = cv2.BFMatcher(cv2.NORM_L2)
-    pairs = [m for m, n in matcher.knnMatch(described, descriptors, k=2) if m.distance < 0.8 * n.distance]
-    scale = photo.shape[1] / small.shape[1]
-    pixels = np.array([found[m.queryIdx].pt for m in pairs]) * scale
-    at = np.array([keypoints[m.trainIdx].pt for m in pairs])
-    filled = cv2.inpaint(np.nan_to_num(heights, nan=0).astype(np.float32), np.isnan(heights).astype(np.uint8),
-                         3, cv2.INPAINT_NS)
-    up = filled[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
-    world = np.column_stack([
-        low[0] + (at[:, 0] + 0.5) * RASTER_M,
-        low[1] + (picture.shape[0] - at[:, 1] - 0.5) * RASTER_M,
-        up,
-    ])
-    done, rvec, tvec, inliers = cv2.solvePnPRansac(
-        world, pixels, lens.matrix(), lens.distortion(), iterationsCount=20000, reprojectionError=20.0,
-        flags=cv2.SOLVEPNP_AP3P,
-    )
-    print(f"  {len(pairs)} matches, {0 if inliers is None else len(inliers)} inliers")
-    if not done or len(inliers) < 30:
-        return None
-    rvec, tvec = cv2.solvePnPRefineLM(world[inliers[:, 0]], pixels[inliers[:, 0]], lens.matrix(),
-                                      lens.distortion(), rvec, tvec)
-    return np.concatenate([rvec.ravel(), tvec.ravel()])
-
-
-def render(scan: Scan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
-    """Gray picture, point index (-1 where empty) and the points' projections, by splats in order of depth."""
-    rotation = cv2.Rodrigues(pose[:3])[0]
-    camera_points = scan.xyz @ rotation.T + pose[3:]
-    projected = np.full((len(scan.xyz), 2), -1e6)
-    front = camera_points[:, 2] > 1.0
-    # Beyond the picture's corners the lens polynomial may fold back: keep to what is within 1.3 of them.
-    slope = np.hypot(*(camera_points[front, :2] / camera_points[front, 2:]).T)
-    front[np.flatnonzero(front)[slope > 1.3 * np.hypot(lens.cx, lens.cy) / lens.f]] = False
-    projected[front] = cv2.projectPoints(
-        scan.xyz[front], pose[:3], pose[3:], lens.matrix(), lens.distortion()
+def _pose(photo: Photo, lens: Lens, frame: Frame) -> dict[str, Any]:
+    rotation = cv2.Rodrigues(photo.pose[:3])[0]
+    center = -rotation.T @ photo.pose[3:]
+    predicted = cv2.projectPoints(
+        photo.world, photo.pose[:3], photo.pose[3:], lens.matrix(), lens.distortion()
     )[0][:, 0]
-    depth = camera_points[:, 2]
-    inside = front & (projected > -5).all(axis=1) & (projected < (lens.width + 4, lens.height + 4)).all(axis=1)
-    rows = np.flatnonzero(inside)
-    rows = rows[np.argsort(-depth[rows])]  # far first, near written last
-    index = np.full((lens.height, lens.width), -1, np.int64)
-    radius = max(1, round(0.5 * lens.f / float(np.median(depth[rows])) * 0.12))
-    nearest = np.full(index.shape, np.inf)
-    offsets = [(i, j) for i in range(-radius, radius + 1) for j in range(-radius, radius + 1)]
-    offsets.sort(key=lambda o: -(o[0] ** 2 + o[1] ** 2))  # a point's own pixel wins over its neighbours'
-    for dy, dx in offsets:
-        column, row = (projected[rows].round().astype(np.int64) + (dx, dy)).T
-        ok = (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
-        layer = np.full(index.shape, np.inf)
-        layer_index = np.full(index.shape, -1, np.int64)
-        layer[row[ok], column[ok]] = depth[rows[ok]]
-        layer_index[row[ok], column[ok]] = rows[ok]
-        # Nearer by more than a surface's own unevenness, or as near and closer to the splat's centre.
-        better = layer < nearest + 0.15
-        nearest[better], index[better] = layer[better], layer_index[better]
-    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
-    picture = np.where(index >= 0, gray[index], 0).astype(np.uint8)
-    return picture, index, projected
+    return {
+        "cam_from_local_rotation": rotation.tolist(),
+        "cam_from_local_translation": photo.pose[3:].tolist(),
+        "center_local": center.tolist(),
+        "center_grid": frame.grid(center[None])[0].tolist(),
+        "cam_from_grid_rotation": (rotation @ frame.grid_from_local().T).tolist(),
+        "correspondences": len(photo.world),
+        "median_residual_px": float(np.median(np.linalg.norm(photo.pixels - predicted, axis=1))),
+    }
 
 
-def correspond(photo: Photo, lens: Lens, scan: Scan) -> Photo:
-    """The photo with new correspondences: places of the render tracked into the photo."""
-    small = lens.scaled(RENDER_WIDTH)
-    picture, index, projected = render(scan, small, photo.pose)
-    target = cv2.resize(photo.gray, (small.width, small.height), interpolation=cv2.INTER_AREA)
-    target = cv2.GaussianBlur(target, (0, 0), 1.5)  # the scan's own sharpness
-    solid = cv2.erode((index >= 0).astype(np.uint8), np.ones((25, 25), np.uint8))
-    filled = cv2.GaussianBlur(cv2.inpaint(picture, (index < 0).astype(np.uint8), 3, cv2.INPAINT_TELEA), (0, 0), 1)
-    a, b = _equal_contrast(filled), _equal_contrast(target)
-    corners = cv2.goodFeaturesToTrack(a, 6000, 0.005, 7, mask=solid, blockSize=7)
-    if corners is None:
-        return replace(photo, world=np.zeros((0, 3)), pixels=np.zeros((0, 2)))
-    settings = {"winSize": (31, 31), "maxLevel": 2,
-                "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 0.005)}
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, **settings)
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **settings)
-    good = (ok[:, 0] & ok_back[:, 0]).astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 0.5)
-    corners, flow = corners[good, 0], (there - corners)[good, 0]
-    rows = index[corners[:, 1].round().astype(int), corners[:, 0].round().astype(int)]
-    scale = lens.width / small.width
-    pixels = (projected[rows] + flow + 0.5) * scale - 0.5
-    return replace(photo, world=scan.xyz[rows], pixels=pixels)
+def halves_of_correspondences(photos: list[Photo], lens: Lens) -> dict[str, float]:
+    """How far poses from two disjoint halves of each photo's blocks differ, with the same lens."""
+    halves = []
+    for parity in (0, 1):
+        chosen = []
+        for photo in photos:
+            rows = ((photo.pixels // _BLOCK_PX).astype(int).sum(axis=1) % 2) == parity
+            chosen.append(replace(photo, world=photo.world[rows], pixels=photo.pixels[rows]))
+        halves.append(adjust(chosen, lens, ())[0])
+    return _difference(halves[0], halves[1])
 
 
-def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image less its local mean, over its local deviation: light and colour tables drop out."""
-    values = image.astype(np.float32)
-    mean = cv2.GaussianBlur(values, (0, 0), 20)
-    deviation = np.sqrt(cv2.GaussianBlur((values - mean) ** 2, (0, 0), 20))
-    return np.clip(128 + 45 * (values - mean) / (deviation + 4), 0, 255).astype(np.uint8)
+def halves_of_photos(photos: list[Photo], lens: Lens) -> dict[str, float]:
+    """How far poses with the camera of the even photos are from those with the camera of the odd ones."""
+    full = tuple(range(7))
+    lenses = [adjust(photos[parity::2], lens, full)[1] for parity in (0, 1)]
+    fixed = [adjust(photos, half, ())[0] for half in lenses]
+    return _difference(fixed[0], fixed[1]) | {"focal_px": abs(lenses[0].f - lenses[1].f)}
 
 
-def adjust(photos: list[Photo], lens: Lens, free: tuple[int, ...], rounds: int = 30) -> tuple[list[Photo], Lens, Floats]:
-    """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2) from all
-    correspondences, robustly (Geman-McClure at three times the spread); also the covariance of the lens."""
-    count = len(photos)
-    poses = np.array([p.pose for p in photos])
-    values = np.array([lens.f, lens.cx, lens.cy, lens.k1, lens.k2])
-    k = len(free)
-    size = 6 * count + k
-    for _ in range(rounds):
-        normal, gradient = np.zeros((size, size)), np.zeros(size)
-        current = Lens(lens.width, lens.height, *values)
-        results = [_linearise(p, pose, current) for p, pose in zip(photos, poses, strict=True)]
-        sigma = 1.4826 * float(np.median(np.concatenate([np.abs(r).ravel() for r, _ in results])))
-        total, used = 0.0, 0.0
-        for i, (residual, jacobian) in enumerate(results):
-            squared = (residual**2).sum(axis=1) / (3 * sigma) ** 2
-            weight = np.repeat(1 / (1 + squared) ** 2, 2)
-            total += float((weight * residual.ravel() ** 2).sum())
-            used += float(weight.sum())
-            columns = np.concatenate([jacobian[:, :6], jacobian[:, 6:][:, list(free)]], axis=1)
-            at = np.concatenate([np.arange(6 * i, 6 * i + 6), np.arange(6 * count, size)])
-            normal[np.ix_(at, at)] += columns.T @ (weight[:, None] * columns)
-            gradient[at] += columns.T @ (weight * residual.ravel())
-        step = np.linalg.solve(normal + 1e-12 * np.diag(np.diag(normal)), gradient)
-        poses = poses + step[: 6 * count].reshape(-1, 6)
-        values[list(free)] += step[6 * count :]
-        if np.abs(step[: 6 * count].reshape(-1, 6)[:, 3:]).max() < 1e-4:
-            break
-    covariance = np.linalg.inv(normal) * total / used
-    moved = [replace(p, pose=pose) for p, pose in zip(photos, poses, strict=True)]
-    return moved, Lens(lens.width, lens.height, *values), covariance
+def _difference(first: list[Photo], second: list[Photo]) -> dict[str, float]:
+    shifts, turns = [], []
+    for a, b in zip(first, second, strict=True):
+        ra, rb = cv2.Rodrigues(a.pose[:3])[0], cv2.Rodrigues(b.pose[:3])[0]
+        shifts.append(ra.T @ a.pose[3:] - rb.T @ b.pose[3:])
+        turns.append(_angle_deg(ra, rb))
+    lengths = np.abs(shifts)
+    return {
+        "east_m": float(np.median(lengths[:, 0])),
+        "north_m": float(np.median(lengths[:, 1])),
+        "up_m": float(np.median(lengths[:, 2])),
+        "position_m": float(np.median(np.linalg.norm(shifts, axis=1))),
+        "rotation_deg": float(np.median(turns)),
+    }
 
 
-def _linearise(photo: Photo, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) photo minus projection, and the projections' Jacobian (2n, 11): pose, f, cx, cy, k1, k2."""
-    projected, j = cv2.projectPoints(photo.world, pose[:3], pose[3:], lens.matrix(), lens.distortion())
-    jacobian = np.column_stack([j[:, :6], j[:, 6] + j[:, 7], j[:, 8:10], j[:, 10:12]])
-    return photo.pixels - projected[:, 0], jacobian
+def compare(
+    found: dict[str, Any], database: Path, photos: Sequence[Path], max_m: float, max_deg: float
+) -> int:
+    """Print the differences of localised photos from their poses; 0 if the medians are within the limits."""
+    command = [sys.executable, "-m", "featuredb.cli", "localise", str(database), *map(str, photos), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1):  # 1: some photo was not localised, which is a row of the table
+        raise SystemExit(f"featuredb localise failed:\n{done.stderr}")
+    answers = {Path(a["image"]).name: a for a in map(json.loads, done.stdout.splitlines())}
+    print(
+        f"{'photo':<16}{'east m':>9}{'north m':>9}{'up m':>9}{'all m':>9}{'deg':>9}{'focal px':>10}  camera"
+    )
+    metres, degrees = [], []
+    for path in photos:
+        answer, truth = answers[path.name], found["poses"].get(path.name)
+        if truth is None or answer["status"] != "localised":
+            metres.append(np.inf)
+            degrees.append(np.inf)
+            print(f"{path.name:<16}  {'no pose by the scan' if truth is None else answer['reason']}")
+            continue
+        utm = answer["utm"]
+        shift = np.array([utm["easting"], utm["northing"], utm["height"]]) - truth["center_grid"]
+        turn = _angle_deg(_rotation(utm["cam_from_utm_xyzw"]), np.array(truth["cam_from_grid_rotation"]))
+        metres.append(float(np.linalg.norm(shift)))
+        degrees.append(turn)
+        camera = answer["camera"]
+        print(
+            f"{path.name:<16}{shift[0]:>9.3f}{shift[1]:>9.3f}{shift[2]:>9.3f}{metres[-1]:>9.3f}{turn:>9.3f}"
+            f"{camera['params'][0]:>10.1f}  {camera['source']}"
+        )
+    median_m, median_deg = float(np.median(metres)), float(np.median(degrees))
+    good = median_m <= max_m and median_deg <= max_deg
+    print(f"median {median_m:.3f} m (at most {max_m:g}), {median_deg:.3f} degrees (at most {max_deg:g})")
+    return 0 if good else 1
+
+
+def _rotation(xyzw: Sequence[float]) -> Floats:
+    """Rotation matrix of a Hamilton quaternion."""
+    x, y, z, w = np.array(xyzw) / np.linalg.norm(xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _angle_deg(a: Floats, b: Floats) -> float:
+    return float(np.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0])))
+
+
+def _print_accuracy(found: dict[str, Any]) -> None:
+    camera = found["camera"]
+    print(f"camera {camera['model']} {camera['width']}x{camera['height']}: ", end="")
+    print(", ".join(f"{value:.6g}" for value in camera["params"]))
+    print(f"{len(found['poses'])} photos registered")
+    for name in ("halves_of_correspondences", "halves_of_photos"):
+        print(f"{name.replace('_', ' ')} differ by: ", end="")
+        print(", ".join(f"{key} {value:.3f}" for key, value in found[name].items()))
+    print(f"{'photo':<16}{'grid east':>12}{'grid north':>13}{'height':>9}{'points':>8}{'median px':>11}")
+    for name, pose in sorted(found["poses"].items()):
+        east, north, up = pose["center_grid"]
+        print(
+            f"{name:<16}{east:>12.2f}{north:>13.2f}{up:>9.2f}{pose['correspondences']:>8}"
+            f"{pose['median_residual_px']:>11.2f}"
+        )
+
+
+def _say(text: str) -> None:
+    sys.stderr.write(text + "\n")
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("scan", type=Path, metavar="SCAN", help="LAS or LAZ with colour")
+    parser.add_argument("photos", type=Path, metavar="FOLDER", help="photos of one camera")
+    parser.add_argument("--crs", default=None, help="of the scan, where the file names none")
+    parser.add_argument("--focal-px", type=float, default=None, help="start; default: 0.6 of the width")
+    parser.add_argument("--poses", type=Path, default=None, metavar="FILE", help="write the poses as JSON")
+    parser.add_argument("--given", type=Path, default=None, metavar="FILE", help="poses of an earlier run")
+    parser.add_argument("--database", type=Path, default=None, metavar="DB", help="compare with `localise`")
+    parser.add_argument("--held-out", nargs="+", default=[], metavar="NAME", help="default: all with a pose")
+    parser.add_argument("--max-m", type=float, default=0.30, help="default: 0.30")
+    parser.add_argument("--max-deg", type=float, default=0.25, help="default: 0.25")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

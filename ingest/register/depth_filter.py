@@ -72,9 +72,7 @@ def reliable_depth(rendering: Rendering, options: DepthFilterOptions) -> NDArray
     kernel = np.zeros((2 * reach + 1, 1), np.float32)
     kernel[0, 0] = kernel[-1, 0] = 0.5
     kernel[reach, 0] = -1.0
-    bend = np.maximum(
-        np.abs(cv2.filter2D(inverse, -1, kernel)), np.abs(cv2.filter2D(inverse, -1, kernel.T))
-    )
+    bend = np.maximum(np.abs(cv2.filter2D(inverse, -1, kernel)), np.abs(cv2.filter2D(inverse, -1, kernel.T)))
     flat = bend * np.where(seen, rendering.depth, 0.0) <= options.max_step_rel
     return np.asarray(seen & flat & (rendering.index >= 0))
 

@@ -8,7 +8,7 @@ not leave the evidence.
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -308,9 +308,7 @@ def _figures_of_fit(
 def _gate_of_fit(
     fit: SimilarityFit, distances: FloatArray, figures: dict[str, Any], options: StructureOptions
 ) -> tuple[StructureReason | None, str]:
-    limit = max(
-        options.min_tolerance_m, options.max_residual_rel * float(np.median(distances[fit.inliers]))
-    )
+    limit = max(options.min_tolerance_m, options.max_residual_rel * float(np.median(distances[fit.inliers])))
     if figures["inliers"] < options.min_pairs:
         return "TOO_FEW_PAIRS", (
             f"{figures['inliers']} pairs remain after refinement, at least {options.min_pairs} are needed"

@@ -126,7 +126,9 @@ def _pairs_of_frame(
     largest = np.sqrt(np.linalg.eigvalsh(uncertainty[points])[:, -1])
     kept = hits.valid & (largest <= options.max_point_sigma_rel * np.where(hits.valid, distance, 0.0))
     own, by_frame = _errors(hits, pose, camera, options)
-    grid = np.minimum((pixels / (small.width, small.height) * options.cells).astype(np.int64), options.cells - 1)
+    grid = np.minimum(
+        (pixels / (small.width, small.height) * options.cells).astype(np.int64), options.cells - 1
+    )
     cell = row * options.cells**2 + grid[:, 1] * options.cells + grid[:, 0]
     return Pairs(
         point_index=points[kept],

@@ -198,9 +198,7 @@ def _align(surface: Surface, points: FloatArray, reach_m: float, options: Surfac
     gicp = _small_gicp()
     source = gicp.PointCloud(points - surface.middle)
     tree = gicp.KdTree(source, num_threads=options.threads)
-    gicp.estimate_covariances(
-        source, tree, num_neighbors=options.neighbours, num_threads=options.threads
-    )
+    gicp.estimate_covariances(source, tree, num_neighbors=options.neighbours, num_threads=options.threads)
     result = gicp.align(
         surface.cloud,
         source,

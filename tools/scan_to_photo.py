@@ -1,0 +1,301 @@
+"""Poses of photos by registering each one directly to a coloured scan, by dense correspondences.
+
+What tools/scan_poses.py runs. It shares no code with the map, anchoring or localisation: laspy reads the scan,
+PROJ makes the topocentric frame, numpy rasters and renders, OpenCV matches and solves. The first pose comes
+from SIFT between the photo and a nadir raster of the scan; then the scan is rendered from that pose, tracked
+into the photo at thousands of places, and all photos' poses are estimated together with one camera.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import laspy
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+RASTER_M = 0.06  # cell of the nadir raster: about the spacing of a dense photogrammetric scan
+RENDER_WIDTH = 1600  # px; finer than the scan's points gains nothing
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """Points in an east-north-up frame at `origin` (easting, northing, height in the file's CRS)."""
+
+    xyz: Floats
+    bgr: NDArray[np.uint8]
+    frame: "Frame"
+    origin: tuple[float, float, float]
+    crs: str
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """OpenCV's pinhole with k1, k2, p1, p2; OpenCV's pixels: centre of the top-left pixel at (0, 0)."""
+
+    width: int
+    height: int
+    f: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+
+    def values(self) -> Floats:
+        """What `adjust` estimates, in its order."""
+        return np.array([self.f, self.cx, self.cy, self.k1, self.k2, self.p1, self.p2])
+
+    def matrix(self) -> Floats:
+        return np.array([[self.f, 0, self.cx], [0, self.f, self.cy], [0, 0, 1]])
+
+    def distortion(self) -> Floats:
+        return np.array([self.k1, self.k2, self.p1, self.p2])
+
+    def scaled(self, width: int) -> "Lens":
+        s = width / self.width
+        centre = ((self.cx + 0.5) * s - 0.5, (self.cy + 0.5) * s - 0.5)
+        return Lens(width, round(self.height * s), self.f * s, *centre, *self.values()[3:].tolist())
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    name: str
+    gray: NDArray[np.uint8]
+    pose: Floats  # (6,) rotation vector and translation, camera from scan
+    world: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+def read_scan(path: Path, crs: str | None) -> Scan:
+    las = laspy.read(path)
+    found = las.header.parse_crs()
+    if crs is None and found is None:
+        raise SystemExit(f"{path}: the file names no CRS; give --crs")
+    projected = pyproj.CRS.from_user_input(crs or found)
+    grid = np.column_stack([las.x, las.y, las.z]).astype(np.float64)
+    origin = tuple(np.round(np.median(grid, axis=0)).tolist())
+    frame = Frame(projected, origin)
+    rgb = np.column_stack([las.red, las.green, las.blue])
+    if rgb.max() > 255:
+        rgb = rgb >> 8
+    bgr = np.ascontiguousarray(rgb[:, ::-1].astype(np.uint8))
+    return Scan(frame.local(grid), bgr, frame, origin, projected.to_string())
+
+
+class Frame:
+    """East, north, up at an origin given in the scan's projected CRS, and back, by PROJ."""
+
+    def __init__(self, crs: pyproj.CRS, origin: tuple[float, float, float]) -> None:
+        self._to_geodetic = pyproj.Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        lon, lat = self._to_geodetic.transform(origin[0], origin[1])
+        self._pipeline = pyproj.Transformer.from_pipeline(
+            "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+            f"+step +proj=topocentric +ellps=WGS84 +lon_0={lon!r} +lat_0={lat!r} +h_0={origin[2]!r}"
+        )
+
+    def local(self, grid: Floats) -> Floats:
+        """Local metres of projected coordinates (n, 3)."""
+        lon, lat = self._to_geodetic.transform(grid[:, 0], grid[:, 1])
+        return np.column_stack(self._pipeline.transform(lon, lat, grid[:, 2])).astype(np.float64)
+
+    def grid(self, local: Floats) -> Floats:
+        """Projected coordinates of local metres (n, 3)."""
+        lon, lat, height = self._pipeline.transform(*local.T, direction="INVERSE")
+        east, north = self._to_geodetic.transform(lon, lat, direction="INVERSE")
+        return np.column_stack([east, north, height]).astype(np.float64)
+
+    def grid_from_local(self) -> Floats:
+        """Rotation (3, 3) from local axes to the grid's at the origin."""
+        ends = self.grid(np.vstack([np.zeros(3), 10.0 * np.eye(3)]))
+        columns = ends[1:] - ends[0]
+        u, _, vt = np.linalg.svd(columns.T)
+        return np.asarray(u @ vt)
+
+
+def nadir_raster(scan: Scan) -> tuple[NDArray[np.uint8], Floats, Floats]:
+    """Picture, heights (NaN where empty) and south-west corner of the scan's top seen from above, north up."""
+    low = scan.xyz.min(axis=0)
+    column, row = ((scan.xyz[:, :2] - low[:2]) / RASTER_M).astype(np.int64).T
+    shape = (int(row.max()) + 1, int(column.max()) + 1)
+    order = np.argsort(scan.xyz[:, 2])  # the highest point of a cell is written last
+    heights = np.full(shape, np.nan)
+    heights[row[order], column[order]] = scan.xyz[order, 2]
+    picture = np.zeros(shape, np.uint8)
+    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
+    picture[row[order], column[order]] = gray[order]
+    empty = np.isnan(heights).astype(np.uint8)
+    filled = cv2.inpaint(picture, empty, 3, cv2.INPAINT_TELEA)
+    return filled[::-1].copy(), heights[::-1].copy(), low
+
+
+def raster_features(raster: tuple[NDArray[np.uint8], Floats, Floats]) -> tuple[Any, Any]:
+    """SIFT keypoints and descriptors of the raster's picture."""
+    return cv2.SIFT_create(20000).detectAndCompute(raster[0], None)
+
+
+def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_features: tuple) -> Floats | None:
+    """Pose by SIFT against the raster and RANSAC PnP, or None."""
+    picture, heights, low = raster
+    keypoints, descriptors = scan_features
+    small = cv2.resize(
+        photo,
+        (RENDER_WIDTH // 2, round(photo.shape[0] * RENDER_WIDTH / 2 / photo.shape[1])),
+        interpolation=cv2.INTER_AREA,
+    )
+    found, described = cv2.SIFT_create(6000).detectAndCompute(small, None)
+    matcher = cv2.BFMatcher(cv2.NORM_L2)
+    pairs = [m for m, n in matcher.knnMatch(described, descriptors, k=2) if m.distance < 0.8 * n.distance]
+    scale = photo.shape[1] / small.shape[1]
+    pixels = np.array([found[m.queryIdx].pt for m in pairs]) * scale
+    at = np.array([keypoints[m.trainIdx].pt for m in pairs])
+    filled = cv2.inpaint(
+        np.nan_to_num(heights, nan=0).astype(np.float32),
+        np.isnan(heights).astype(np.uint8),
+        3,
+        cv2.INPAINT_NS,
+    )
+    up = filled[at[:, 1].round().astype(int), at[:, 0].round().astype(int)]
+    world = np.column_stack(
+        [
+            low[0] + (at[:, 0] + 0.5) * RASTER_M,
+            low[1] + (picture.shape[0] - at[:, 1] - 0.5) * RASTER_M,
+            up,
+        ]
+    )
+    done, rvec, tvec, inliers = cv2.solvePnPRansac(
+        world,
+        pixels,
+        lens.matrix(),
+        lens.distortion(),
+        iterationsCount=20000,
+        reprojectionError=20.0,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not done or len(inliers) < 30:
+        return None
+    rvec, tvec = cv2.solvePnPRefineLM(
+        world[inliers[:, 0]], pixels[inliers[:, 0]], lens.matrix(), lens.distortion(), rvec, tvec
+    )
+    return np.concatenate([rvec.ravel(), tvec.ravel()])
+
+
+def render(scan: Scan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
+    """Gray picture, point index (-1 where empty) and the points' projections, by splats in order of depth."""
+    rotation = cv2.Rodrigues(pose[:3])[0]
+    camera_points = scan.xyz @ rotation.T + pose[3:]
+    projected = np.full((len(scan.xyz), 2), -1e6)
+    front = camera_points[:, 2] > 1.0
+    # Beyond the picture's corners the lens polynomial may fold back: keep to what is within 1.3 of them.
+    slope = np.hypot(*(camera_points[front, :2] / camera_points[front, 2:]).T)
+    front[np.flatnonzero(front)[slope > 1.3 * np.hypot(lens.cx, lens.cy) / lens.f]] = False
+    projected[front] = cv2.projectPoints(
+        scan.xyz[front], pose[:3], pose[3:], lens.matrix(), lens.distortion()
+    )[0][:, 0]
+    depth = camera_points[:, 2]
+    inside = (
+        front & (projected > -5).all(axis=1) & (projected < (lens.width + 4, lens.height + 4)).all(axis=1)
+    )
+    rows = np.flatnonzero(inside)
+    rows = rows[np.argsort(-depth[rows])]  # far first, near written last
+    index = np.full((lens.height, lens.width), -1, np.int64)
+    radius = max(1, round(0.5 * lens.f / float(np.median(depth[rows])) * 0.12))
+    nearest = np.full(index.shape, np.inf)
+    offsets = [(i, j) for i in range(-radius, radius + 1) for j in range(-radius, radius + 1)]
+    offsets.sort(key=lambda o: -(o[0] ** 2 + o[1] ** 2))  # a point's own pixel wins over its neighbours'
+    for dy, dx in offsets:
+        column, row = (projected[rows].round().astype(np.int64) + (dx, dy)).T
+        ok = (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
+        layer = np.full(index.shape, np.inf)
+        layer_index = np.full(index.shape, -1, np.int64)
+        layer[row[ok], column[ok]] = depth[rows[ok]]
+        layer_index[row[ok], column[ok]] = rows[ok]
+        # Nearer by more than a surface's own unevenness, or as near and closer to the splat's centre.
+        better = layer < nearest + 0.15
+        nearest[better], index[better] = layer[better], layer_index[better]
+    gray = cv2.cvtColor(scan.bgr[:, None], cv2.COLOR_BGR2GRAY)[:, 0]
+    picture = np.where(index >= 0, gray[index], 0).astype(np.uint8)
+    return picture, index, projected
+
+
+def correspond(photo: Photo, lens: Lens, scan: Scan) -> Photo:
+    """The photo with new correspondences: places of the render tracked into the photo."""
+    small = lens.scaled(RENDER_WIDTH)
+    picture, index, projected = render(scan, small, photo.pose)
+    target = cv2.resize(photo.gray, (small.width, small.height), interpolation=cv2.INTER_AREA)
+    target = cv2.GaussianBlur(target, (0, 0), 1.5)  # the scan's own sharpness
+    solid = cv2.erode((index >= 0).astype(np.uint8), np.ones((25, 25), np.uint8))
+    filled = cv2.GaussianBlur(
+        cv2.inpaint(picture, (index < 0).astype(np.uint8), 3, cv2.INPAINT_TELEA), (0, 0), 1
+    )
+    a, b = _equal_contrast(filled), _equal_contrast(target)
+    corners = cv2.goodFeaturesToTrack(a, 6000, 0.005, 7, mask=solid, blockSize=7)
+    if corners is None:
+        return replace(photo, world=np.zeros((0, 3)), pixels=np.zeros((0, 2)))
+    settings = {
+        "winSize": (31, 31),
+        "maxLevel": 2,
+        "criteria": (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 0.005),
+    }
+    there, ok, _ = cv2.calcOpticalFlowPyrLK(a, b, corners, None, **settings)
+    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(b, a, there, None, **settings)
+    good = (ok[:, 0] & ok_back[:, 0]).astype(bool) & (np.linalg.norm(back - corners, axis=2)[:, 0] < 0.5)
+    corners, flow = corners[good, 0], (there - corners)[good, 0]
+    rows = index[corners[:, 1].round().astype(int), corners[:, 0].round().astype(int)]
+    scale = lens.width / small.width
+    pixels = (projected[rows] + flow + 0.5) * scale - 0.5
+    return replace(photo, world=scan.xyz[rows], pixels=pixels)
+
+
+def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image less its local mean, over its local deviation: light and colour tables drop out."""
+    values = image.astype(np.float32)
+    mean = cv2.GaussianBlur(values, (0, 0), 20)
+    deviation = np.sqrt(cv2.GaussianBlur((values - mean) ** 2, (0, 0), 20))
+    return np.clip(128 + 45 * (values - mean) / (deviation + 4), 0, 255).astype(np.uint8)
+
+
+def adjust(
+    photos: list[Photo], lens: Lens, free: tuple[int, ...], rounds: int = 30
+) -> tuple[list[Photo], Lens, Floats]:
+    """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2, 5 p1, 6 p2) from all
+    correspondences, robustly (Geman-McClure at three times the spread); also the covariance of the lens."""
+    count = len(photos)
+    poses = np.array([p.pose for p in photos])
+    values = lens.values()
+    k = len(free)
+    size = 6 * count + k
+    for _ in range(rounds):
+        normal, gradient = np.zeros((size, size)), np.zeros(size)
+        current = Lens(lens.width, lens.height, *values.tolist())
+        results = [_linearise(p, pose, current) for p, pose in zip(photos, poses, strict=True)]
+        sigma = 1.4826 * float(np.median(np.concatenate([np.abs(r).ravel() for r, _ in results])))
+        total, used = 0.0, 0.0
+        for i, (residual, jacobian) in enumerate(results):
+            squared = (residual**2).sum(axis=1) / (3 * sigma) ** 2
+            weight = np.repeat(1 / (1 + squared) ** 2, 2)
+            total += float((weight * residual.ravel() ** 2).sum())
+            used += float(weight.sum())
+            columns = np.concatenate([jacobian[:, :6], jacobian[:, 6:][:, list(free)]], axis=1)
+            at = np.concatenate([np.arange(6 * i, 6 * i + 6), np.arange(6 * count, size)])
+            normal[np.ix_(at, at)] += columns.T @ (weight[:, None] * columns)
+            gradient[at] += columns.T @ (weight * residual.ravel())
+        step = np.linalg.solve(normal + 1e-12 * np.diag(np.diag(normal)), gradient)
+        poses = poses + step[: 6 * count].reshape(-1, 6)
+        values[list(free)] += step[6 * count :]
+        if np.abs(step[: 6 * count].reshape(-1, 6)[:, 3:]).max() < 1e-4:
+            break
+    covariance = np.linalg.inv(normal) * total / used
+    moved = [replace(p, pose=pose) for p, pose in zip(photos, poses, strict=True)]
+    return moved, Lens(lens.width, lens.height, *values.tolist()), covariance
+
+
+def _linearise(photo: Photo, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:
+    """Residuals (n, 2) photo minus projection, and the projections' Jacobian (2n, 13): pose, then the lens' values."""
+    projected, j = cv2.projectPoints(photo.world, pose[:3], pose[3:], lens.matrix(), lens.distortion())
+    jacobian = np.column_stack([j[:, :6], j[:, 6] + j[:, 7], j[:, 8:10], j[:, 10:14]])
+    return photo.pixels - projected[:, 0], jacobian
