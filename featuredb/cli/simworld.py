@@ -15,6 +15,14 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from featuredb.simworld.scan_world import (
+    ORTHO_FILE,
+    OTHER_ORTHO_FILE,
+    OTHER_SCAN_FILE,
+    SCAN_FILE,
+    ScanWorldOptions,
+    write_lidar,
+)
 from featuredb.simworld.world import World, WorldOptions, write_world
 
 
@@ -35,6 +43,12 @@ def register(subparsers: Any) -> None:
         default="realistic",
         help="none: EXIF positions are the truth; default: realistic",
     )
+    parser.add_argument(
+        "--lidar",
+        action="store_true",
+        help="also write scan.laz (airborne, intensity only) and ortho.tif of the town, and those of another "
+        "town at the same place; needs the extra lidar",
+    )
     parser.add_argument("--workers", type=int, default=0, help="processes; default: one per core")
     parser.set_defaults(run=run_simworld)
 
@@ -43,8 +57,11 @@ def run_simworld(args: argparse.Namespace) -> int:
     """Write the world and say what is in it."""
     options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
     options = replace(options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error))
+    console = Console(stderr=True)
+    if args.lidar:  # first, since it may lack a package
+        write_lidar(args.out, ScanWorldOptions(world=options), lambda name: console.print(f"writing {name}"))
     world = _write_with_progress(args.out, options)
-    Console().print(_summary(world))
+    Console().print(_summary(world, lidar=args.lidar))
     return 0
 
 
@@ -61,11 +78,14 @@ def _write_with_progress(folder: Path, options: WorldOptions) -> World:
         return write_world(folder, options, lambda done, total: bar.update(task, completed=done, total=total))
 
 
-def _summary(world: World) -> str:
+def _summary(world: World, *, lidar: bool) -> str:
     counts = {
         "survey photos": len(world.images("drone")),
         "queries": len(world.images("queries")),
         "street photos": len(world.images("street")),
         "negatives": len(world.negatives()),
     }
-    return f"{world.folder}: " + ", ".join(f"{n} {what}" for what, n in counts.items()) + ", truth.json"
+    files = [SCAN_FILE, ORTHO_FILE, OTHER_SCAN_FILE, OTHER_ORTHO_FILE] if lidar else []
+    return f"{world.folder}: " + ", ".join(
+        [*(f"{n} {what}" for what, n in counts.items()), "truth.json", *files]
+    )
