@@ -18,6 +18,7 @@ from featuredb.cli.common import (
 )
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
+from featuredb.store.scans import list_scans, retire_scan
 from featuredb.store.sql import SqlResult, SqlSession
 from featuredb.store.verify import verify
 
@@ -36,7 +37,7 @@ def register(subparsers: Any) -> None:
         subparsers,
         "sql",
         run_sql,
-        "read by SQL (DuckDB): maps, images, cameras, points, observations",
+        "read by SQL (DuckDB): maps, images, cameras, points, observations, lidar, lidar_points",
         epilog='example: featuredb sql DB "select tile, count(*) from points group by tile"; see docs/sql.md',
     )
     sql.add_argument("query", metavar="SELECT", help="one reading statement")
@@ -47,10 +48,10 @@ def register(subparsers: Any) -> None:
     )
     check.add_argument("--json", action="store_true", help="the report as JSON")
     retire = _command(
-        subparsers, "retire", run_retire, "take a map out of service, with all that hangs on it"
+        subparsers, "retire", run_retire, "take a map out of service, with all that hangs on it, or a scan"
     )
-    retire.add_argument("map_id", metavar="MAP")
-    retire.add_argument("--reason", required=True, help="kept with the map")
+    retire.add_argument("map_id", metavar="MAP", help="id of a map or of a LiDAR scan")
+    retire.add_argument("--reason", required=True, help="kept with the map or scan")
     rollback = _command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
     _command(subparsers, "compact", run_compact, "merge small files")
@@ -93,7 +94,8 @@ def run_history(args: argparse.Namespace) -> int:
 
 
 def run_sql(args: argparse.Namespace) -> int:
-    with SqlSession(open_database(args).snapshot(args.as_of)) as session:
+    database = open_database(args)
+    with SqlSession(database.snapshot(args.as_of), database) as session:
         write_result(session.query(args.query), args.format)
     return 0
 
@@ -106,6 +108,7 @@ def run_verify(args: argparse.Namespace) -> int:
                 "ok": report.ok,
                 "version": report.version,
                 "maps": report.maps,
+                "scans": report.scans,
                 "files": report.files,
                 "rows": report.rows,
                 "problems": [{"where": p.where, "what": p.what} for p in report.problems],
@@ -119,13 +122,19 @@ def run_verify(args: argparse.Namespace) -> int:
         sys.stdout.write(f"orphan rows of write {orphan}: harmless, `featuredb vacuum` removes them\n")
     verdict = "sound" if report.ok else f"{len(report.problems)} problems"
     sys.stdout.write(
-        f"version {report.version}: {report.maps} maps, {report.files} files, {report.rows} rows: {verdict}\n"
+        f"version {report.version}: {report.maps} maps, {report.scans} scans, {report.files} files, "
+        f"{report.rows} rows: {verdict}\n"
     )
     return 0 if report.ok else 1
 
 
 def run_retire(args: argparse.Namespace) -> int:
-    retired = open_database(args).retire(args.map_id, args.reason)
+    database = open_database(args)
+    retired: tuple[str, ...] = ()
+    if args.map_id not in {scan.scan_id for scan in list_scans(database, include_retired=True)}:
+        retired = database.retire(args.map_id, args.reason)
+    elif retire_scan(database, args.map_id, args.reason):
+        retired = (args.map_id,)
     sys.stdout.write(f"retired: {', '.join(retired) if retired else 'nothing, it was retired already'}\n")
     return 0
 

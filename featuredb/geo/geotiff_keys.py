@@ -8,7 +8,13 @@ transverse Mercator, Lambert's conformal conic with two parallels, and Albers' e
 from collections.abc import Mapping
 
 from pyproj import CRS
-from pyproj.crs import CompoundCRS, CoordinateOperation, Datum, GeographicCRS, ProjectedCRS
+from pyproj.crs import (  # type: ignore[attr-defined]
+    CompoundCRS,
+    CoordinateOperation,
+    Datum,
+    GeographicCRS,
+    ProjectedCRS,
+)
 from pyproj.crs.coordinate_operation import (
     AlbersEqualAreaConversion,
     LambertConformalConic2SPConversion,

@@ -7,7 +7,7 @@ from datetime import UTC, datetime, timedelta
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from featuredb.store.changes import Change
+from featuredb.store.changes import RETIRED, Change
 from featuredb.store.database import (
     KEPT_FROM,
     Database,
@@ -17,7 +17,8 @@ from featuredb.store.database import (
     write_time,
 )
 from featuredb.store.delta import Commit, Table, retry_stale
-from featuredb.store.tables import CHILD_TABLES, MAPS, TABLES
+from featuredb.store.scans import has_scans, retired_since, scan_rows
+from featuredb.store.tables import CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,7 +57,7 @@ class VacuumReport:
 def compact(database: Database) -> dict[str, int]:
     """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
     saved = {}
-    for name in CHILD_TABLES:
+    for name in (*CHILD_TABLES, *((LIDAR_POINTS,) if has_scans(database) else ())):
         saved[name] = database.table(name).compact()
     saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
     return saved
@@ -85,6 +86,7 @@ def vacuum(
         if found and not dry_run:
             table.delete_writes(found)
         orphans |= found
+    orphans |= _vacuum_scans(database, options, now, dry_run)
     return VacuumReport(
         kept_from=kept_from,
         write_ids=tuple(sorted(orphans)),
@@ -158,9 +160,28 @@ def _oldest_within(commits: Iterable[Commit], cutoff: datetime) -> int:
     return max((commit.version for commit in commits if commit.timestamp <= cutoff), default=0)
 
 
+def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> set[str]:
+    """Remove points that no scan names, and those of scans that were retired before the kept history."""
+    if not has_scans(database):
+        return set()
+    since = retired_since(database)
+    history = timedelta(hours=options.history_h)
+    named = {
+        row["write_id"]
+        for row in scan_rows(database)
+        if row["status"] != RETIRED or now - since.get(row["scan_id"], now) < history
+    }
+    table = database.table(LIDAR_POINTS)
+    grace = timedelta(hours=options.orphan_grace_h)
+    found = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
+    if found and not dry_run:
+        table.delete_writes(found)
+    return found
+
+
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
     files = []
-    for name in TABLES:
+    for name in (*TABLES, *((LIDAR_POINTS,) if has_scans(database) else ())):
         table = database.table(name)
         # Versions of `maps` are kept by number; the newest child table serves all of them.
         keep = range(kept_from, table.version + 1) if name == MAPS else ()

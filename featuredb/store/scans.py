@@ -155,7 +155,7 @@ def commit_scan(
         return False, visible["write_id"]
     started = datetime.now(UTC)
     write_id = new_write_id(started)
-    checksum = _Checksum()
+    checksum = PointsChecksum()
     written = 0
 
     def batches(group: Callable[[], Iterator[TilePoints]]) -> Iterator[pa.RecordBatch]:
@@ -236,6 +236,23 @@ def scan_points(
         ) from error
 
 
+def scan_batches(database: Database, scan: ScanSummary, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
+    """All points of a scan, some thousand at a time, in no particular order."""
+    dataset = database.table(LIDAR_POINTS).dataset([("write_id", "=", scan.write_id)])
+    wanted = ds.field("write_id") == scan.write_id
+    yield from dataset.to_batches(columns=list(columns), filter=wanted, use_threads=False)
+
+
+def retired_since(database: Database) -> dict[str, datetime]:
+    """When each scan was retired last, by scan id."""
+    commits = database.table(LIDAR).commits() if has_scans(database) else []
+    times: dict[str, datetime] = {}
+    for commit in commits:  # newest first
+        if commit.metadata.get(OPERATION) == "retire":
+            times.setdefault(commit.metadata.get(CHANGED, ""), commit.timestamp)
+    return times
+
+
 def count_points(
     database: Database, scan: ScanSummary, level: int, box: tuple[float, float, float, float] | None
 ) -> int:
@@ -261,15 +278,7 @@ def scan_rows_table(rows: Sequence[Row]) -> pa.Table:
     return pa.Table.from_pylist(list(rows), schema=SPECS[LIDAR].schema)
 
 
-def points_checksum(batches: Iterable[FloatArray]) -> str:
-    """The checksum of UTM coordinates (n, 3) float64 that come in pieces, in any order."""
-    checksum = _Checksum()
-    for utm in batches:
-        checksum.add(utm)
-    return checksum.text()
-
-
-class _Checksum:
+class PointsChecksum:
     """Sum over all points of a hash of each, so that the order, which compaction changes, does not count."""
 
     def __init__(self) -> None:
@@ -277,6 +286,7 @@ class _Checksum:
         self._count = 0
 
     def add(self, utm: FloatArray) -> None:
+        """Take in coordinates (n, 3) float64."""
         bits = np.ascontiguousarray(utm, dtype="<f8").view("<u8")
         h = bits[:, 0] * np.uint64(0x9E3779B97F4A7C15)
         for axis, factor in ((1, 0xC2B2AE3D27D4EB4F), (2, 0x165667B19E3779F9)):
@@ -287,6 +297,7 @@ class _Checksum:
         self._count += len(bits)
 
     def text(self) -> str:
+        """The checksum, 64 hex digits."""
         return hashlib.sha256(f"{self._sums} {self._count}".encode()).hexdigest()
 
 

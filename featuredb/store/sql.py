@@ -13,11 +13,13 @@ import duckdb
 import pyarrow as pa
 
 from featuredb.errors import StoreError
+from featuredb.store.database import Database
 from featuredb.store.encode import map_rows_table
+from featuredb.store.scans import points_dataset, scan_rows, scan_rows_table
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import CHILD_TABLES, MAPS
+from featuredb.store.tables import CHILD_TABLES, LIDAR, LIDAR_POINTS, LIDAR_TABLES, MAPS, SPECS
 
-VIEWS = (MAPS, *CHILD_TABLES, "cameras")
+VIEWS = (MAPS, *CHILD_TABLES, "cameras", *LIDAR_TABLES)
 _BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
 _ALLOWED = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 
@@ -26,6 +28,12 @@ _CAMERAS_VIEW = """
     SELECT map_id, camera_id, c.model, c.width, c.height, c.params, camera_keys[camera_id + 1] AS camera_key
     FROM (SELECT map_id, camera_keys, unnest(cameras) AS c, generate_subscripts(cameras, 1) - 1 AS camera_id
           FROM stored_maps WHERE status <> 'retired')
+"""
+_LIDAR_VIEW = f"CREATE VIEW {LIDAR} AS SELECT * EXCLUDE (write_id, points_checksum) FROM stored_{LIDAR}"
+_LIDAR_POINTS_VIEW = f"""
+    CREATE VIEW {LIDAR_POINTS} AS
+    SELECT s.scan_id, p.* EXCLUDE (write_id)
+    FROM stored_{LIDAR_POINTS} p JOIN stored_{LIDAR} s ON p.write_id = s.write_id
 """
 
 
@@ -41,13 +49,18 @@ class SqlSession:
     """DuckDB over one snapshot; a context manager.
 
     Views: `maps` (retired ones included, see its column `status`); `images`, `points`, `observations` and
-    `cameras` of the maps that are not retired.
+    `cameras` of the maps that are not retired. With the database also its scans as they are now: `lidar`
+    (retired ones included) and `lidar_points` of those that are not retired.
     """
 
-    def __init__(self, snapshot: Snapshot) -> None:
+    def __init__(self, snapshot: Snapshot, database: Database | None = None) -> None:
         self.snapshot = snapshot
         self._connection = duckdb.connect(":memory:", config={"python_enable_replacements": "false"})
         self._register()
+        if database is not None:
+            self._register_scans(database)
+        self._connection.execute("SET enable_external_access = false")
+        self._connection.execute("SET lock_configuration = true")
 
     def __enter__(self) -> "SqlSession":
         return self
@@ -84,8 +97,16 @@ class SqlSession:
         for name in CHILD_TABLES:
             self._connection.register(f"stored_{name}", self.snapshot.dataset(name, include_retired=False))
             self._connection.execute(f"CREATE VIEW {name} AS SELECT * EXCLUDE (write_id) FROM stored_{name}")
-        self._connection.execute("SET enable_external_access = false")
-        self._connection.execute("SET lock_configuration = true")
+
+    def _register_scans(self, database: Database) -> None:
+        rows = _without_zone(scan_rows_table(scan_rows(database)))
+        self._connection.register(f"stored_{LIDAR}", rows)
+        points = points_dataset(database, include_retired=False)
+        if points is None:
+            points = SPECS[LIDAR_POINTS].schema.empty_table()
+        self._connection.register(f"stored_{LIDAR_POINTS}", points)
+        self._connection.execute(_LIDAR_VIEW)
+        self._connection.execute(_LIDAR_POINTS_VIEW)
 
     def _fetch(self) -> Iterator[tuple[Any, ...]]:
         try:

@@ -15,8 +15,26 @@ from featuredb.store.database import Database, oldest_kept_version
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
+from featuredb.store.scans import (
+    PointsChecksum,
+    ScanSummary,
+    has_scans,
+    list_scans,
+    scan_batches,
+    scan_rows,
+)
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import BOUNDS, CHILD_TABLES, IMAGES, MAPS, OBSERVATIONS, POINTS, TABLES
+from featuredb.store.tables import (
+    BOUNDS,
+    CHILD_TABLES,
+    IMAGES,
+    LIDAR_POINTS,
+    LIDAR_TABLES,
+    MAPS,
+    OBSERVATIONS,
+    POINTS,
+    TABLES,
+)
 
 _LIGHT_COLUMNS = {
     IMAGES: ["image_index", "image_id", "camera_id", "easting", "northing", "height", "zone", "tile"],
@@ -40,7 +58,7 @@ class VerifyReport:
 
     Attributes:
         version: of the snapshot that was checked.
-        maps, files, rows: how many of each were checked.
+        maps, scans, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
             commit under way. No damage: nobody reads them, and `vacuum` removes them.
@@ -48,6 +66,7 @@ class VerifyReport:
 
     version: int
     maps: int
+    scans: int
     files: int
     rows: int
     problems: tuple[Problem, ...]
@@ -59,7 +78,7 @@ class VerifyReport:
 
 
 def verify(database: Database) -> VerifyReport:
-    """Check the newest snapshot; reads every file and every row of it once.
+    """Check the newest snapshot and the scans; reads every file and every row of them once.
 
     Raises:
         StoreError: the table `maps` itself, without which nothing can be said, is not readable.
@@ -67,7 +86,8 @@ def verify(database: Database) -> VerifyReport:
     snapshot = database.snapshot()
     problems: list[Problem] = []
     files = rows = 0
-    for name in TABLES:
+    scans = list_scans(database)
+    for name in (*TABLES, *(LIDAR_TABLES if has_scans(database) else ())):
         table = database.table(name)
         live = table.files()
         files += len(live)
@@ -75,10 +95,13 @@ def verify(database: Database) -> VerifyReport:
         problems += check_files(table)
     for row in snapshot.rows():
         problems += check_map(snapshot, row)
+    for scan in scans:
+        problems += check_scan(database, scan)
     orphans = [] if problems else _orphans(database)
     return VerifyReport(
         version=snapshot.version,
         maps=len(snapshot.rows()),
+        scans=len(scans),
         files=files,
         rows=rows,
         problems=tuple(problems),
@@ -129,6 +152,37 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
         return
     if digest != row["content_digest"]:
         yield Problem(where=where, what="its rows are not those that were committed: content digests differ")
+
+
+def check_scan(database: Database, scan: ScanSummary) -> Iterator[Problem]:
+    """Do the points of a scan agree with its row, and are they those that were committed?"""
+    where = f"scan {scan.scan_id}"
+    levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
+    low, high = np.array([[scan.row[b] for b in BOUNDS[:3]], [scan.row[b] for b in BOUNDS[3:]]])
+    elsewhere = outside = 0
+    try:
+        for batch in scan_batches(database, scan, ("easting", "northing", "height", "tile", "level")):
+            utm = _utm(batch)
+            coordinates.add(utm)
+            levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
+            if not np.isfinite(utm).all():
+                yield Problem(where=where, what="coordinates that are not finite")
+                return
+            elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
+            outside += int((~((utm >= low) & (utm <= high)).all(axis=1)).sum())
+    except (OSError, pa.ArrowException) as error:
+        yield Problem(where=where, what=f"cannot read its points: {_one_line(error)}")
+        return
+    if levels.tolist() != list(scan.level_points):
+        yield Problem(
+            where=where, what=f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
+        )
+    elif coordinates.text() != scan.row["points_checksum"]:
+        yield Problem(where=where, what="its points are not those that were committed: checksums differ")
+    if elsewhere:
+        yield Problem(where=where, what=f"{elsewhere} points in another tile than their coordinates'")
+    if outside:
+        yield Problem(where=where, what=f"{outside} points outside the scan's box")
 
 
 def _check_counts(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
@@ -186,14 +240,17 @@ def _observations_in_wrong_tile(tables: dict[str, pa.Table]) -> int:
     return int(pc.sum(pc.not_equal(tiles, seen["tile"].filter(known))).as_py() or 0)
 
 
-def _utm(table: pa.Table) -> FloatArray:
+def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:
     return np.column_stack([table[name].to_numpy() for name in ("easting", "northing", "height")])
 
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
     present = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
-    return sorted(present - write_ids_of_history(database, first))
+    orphans = present - write_ids_of_history(database, first)
+    if has_scans(database):
+        orphans |= write_ids_in(database.table(LIDAR_POINTS)) - {r["write_id"] for r in scan_rows(database)}
+    return sorted(orphans)
 
 
 def _one_line(error: Exception) -> str:

@@ -1,0 +1,146 @@
+"""Peak memory and speed of `featuredb lidar add` for a scan of any size, which it makes first.
+
+    python tools/lidar_memory.py --points 100_000_000 --folder /tmp/scan
+
+The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so that making
+it needs little memory, too. The command runs in a process of its own; the memory of that process and all its children
+(resident set) is sampled ten times a second, and the largest the kernel has seen of the process is asked for in the end.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import laspy
+import numpy as np
+from laspy.vlrs.known import WktCoordinateSystemVlr
+from pyproj import CRS
+
+CHUNK = 500_000
+EPSG = 32632
+WEST, SOUTH = 560_000.0, 5_930_000.0
+SAMPLE_S = 0.1
+
+
+def make_scan(path: Path, points: int, density: float, seed: int) -> None:
+    """Write a scan of a square, in strips from west to east."""
+    rng = np.random.default_rng(seed)
+    side = float(np.sqrt(points / density))
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.array([WEST, SOUTH, 0.0])
+    header.vlrs.append(WktCoordinateSystemVlr(CRS.from_epsg(EPSG).to_wkt("WKT1_GDAL")))
+    header.global_encoding.wkt = True
+    with laspy.open(path, mode="w", header=header) as writer:
+        for start in range(0, points, CHUNK):
+            n = min(CHUNK, points - start)
+            east = side * (start + n * rng.random(n)) / points
+            north = side * rng.random(n)
+            height, label, value = _surface(rng, east, north)
+            record = laspy.ScaleAwarePointRecord.zeros(n, header=header)
+            record.x, record.y, record.z = WEST + east, SOUTH + north, height
+            record.classification = label
+            record.intensity = value
+            for name, gain in (("red", 250), ("green", 230), ("blue", 200)):
+                setattr(record, name, (value.astype(np.uint32) * gain % 65536).astype(np.uint16))
+            writer.write_points(record)
+
+
+def _surface(
+    rng: np.random.Generator, east: np.ndarray, north: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Height, class and intensity: hills, a house on every second block of 40 m, trees, one in 20,000 astray."""
+    height = 40.0 + 8.0 * np.sin(east / 173.0) * np.cos(north / 131.0) + rng.normal(0.0, 0.02, len(east))
+    label = np.full(len(east), 2, np.uint8)
+    value = (120 + 40 * np.sin(east / 7.0) + rng.normal(0, 8, len(east))).clip(1, 255)
+    block = (east // 40).astype(int) * 7 + (north // 40).astype(int) * 13
+    house = (block % 2 == 0) & (east % 40 > 12) & (east % 40 < 26) & (north % 40 > 10) & (north % 40 < 22)
+    height[house] += 6.0
+    label[house] = 6
+    tree = (block % 3 == 1) & (np.hypot(east % 40 - 20, north % 40 - 30) < 5)
+    height[tree] += 9.0 * rng.random(int(tree.sum()))
+    label[tree] = 5
+    astray = rng.random(len(east)) < 5e-5
+    height[astray] += rng.uniform(30, 60, int(astray.sum()))
+    return height, label, value.astype(np.uint16)
+
+
+def tree_rss_bytes(root: int) -> int:
+    """Resident memory of a process and all its descendants."""
+    children: dict[int, list[int]] = {}
+    resident: dict[int, int] = {}
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue  # it has ended meanwhile
+        children.setdefault(int(fields[1]), []).append(int(entry.name))
+        resident[int(entry.name)] = int(fields[21]) * os.sysconf("SC_PAGE_SIZE")
+    total, todo = 0, [root]
+    while todo:
+        process = todo.pop()
+        total += resident.get(process, 0)
+        todo += children.get(process, [])
+    return total
+
+
+def measure(command: list[str]) -> dict[str, float]:
+    """Run a command; wall and CPU seconds, peak of the tree by sampling, peak of the process by the kernel."""
+    started, peak = time.perf_counter(), 0
+    process = subprocess.Popen(command, stdout=sys.stderr)
+    done = threading.Event()
+
+    def watch() -> None:
+        nonlocal peak
+        while not done.wait(SAMPLE_S):
+            peak = max(peak, tree_rss_bytes(process.pid))
+
+    watcher = threading.Thread(target=watch)
+    watcher.start()
+    _, status, usage = os.wait4(process.pid, 0)
+    done.set()
+    watcher.join()
+    if os.waitstatus_to_exitcode(status) != 0:
+        raise SystemExit(f"{' '.join(command)} failed with status {os.waitstatus_to_exitcode(status)}")
+    return {
+        "seconds": time.perf_counter() - started,
+        "cpu_seconds": usage.ru_utime + usage.ru_stime,
+        "peak_tree_mib": peak / 2**20,
+        "peak_process_mib": usage.ru_maxrss / 2**10,
+    }
+
+
+def main() -> int:
+    """Make the scan unless it is there, add it to a fresh database, print what it took as JSON."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("--points", type=int, default=5_000_000)
+    parser.add_argument("--density", type=float, default=20.0, help="points per square metre; default: 20")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--folder", type=Path, required=True, help="for the scan and the database")
+    args = parser.parse_args()
+    args.folder.mkdir(parents=True, exist_ok=True)
+    scan = args.folder / f"scan-{args.points}-{args.density:g}-{args.seed}.las"
+    if not scan.is_file():
+        part = scan.with_suffix(".part.las")
+        make_scan(part, args.points, args.density, args.seed)
+        part.rename(scan)
+    database = args.folder / "scans.db"
+    shutil.rmtree(database, ignore_errors=True)
+    run = [sys.executable, "-m", "featuredb.cli", "lidar", "add", str(database), str(scan), "--quiet"]
+    figures = {"points": args.points, "scan_bytes": scan.stat().st_size, **measure(run)}
+    figures["points_per_second"] = args.points / figures["seconds"]
+    figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
+    figures["database_bytes"] = sum(f.stat().st_size for f in database.rglob("*") if f.is_file())
+    sys.stdout.write(json.dumps({k: round(v, 1) for k, v in figures.items()}, indent=2) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
