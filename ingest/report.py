@@ -236,7 +236,7 @@ def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
 
 def report_json(report: IngestReport) -> dict[str, Any]:
     """The report as JSON of `schemas/ingest/report.json`; NaN and infinity become null."""
-    document: dict[str, Any] = _plain(
+    document: dict[str, Any] = plain(
         {
             "schema": SCHEMA_ID,
             "job_id": report.job_id,
@@ -328,16 +328,16 @@ def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
     return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """`value` with only what JSON has."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if value is None or isinstance(value, (str, int, float, bool)):

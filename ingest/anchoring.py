@@ -1,0 +1,372 @@
+"""`featuredb anchor` from the database to the database: loads, anchors, writes pictures and report, commits.
+
+The commit is the last step and one atomic change: whatever interrupts the work before it leaves the database
+as it was.
+"""
+
+import logging
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError, MapNotFoundError, RegistrationError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
+from featuredb.lidar.load import load_cloud
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.render.cloud import PointCloud
+from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.scans import list_scans
+from ingest.executor import Progress, no_progress
+from ingest.register.anchor import AnchorOptions, AnchorResult, place_map
+from ingest.register.anchor_frames import TriedFrames, try_frames
+from ingest.register.anchor_report import AnchorReport, write_anchor_report
+from ingest.register.frame_registration import FramePrior
+from ingest.register.photo_files import PhotoFiles, find_photos
+from ingest.register.picks import pose_from_picks
+from ingest.register.proposal_file import SavedProposals, load_proposals, save_proposals
+from ingest.register.start import image_named, prior_from_rough_pose
+from ingest.register.start_files import read_picks, read_pose
+
+_LOG = logging.getLogger(__name__)
+# Scan around the map's points and cameras that may be seen, metres: errors of GPS, and what frames show
+# beside the map's points.
+_MARGIN_M = 60.0
+_CONFIRM = "--confirm"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnchorRequest:
+    """What a person asks for.
+
+    Attributes:
+        map_id: or its first letters, if no other map begins so.
+        photos: folder of the map's photos.
+        scan_ids: empty for all scans around the map.
+        out: folder of pictures and report, None for ./anchor-MAP.
+        frames: how many to register, None for the default.
+        auto: place the map without a person.
+        confirm: names of proposed frames that a person has confirmed.
+        pose_file, picks_file, image: where a registration starts.
+        storage_options: as the command line had them, for the command that confirms.
+    """
+
+    map_id: str
+    photos: Path
+    scan_ids: tuple[str, ...] = ()
+    out: Path | None = None
+    frames: int | None = None
+    auto: bool = False
+    confirm: tuple[str, ...] = ()
+    pose_file: Path | None = None
+    picks_file: Path | None = None
+    image: str | None = None
+    storage_options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Anchoring:
+    """What was done.
+
+    Attributes:
+        report: everything about the registration and placement.
+        page: to flick through, None where there are no frames. report_page: path of the report.
+        placed: whether the map is in the database at its new place. version: of the database since;
+            version_before: the last one that shows the old place.
+        flagged: maps that were quarantined, because this one had placed them.
+        proposed: names of the registered frames, where nobody has decided yet.
+        command: that confirms all of them.
+    """
+
+    report: AnchorReport
+    map_id: str
+    out: Path
+    page: Path | None
+    report_page: Path
+    placed: bool = False
+    version: int = -1
+    version_before: int = -1
+    flagged: tuple[str, ...] = ()
+    proposed: tuple[str, ...] = ()
+    command: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Job:
+    """What is loaded for a request."""
+
+    request: AnchorRequest
+    snapshot: Snapshot
+    summary: MapSummary
+    feature_map: FeatureMap
+    files: PhotoFiles
+    cloud: PointCloud
+    scan_ids: tuple[str, ...]
+    out: Path
+    options: AnchorOptions
+
+    def gray(self, image: MapImage) -> NDArray[np.uint8]:
+        return decode_gray(self.files.path(image), INGEST_LIMITS)
+
+    def rgb(self, image: MapImage) -> NDArray[np.uint8]:
+        return decode_rgb(self.files.path(image), INGEST_LIMITS)
+
+
+def anchor(
+    database: Database,
+    request: AnchorRequest,
+    progress: Progress = no_progress,
+    options: AnchorOptions | None = None,
+) -> Anchoring:
+    """Do what the request asks for.
+
+    Raises:
+        RegistrationError: photos, scan or a person's file are missing or do not fit.
+        MapNotFoundError, ScanNotFoundError, ScanError, StoreError
+        ConflictError: someone else placed the map anew meanwhile.
+    """
+    job = _load(database, request, _with_frames(options or AnchorOptions(), request.frames))
+    if request.confirm:
+        tried = _confirmed(job)
+        notes = [f"confirmed by a person: {', '.join(f.image.name for f in tried.accepted)}"]
+    else:
+        starts, notes = _starts(job)
+        tried = try_frames(
+            job.feature_map,
+            job.cloud,
+            job.gray,
+            job.options.frames,
+            starts=starts,
+            readable=list(job.files.paths),
+            progress=progress,
+        )
+    notes += _about_photos(job, tried)
+    result: AnchorResult | None = None
+    if request.auto or request.confirm:
+        supervised = bool(request.confirm or request.pose_file or request.picks_file)
+        result = place_map(
+            job.feature_map, job.cloud, tried, job.gray, job.options,
+            confirmed=bool(request.confirm), supervised=supervised, progress=progress,
+        )  # fmt: skip
+    return _finished(database, job, tried, result, notes)
+
+
+def _finished(
+    database: Database, job: _Job, tried: TriedFrames, result: AnchorResult | None, notes: Sequence[str]
+) -> Anchoring:
+    """Write everything down, then commit."""
+    report = AnchorReport(
+        map_id=job.summary.map_id,
+        map_name=job.summary.name,
+        database=database.url,
+        photos=str(job.files.folder),
+        scan_ids=job.scan_ids,
+        epsg=job.feature_map.epsg,
+        datum_before=job.feature_map.height_datum,
+        datum_after=job.cloud.height_datum,
+        tried=tried,
+        result=result,
+        notes=tuple(notes),
+    )
+    page, report_page = write_anchor_report(
+        job.out, report, job.feature_map, job.cloud, job.rgb, _confirm_command(database, job)
+    )
+    done = Anchoring(
+        report=report, map_id=job.summary.map_id, out=job.out, page=page, report_page=report_page
+    )
+    if result is None:
+        save_proposals(
+            job.out,
+            SavedProposals(
+                map_id=job.summary.map_id,
+                write_id=job.summary.write_id,
+                scan_id=" ".join(job.scan_ids),
+                registrations={f.image.image_id: f.registration for f in tried.accepted},
+            ),
+        )
+        names = tuple(f.image.name for f in tried.accepted)
+        command = _confirm_command(database, job).replace(
+            "{image}", f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
+        )
+        return replace(done, proposed=names, command=command)
+    if result.feature_map is None:
+        return done
+    committed = database.commit_map(
+        result.feature_map, replaces=job.summary.map_id, based_on=job.summary.write_id
+    )
+    return replace(
+        done,
+        placed=True,
+        version=committed.version,
+        version_before=job.snapshot.version,
+        flagged=committed.flagged,
+    )
+
+
+def _confirm_command(database: Database, job: _Job) -> str:
+    """What a person runs to confirm a frame; its name goes in the place of {image}."""
+    words = ["featuredb", "anchor", database.url, job.summary.map_id, "--photos", str(job.files.folder)]
+    for option in job.request.storage_options:
+        words += ["--storage-option", option]
+    for scan_id in job.request.scan_ids:
+        words += ["--scan", scan_id]
+    words += ["--out", str(job.out)]
+    return f"{shlex.join(words)} {_CONFIRM} {{image}}"
+
+
+def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:
+    snapshot = database.snapshot()
+    summary = _the_map(snapshot, request.map_id)
+    feature_map = snapshot.load_map(summary.map_id)
+    files = find_photos(feature_map, request.photos)
+    scan_ids = request.scan_ids or _scans_around(database, feature_map, summary)
+    cloud = load_cloud(database, feature_map.frame, _box(feature_map), scan_ids=scan_ids)
+    if not len(cloud):
+        raise RegistrationError(
+            f"scan {', '.join(scan_ids)} has no points within {_MARGIN_M:.0f} m of map {summary.map_id}; "
+            "`featuredb lidar list` tells where scans lie"
+        )
+    return _Job(
+        request=request,
+        snapshot=snapshot,
+        summary=summary,
+        feature_map=feature_map,
+        files=files,
+        cloud=cloud,
+        scan_ids=tuple(scan_ids),
+        out=request.out or Path(f"anchor-{summary.map_id}"),
+        options=options,
+    )
+
+
+def _the_map(snapshot: Snapshot, map_id: str) -> MapSummary:
+    """The live map of that id, or of an id that begins so."""
+    maps = snapshot.maps()
+    exact = [m for m in maps if m.map_id == map_id]
+    found = exact or [m for m in maps if map_id and m.map_id.startswith(map_id)]
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InvalidValueError(
+            f"{map_id}: {len(found)} maps begin so ({', '.join(m.map_id for m in found[:4])}); write more"
+        )
+    raise MapNotFoundError(
+        f"snapshot {snapshot.version} has no live map {map_id}; `featuredb maps` lists what there is"
+    )
+
+
+def _scans_around(database: Database, feature_map: FeatureMap, summary: MapSummary) -> tuple[str, ...]:
+    """Scans of the map's zone whose box touches the map's with a margin, or of other zones nearby."""
+    scans = list_scans(database)
+    if not scans:
+        raise RegistrationError(f"{database.url} has no scan; add one by `featuredb lidar add`")
+    box = summary.box
+    if box is None:
+        raise RegistrationError(f"map {summary.map_id} has no points; nothing can be placed")
+    around = [
+        scan.scan_id
+        for scan in scans
+        if scan.epsg != feature_map.epsg
+        or scan.box.touches(
+            box.min_easting - _MARGIN_M,
+            box.min_northing - _MARGIN_M,
+            box.max_easting + _MARGIN_M,
+            box.max_northing + _MARGIN_M,
+        )
+    ]
+    if not around:
+        raise RegistrationError(
+            f"no scan of {database.url} lies within {_MARGIN_M:.0f} m of map {summary.map_id} "
+            f"(easting {box.min_easting:.0f} to {box.max_easting:.0f}, northing {box.min_northing:.0f} to "
+            f"{box.max_northing:.0f}, EPSG:{feature_map.epsg}); add one that covers it by "
+            "`featuredb lidar add`"
+        )
+    return tuple(around)
+
+
+def _box(feature_map: FeatureMap) -> tuple[float, float, float, float]:
+    """Plan box in the map's frame around its points and cameras."""
+    centers = np.array([image.cam_from_local.center for image in feature_map.images])
+    points = feature_map.points_local()
+    # A few wild points must not ask for a whole county.
+    inner = np.percentile(points[:, :2], (1, 99), axis=0)
+    both = np.vstack([inner, centers[:, :2]])
+    low, high = both.min(axis=0) - _MARGIN_M, both.max(axis=0) + _MARGIN_M
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
+def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
+    """Priors by a person, with a line on each."""
+    request, feature_map = job.request, job.feature_map
+    starts: dict[int, FramePrior] = {}
+    notes: list[str] = []
+    if request.pose_file is not None:
+        rough = read_pose(request.pose_file, request.image)
+        image = image_named(feature_map, rough.image)
+        starts[image.image_id] = prior_from_rough_pose(rough, feature_map)
+        notes.append(f"{image.name} starts from the pose in {request.pose_file}")
+    if request.picks_file is not None:
+        for picks in read_picks(request.picks_file, request.image):
+            image = image_named(feature_map, picks.image)
+            found = pose_from_picks(
+                picks,
+                feature_map.frame.enu_from_utm(picks.utm, feature_map.epsg),
+                feature_map.cameras[image.camera_id],
+                job.options.frames.start,
+            )
+            starts[image.image_id] = found.prior
+            outliers = (
+                f"; they contradict the others: line {_numbers(found.outliers)}" if found.outliers else ""
+            )
+            notes.append(
+                f"{image.name} starts from {len(picks.pixels)} picks, median residual "
+                f"{float(np.median(found.residuals_px[found.inliers])):.1f} px{outliers}"
+            )
+    for image_id in starts:
+        image = next(i for i in feature_map.images if i.image_id == image_id)
+        job.files.path(image)  # raises where the photo is missing
+    return starts, notes
+
+
+def _numbers(rows: Sequence[int]) -> str:
+    return ", ".join(str(row + 1) for row in rows)
+
+
+def _confirmed(job: _Job) -> TriedFrames:
+    """The proposed frames that the person confirms, as if they had just been registered."""
+    saved = load_proposals(job.out, job.summary.map_id, job.summary.write_id, " ".join(job.scan_ids))
+    chosen = [image_named(job.feature_map, name) for name in job.request.confirm]
+    unknown = [image.name for image in chosen if image.image_id not in saved.registrations]
+    if unknown:
+        names = {i.image_id: i.name for i in job.feature_map.images}
+        raise RegistrationError(
+            f"{', '.join(unknown)}: not among the proposed frames: "
+            f"{', '.join(names[i] for i in saved.registrations) or 'none'}"
+        )
+    return TriedFrames.of_registrations(
+        job.feature_map, {image.image_id: saved.registrations[image.image_id] for image in chosen}
+    )
+
+
+def _about_photos(job: _Job, tried: TriedFrames) -> list[str]:
+    notes = []
+    if job.files.missing:
+        names = {i.image_id: i.name for i in job.feature_map.images}
+        few = "; ".join(f"{names[i]}: {why}" for i, why in list(job.files.missing.items())[:3])
+        notes.append(f"{len(job.files.missing)} of {len(names)} photos are not used: {few}")
+    notes += [f"{name} cannot be read: {why}" for name, why in tried.unreadable.items()]
+    return notes
+
+
+def _with_frames(options: AnchorOptions, frames: int | None) -> AnchorOptions:
+    """The options for a wanted number of frames; who asks for one does not ask for two that agree."""
+    if frames is None:
+        return options
+    return replace(
+        options,
+        frames=replace(options.frames, frames=frames, max_tries=max(options.frames.max_tries, frames + 5)),
+        min_agreeing=min(options.min_agreeing, frames),
+    )

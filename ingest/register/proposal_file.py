@@ -1,0 +1,107 @@
+"""Proposed frames on disk, between the command that proposes them and the one that confirms them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from featuredb.errors import IngestError, RegistrationError
+from featuredb.geometry.rigid3 import Rigid3
+from ingest.register.frame_registration import FrameRegistration
+from ingest.workspace import read_json, write_json
+
+PROPOSALS = "proposals.json"
+_VERSION = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SavedProposals:
+    """What was proposed for one state of one map.
+
+    Attributes:
+        map_id: of the map. write_id: of its state; another state has other poses.
+        scan_id: of the scan.
+        registrations: accepted ones, by image id.
+    """
+
+    map_id: str
+    write_id: str
+    scan_id: str
+    registrations: Mapping[int, FrameRegistration]
+
+
+def save_proposals(folder: Path, proposals: SavedProposals) -> Path:
+    """Write folder/proposals.json, atomically."""
+    path = folder / PROPOSALS
+    write_json(
+        path,
+        {
+            "version": _VERSION,
+            "map_id": proposals.map_id,
+            "write_id": proposals.write_id,
+            "scan_id": proposals.scan_id,
+            "frames": {str(i): _plain(r) for i, r in proposals.registrations.items() if r.accepted},
+        },
+    )
+    return path
+
+
+def load_proposals(folder: Path, map_id: str, write_id: str, scan_id: str) -> SavedProposals:
+    """Read them back for the same map, in the same state, and the same scan.
+
+    Raises:
+        RegistrationError: there are none, or they belong to something else.
+    """
+    path = folder / PROPOSALS
+    if not path.is_file():
+        raise RegistrationError(
+            f"{path}: nothing has been proposed there; run the command without --confirm first, with "
+            "the same --out"
+        )
+    try:
+        document = read_json(path)
+        if document["version"] != _VERSION:
+            raise RegistrationError(
+                f"{path}: expected version {_VERSION}, found {document['version']}; propose anew"
+            )
+        found = (document["map_id"], document["write_id"], document["scan_id"])
+        frames = {int(i): _registration(entry) for i, entry in document["frames"].items()}
+    except (IngestError, KeyError, TypeError, ValueError) as error:
+        raise RegistrationError(f"{path}: cannot be read as proposals ({error!r}); propose anew") from error
+    if found != (map_id, write_id, scan_id):
+        raise RegistrationError(
+            f"{path}: proposed for map {found[0]}, state {found[1]}, scan {found[2]}; the map is now in "
+            f"state {write_id} with scan {scan_id}; run the command without --confirm again"
+        )
+    return SavedProposals(map_id=map_id, write_id=write_id, scan_id=scan_id, registrations=frames)
+
+
+def _plain(registration: FrameRegistration) -> dict[str, Any]:
+    pose, covariance = registration.cam_from_local, registration.covariance
+    assert pose is not None
+    assert covariance is not None
+    return {
+        "cam_from_local": pose.matrix().tolist(),
+        "covariance": covariance.tolist(),
+        "source": registration.source,
+        "points_local": registration.points_local.tolist(),
+        "pixels": registration.pixels.tolist(),
+        "evidence": registration.evidence,
+        "seconds": registration.seconds,
+    }
+
+
+def _registration(entry: dict[str, Any]) -> FrameRegistration:
+    return FrameRegistration(
+        cam_from_local=Rigid3.from_matrix(entry["cam_from_local"]),
+        covariance=np.array(entry["covariance"]),
+        reason=None,
+        message="",
+        source=entry["source"],
+        points_local=np.array(entry["points_local"]).reshape(-1, 3),
+        pixels=np.array(entry["pixels"]).reshape(-1, 2),
+        evidence=entry["evidence"],
+        seconds=entry["seconds"],
+    )
