@@ -1,18 +1,20 @@
 """One photo registered to a scan, from a coarse prior (paper, section 2.3: building block B)."""
 
-import logging
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
+from ingest.register.confirmation import Confirmation
+from ingest.register.frame_dense import confirmed, dense_fitted, dense_hypotheses
 from ingest.register.frame_options import FrameOptions
 from ingest.register.frame_registration import (
     FramePrior,
@@ -34,8 +36,8 @@ from ingest.register.frame_uncertainty import frame_covariance
 from ingest.register.frame_verdict import FrameEvidence, cells_with_inliers, prior_sigmas, verdict
 from ingest.register.frame_views import FrameViews, first_look
 
-_LOG = logging.getLogger(__name__)
 _GUIDED_ROUNDS = 2
+_MIN_FOR_COVARIANCE = 6  # twice the least that determines a pose
 
 
 def register_frame(
@@ -71,18 +73,74 @@ def register_frame(
             clock,
         )
     views = FrameViews(gray, camera, cloud, look, options)
-    found = _search(views, prior, clock)
-    if found is None:
+    judged = _best(views, prior, clock)
+    if judged is None:
         return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", {}, clock)
-    first = found
-    side = max(camera.width, camera.height)
+    return _verdict(views, prior, judged, clock)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Judged:
+    """A fitted pose with what the pictures say of it."""
+
+    found: FrameHypothesis
+    confirmation: Confirmation
+
+
+def _best(views: FrameViews, prior: FramePrior, clock: "_Clock") -> _Judged | None:
+    """The first pose that is beyond doubt, or the one that the pictures confirm most of all that were found."""
+    options = views.options
+    judged: list[_Judged] = []
+    for start in _starts(views, prior, clock):
+        judged.append(_polished(views, start, clock))
+        sure = judged[-1].confirmation.log_nfa >= options.sure_confirmation_log_nfa
+        if judged[-1].confirmation.confirmed and (sure or start.log_nfa >= options.decisive_log_nfa):
+            return judged[-1]
+    return max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
+
+
+def _starts(views: FrameViews, prior: FramePrior, clock: "_Clock") -> Iterator[FrameHypothesis]:
+    """Poses to begin with, made as they are asked for: source by source, features first, then dense templates."""
+    options = views.options
+    with clock.stage("render star"):
+        star = star_groups(views, prior)
+    fan: list[RenderGroup] | None = None
+    sources = options.sources or available_sources(views.cloud)
+    for source in sources:
+        for upright in _kinds(prior, options):
+            if upright and fan is None:
+                with clock.stage("render fan"):
+                    fan = fan_groups(views, prior)
+            groups = [*star, *(fan or [])] if upright else star
+            with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
+                found = search(views, groups, source, upright)
+            if found is not None and found.log_nfa >= options.min_log_nfa:
+                yield found
+        # Shaded relief has few edges of its own; where the scan has more to show, the search goes without.
+        if source != "shaded" or len(sources) == 1:
+            with clock.stage(f"search {source} dense"):
+                dense = dense_hypotheses(views, prior, source)
+            yield from dense
+
+
+def _polished(views: FrameViews, found: FrameHypothesis, clock: "_Clock") -> _Judged:
+    """Fitted by guided features where colours are rendered, else by dense pieces; and shown to the pictures."""
+    by_features = found.source == "rgb" and found.kind != "dense"
+    with clock.stage("fit"):
+        fitted = _guided(views, found) if by_features else dense_fitted(views, found, views.options.dense_fit)
+    found = fitted or found
+    with clock.stage("confirm"):
+        return _Judged(found=found, confirmation=confirmed(views, found))
+
+
+def _guided(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:
+    side = max(views.camera.width, views.camera.height)
     for turn in range(_GUIDED_ROUNDS):
-        with clock.stage(f"guided {turn + 1}"):
-            better = guided(views, found, options.guided_radius_rel * side / 3.0**turn)
+        better = guided(views, found, views.options.guided_radius_rel * side / 3.0**turn)
         if better is None:
             break
         found = better
-    return _judged(views, prior, first, found, clock)
+    return found
 
 
 def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
@@ -95,29 +153,6 @@ def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
     return (*sources, "shaded")
 
 
-def _search(views: FrameViews, prior: FramePrior, clock: "_Clock") -> FrameHypothesis | None:
-    """The hypothesis with most evidence, over sources and kinds of features; the first decisive one ends it."""
-    options = views.options
-    with clock.stage("render star"):
-        star = star_groups(views, prior)
-    fan: list[RenderGroup] = []
-    best: FrameHypothesis | None = None
-    for source in options.sources or available_sources(views.cloud):
-        for upright in _kinds(prior, options):
-            if upright and not fan:
-                with clock.stage("render fan"):
-                    fan = fan_groups(views, prior)
-            with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
-                found = search(views, [*star, *fan] if upright else star, source, upright)
-            if found is not None:
-                _LOG.debug("%s upright=%s: log NFA %.1f", source, upright, found.log_nfa)
-            if found is not None and (best is None or found.log_nfa > best.log_nfa):
-                best = found
-            if best is not None and best.log_nfa >= options.decisive_log_nfa:
-                return best
-    return best
-
-
 def _kinds(prior: FramePrior, options: FrameOptions) -> tuple[bool, ...]:
     """Upright features first where the heading is known; without, those with orientation cost less."""
     unknown = prior.sigma_heading_deg >= options.star.full_circle_sigma_deg
@@ -126,43 +161,18 @@ def _kinds(prior: FramePrior, options: FrameOptions) -> tuple[bool, ...]:
     return (False, True) if oriented_features_suffice(prior) else (True,)
 
 
-def _judged(
-    views: FrameViews, prior: FramePrior, first: FrameHypothesis, found: FrameHypothesis, clock: "_Clock"
-) -> FrameRegistration:
-    options, camera = views.options, found.pose.camera
+def _verdict(views: FrameViews, prior: FramePrior, judged: _Judged, clock: "_Clock") -> FrameRegistration:
+    options, found = views.options, judged.found
     with clock.stage("verdict"):
-        covariance = frame_covariance(
-            found.inliers.pixels,
-            found.inliers.points,
-            found.pose,
-            views.look.spacing_m,
-            views.look.depth_m,
-            pose_options(views),
-            options.correlated_inliers,
-            options.shared_point_share,
-        )
-        rendering = views.renders([found.pose.cam_from_local], options.min_side_px)
-        cells, agreement = (0, 0.0)
-        if rendering:
-            cells, agreement = cells_with_inliers(found.inliers.pixels, rendering[0].valid, camera)
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1]))
-        evidence = FrameEvidence(
-            inliers=len(found.inliers),
-            candidates=first.candidates,
-            log_nfa=first.log_nfa,
-            cells=cells,
-            agreement=agreement,
-            rival_inliers=first.rival_inliers,
-            first_inliers=len(first.inliers),
-            prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
-            position_sigma_share=sigma_m / views.look.depth_m,
-        )
+        covariance = _covariance(views, found)
+        evidence = _evidence(views, prior, judged, covariance)
         refusal = verdict(evidence, options.verdict)
     figures = asdict(evidence) | {
-        "upright": first.upright,
+        "matched_by": found.kind,
+        "confirmation": asdict(judged.confirmation),
         "depth_m": views.look.depth_m,
         "spacing_m": views.look.spacing_m,
-        "focal_px": camera.focal_px,
+        "focal_px": found.pose.camera.focal_px,
         "pose_tried": found.pose.cam_from_local.matrix().tolist(),
     }
     if refusal is not None:
@@ -177,6 +187,49 @@ def _judged(
         pixels=found.inliers.pixels,
         evidence=figures,
         seconds=clock.seconds,
+    )
+
+
+def _covariance(views: FrameViews, found: FrameHypothesis) -> FloatArray | None:
+    """None where too few matches stand behind the pose to say."""
+    options = views.options
+    if len(found.inliers) < _MIN_FOR_COVARIANCE:
+        return None
+    return frame_covariance(
+        found.inliers.pixels,
+        found.inliers.points,
+        found.pose,
+        views.look.spacing_m,
+        views.look.depth_m,
+        pose_options(views),
+        options.correlated_inliers,
+        options.shared_point_share,
+    )
+
+
+def _evidence(
+    views: FrameViews, prior: FramePrior, judged: _Judged, covariance: FloatArray | None
+) -> FrameEvidence:
+    found, confirmation = judged.found, judged.confirmation
+    cells, agreement = 0, 0.0
+    renderings = views.renders([found.pose.cam_from_local], views.options.min_side_px)
+    if renderings:
+        cells, agreement = cells_with_inliers(found.inliers.pixels, renderings[0].valid, views.camera)
+    share = np.inf
+    if covariance is not None:
+        share = float(np.sqrt(np.linalg.eigvalsh(covariance[3:, 3:])[-1])) / views.look.depth_m
+    return FrameEvidence(
+        inliers=len(found.inliers),
+        candidates=found.candidates,
+        log_nfa=found.log_nfa,
+        confirmed=confirmation.confirmed,
+        confirmation_log_nfa=confirmation.log_nfa,
+        confirmation_message=confirmation.message,
+        cells=cells,
+        agreement=agreement,
+        rival_share=found.rival_share,
+        prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
+        position_sigma_share=share,
     )
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
 from ingest.register.consistency import ConsistencyOptions
+from ingest.register.dense_fit import DenseFitOptions
 from ingest.register.frame_registration import RenderSource
 from ingest.register.frame_verdict import VerdictOptions
 from ingest.register.pool import PoolOptions
@@ -30,7 +31,9 @@ class FrameOptions:
         same_place: pool points nearer than this share of their distance from the camera are one place.
         guided_radius_rel: first radius around a predicted place in which a match is looked for, share of the
             longer side; the second is a third of it.
-        decisive_log_nfa: a hypothesis with that much evidence ends the search over sources and features.
+        min_log_nfa: a pose with less evidence among the features' matches is not looked into.
+        decisive_log_nfa: one with so much, if the pictures confirm it, ends the search.
+        sure_confirmation_log_nfa: and so does one that the pictures confirm so strongly. Right poses have 35 and more, wrong ones next to nothing.
         tolerance_rel: inlier tolerance as a share of the longer side (4 pixels at 1600), where points are
             denser than pixels; max_tolerance_rel: where they are sparser, it grows up to this.
         correlated_inliers: so many inliers count as one measurement. shared_point_share: standard deviation of
@@ -53,7 +56,9 @@ class FrameOptions:
     max_ratio: float = 0.97
     same_place: float = 0.01
     guided_radius_rel: float = 0.012
+    min_log_nfa: float = 2.0
     decisive_log_nfa: float = 60.0
+    sure_confirmation_log_nfa: float = 20.0
     tolerance_rel: float = 0.0025
     max_tolerance_rel: float = 0.006
     correlated_inliers: float = 4.0
@@ -63,6 +68,7 @@ class FrameOptions:
     star: StarOptions = field(default_factory=StarOptions)
     pool: PoolOptions = field(default_factory=PoolOptions)
     consistency: ConsistencyOptions = field(default_factory=ConsistencyOptions)
+    dense_fit: DenseFitOptions = field(default_factory=DenseFitOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
     def __post_init__(self) -> None:

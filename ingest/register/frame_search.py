@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
@@ -20,6 +20,8 @@ from reloc.acceptance import independent_inliers, log_nfa
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
 
+MatchKind = Literal["upright", "oriented", "dense"]
+
 _NADIR_COSINE = 0.87  # within 30 degrees of straight down a heading is a rotation of the image
 # One structure's keypoints at several scales lie this close together, share of the longer side (3 px at 1600).
 _SAME_STRUCTURE_REL = 0.002
@@ -30,21 +32,22 @@ class FrameHypothesis:
     """A pose with the matches behind it.
 
     Attributes:
-        pose: with the lens.
+        pose: with the lens. source: what was rendered.
         matches: all that it was found among. inliers: those of them that agree and are independent.
         candidates: matches before any selection by geometry; log_nfa: evidence that the pose is no chance among
             these, so that nothing that was selected by the pose testifies for it.
-        rival_inliers: inliers of the best pose elsewhere among the same matches.
+        kind: what was matched first.
+        rival_share: support of the best pose elsewhere, as a share of this one's.
     """
 
     pose: PoseHypothesis
     source: RenderSource
-    upright: bool
+    kind: MatchKind
     matches: FrameMatches
     inliers: FrameMatches
     candidates: int
     log_nfa: float
-    rival_inliers: int
+    rival_share: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,7 +135,7 @@ def guided(views: FrameViews, start: FrameHypothesis, radius_px: float) -> Frame
         return None
     pose = refine_pose(matches.pixels, matches.points, _with_prior_lens(pose, start.pose), settings)
     return replace(
-        start, pose=pose, matches=matches, inliers=_independent(views.camera, matches.take(pose.inliers))
+        start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
     )
 
 
@@ -179,18 +182,18 @@ def _hypothesis(
     pose = refine_pose(kept.pixels, kept.points, pose, settings)
     tolerance_px = settings.tolerance_rel * max(views.camera.width, views.camera.height)
     error = reprojection_errors(raw.pixels, raw.points, pose.camera, pose.cam_from_local)
-    testimony = _independent(views.camera, raw.take(error < tolerance_px))
+    testimony = independent(views.camera, raw.take(error < tolerance_px))
     return FrameHypothesis(
         pose=pose,
         source=source,
-        upright=upright,
+        kind="upright" if upright else "oriented",
         matches=kept,
-        inliers=_independent(views.camera, kept.take(pose.inliers)),
+        inliers=independent(views.camera, kept.take(pose.inliers)),
         candidates=len(raw),
         log_nfa=log_nfa(
             len(raw), len(testimony), tolerance_px, views.camera.width, views.camera.height, sample=3
         ),
-        rival_inliers=_rival(views, kept, pose, settings),
+        rival_share=_rival(views, kept, pose, settings) / max(pose.count, 1),
     )
 
 
@@ -203,10 +206,11 @@ def _rival(views: FrameViews, kept: FrameMatches, best: PoseHypothesis, settings
     other = estimate_pose(rest.pixels, rest.points, best.camera, "request", settings)
     if other is None:
         return 0
-    return len(_independent(views.camera, rest.take(other.inliers)))
+    return len(independent(views.camera, rest.take(other.inliers)))
 
 
-def _independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
+def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
+    """Those inliers that are measurements of their own."""
     gap = _SAME_STRUCTURE_REL * max(camera.width, camera.height)
     return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
 
@@ -222,7 +226,3 @@ def _with_prior_lens(pose: PoseHypothesis, start: PoseHypothesis) -> PoseHypothe
 
 def _any_heading(prior: FramePrior, options: FrameOptions) -> bool:
     return prior.sigma_heading_deg >= options.star.full_circle_sigma_deg
-
-
-def center_of(pose: PoseHypothesis) -> FloatArray:
-    return pose.cam_from_local.center

@@ -19,7 +19,6 @@ class VerdictOptions:
     Attributes:
         min_cover: smallest share of a render that shows the scan.
         min_inliers: fewer independent inliers are never believed.
-        min_log_nfa: smallest -log10 of the number of false alarms of the first, unguided matches.
         min_agreement: smallest share of the parts of the photo where the scan should be seen that hold inliers.
         min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
@@ -32,7 +31,6 @@ class VerdictOptions:
 
     min_cover: float = 0.03
     min_inliers: int = 20
-    min_log_nfa: float = 10.0
     min_agreement: float = 0.2
     min_cells: int = 6
     rival_share: float = 0.5
@@ -48,9 +46,10 @@ class FrameEvidence:
     Attributes:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them, see VerdictOptions.
+        confirmed, confirmation_log_nfa, confirmation_message: see ingest.register.confirmation.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
-        rival_inliers, first_inliers: of the best pose elsewhere and of this one, in the first round.
+        rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
         position_sigma_share: see VerdictOptions. focal_sigma_rel: of an estimated focal length, else 0.
     """
@@ -58,10 +57,12 @@ class FrameEvidence:
     inliers: int
     candidates: int
     log_nfa: float
+    confirmed: bool
+    confirmation_log_nfa: float
+    confirmation_message: str
     cells: int
     agreement: float
-    rival_inliers: int
-    first_inliers: int
+    rival_share: float
     prior_sigmas: float
     position_sigma_share: float
     focal_sigma_rel: float = 0.0
@@ -72,23 +73,16 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     e, o = evidence, options
     if e.inliers < o.min_inliers:
         return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {o.min_inliers} needed"
-    if e.log_nfa < o.min_log_nfa:
-        return (
-            "NO_CONSISTENT_POSE",
-            f"as many matches agree by chance too easily: -log10(NFA) {e.log_nfa:.1f} among {e.candidates} "
-            f"matches, {o.min_log_nfa:.0f} needed",
-        )
+    if not e.confirmed:
+        return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
             "NO_CONSISTENT_POSE",
             f"inliers lie in {e.cells} of a hundred parts of the photo, {100 * e.agreement:.0f} % of those where "
             f"the scan should be seen; {o.min_cells} and {100 * o.min_agreement:.0f} % needed",
         )
-    if e.rival_inliers >= o.rival_share * e.first_inliers:
-        return (
-            "AMBIGUOUS",
-            f"a pose elsewhere has {e.rival_inliers} inliers, this one {e.first_inliers}",
-        )
+    if e.rival_share >= o.rival_share:
+        return "AMBIGUOUS", f"a pose elsewhere has {100 * e.rival_share:.0f} % of this one's inliers"
     if e.position_sigma_share > o.max_position_sigma_share or e.focal_sigma_rel > o.max_focal_sigma_rel:
         return (
             "NO_CONSISTENT_POSE",
