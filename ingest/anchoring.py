@@ -315,6 +315,7 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
                 picks,
                 feature_map.frame.enu_from_utm(picks.utm, feature_map.epsg),
                 feature_map.cameras[image.camera_id],
+                image.cam_from_local,
                 job.options.frames.start,
             )
             starts[image.image_id] = found.prior

@@ -18,11 +18,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
@@ -142,10 +143,18 @@ def reference(database: Path) -> FeatureMap:
 
 def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[Row]:
     """Localise the photos over Zenoh and compare with their poses in the reference map."""
-    poses = {image.name: image.cam_from_local for image in truth.images}
+    return ask_poses(
+        database, photos, names, truth.frame, {image.name: image.cam_from_local for image in truth.images}
+    )
+
+
+def ask_poses(
+    database: Database, photos: Path, names: Sequence[str], frame: LocalFrame, poses: Mapping[str, Rigid3]
+) -> list[Row]:
+    """Localise the photos over Zenoh and compare with poses `cam_from_local` in a frame."""
     missing = [name for name in names if name not in poses]
     if missing:
-        raise SystemExit(f"not in the map of all photos, so there is nothing to compare with: {missing}")
+        raise SystemExit(f"without a reference pose, so there is nothing to compare with: {missing}")
     rows = []
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
@@ -154,15 +163,15 @@ def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMa
         for name in names:
             start = time.perf_counter()
             reply = client.localise(photos / name, timeout_s=60.0)
-            rows.append(_row(name, reply, truth, poses[name], 1e3 * (time.perf_counter() - start)))
+            rows.append(_row(name, reply, frame, poses[name], 1e3 * (time.perf_counter() - start)))
     return rows
 
 
-def _row(name: str, reply: LocaliseReply, truth: FeatureMap, pose: Rigid3, wall_ms: float) -> Row:
+def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_ms: float) -> Row:
     error, nan = None, float("nan")
     if reply.utm is not None:
         utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-        error = pose_difference(truth.frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
+        error = pose_difference(frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
     accuracy = reply.accuracy
     return Row(
         name=name,

@@ -58,11 +58,14 @@ class PickedPose:
         return [int(i) for i in np.flatnonzero(~self.inliers)]
 
 
-def pose_from_picks(picks: Picks, points: FloatArray, camera: Camera, options: StartOptions) -> PickedPose:
+def pose_from_picks(
+    picks: Picks, points: FloatArray, camera: Camera, present: Rigid3, options: StartOptions
+) -> PickedPose:
     """Robust pose from picked correspondences.
 
     Args:
         points: (n, 3) the picks' coordinates in the local frame, metres.
+        present: where the map has the camera now, in the local frame; only its vertical counts.
 
     Raises:
         RegistrationError: too few, contradictory, or badly spread picks.
@@ -83,6 +86,12 @@ def pose_from_picks(picks: Picks, points: FloatArray, camera: Camera, options: S
             f"picks of {picks.image}: only {agreeing} of {count} agree with one pose within "
             f"{options.pick_tolerance_rel * max(camera.width, camera.height):.0f} px; check the order of the "
             "columns (pixel x, pixel y, easting, northing, height), the zone, the heights and the photo"
+        )
+    tilt = np.degrees(np.arccos(np.clip(found.cam_from_local.rotation[:, 2] @ present.rotation[:, 2], -1, 1)))
+    if tilt > options.max_pick_tilt_deg:
+        raise RegistrationError(
+            f"picks of {picks.image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
+            "are easting and northing, or pixel x and y, swapped?"
         )
     inner = found.inliers
     covariance = _pick_covariance(picks.pixels[inner], points[inner], camera, found.cam_from_local, options)

@@ -32,9 +32,12 @@ class StartOptions:
         pick_sigma_px_rel: how well a person marks a point, as a share of the image's longer side: 3 pixels
             in 4000.
         pick_sigma_m: how well a person reads a coordinate off a scan.
-        pick_tolerance_rel: a pick that misses by more is an outlier: 20 pixels in 4000, six sigmas.
+        pick_tolerance_rel: a pick that misses by more is an outlier: 50 pixels in 4000. From 50 m the 0.2 m
+            of a coordinate are 13 of them.
         min_pick_share: with fewer picks that agree, nobody knows which ones are right.
         max_pick_sigma_m, max_pick_sigma_deg: picks on a line or close together leave the pose open.
+        max_pick_tilt_deg: between the vertical by the picks and by the map: reconstructions placed by GPS
+            know it to degrees, and swapped columns turn the ground upside down.
     """
 
     min_sigma_horizontal_m: float = 1.0
@@ -46,10 +49,11 @@ class StartOptions:
     min_picks: int = 6
     pick_sigma_px_rel: float = 0.00075
     pick_sigma_m: float = 0.2
-    pick_tolerance_rel: float = 0.005
+    pick_tolerance_rel: float = 0.0125
     min_pick_share: float = 0.6
     max_pick_sigma_m: float = 20.0
     max_pick_sigma_deg: float = 10.0
+    max_pick_tilt_deg: float = 45.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

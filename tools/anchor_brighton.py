@@ -1,0 +1,122 @@
+"""Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
+
+    python -m tools.scan_poses SCAN.laz FOLDER --poses poses.json
+    python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
+
+1. `featuredb ingest photos` makes a map of all photos but the held-out ones (or --database names a database
+   that has one, which is copied and left alone).
+2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
+3. A server answers for each held-out photo, as `featuredb query` asks: nothing but the file.
+4. The answers are compared with poses that tools/scan_poses.py found by registering each photo to the scan
+   directly. Before anchoring, too, to show what it changed.
+
+Exit code 0 if the medians lie within the limits and all were answered, else 1.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.store import Database
+from tools.real_photos import Row, ask_poses, ingest, table
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    frame, poses = read_poses(args.poses)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        database = work / "anchored"
+        if args.database is not None:
+            shutil.copytree(args.database, database)
+        else:
+            ingest(database, args.photos, args.held_out)
+        sys.stdout.write("before, placed by GPS\n")
+        before = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
+        sys.stdout.write(table(before, args.max_m, args.max_deg) + "\n")
+        _featuredb("lidar", "add", str(database), str(args.scan))
+        map_id = Database.open(database).snapshot().maps()[0].map_id
+        out = work / "anchor"
+        _featuredb(
+            *("anchor", str(database), map_id, "--photos", str(args.photos), "--out", str(out)),
+            *("--auto", "--quiet"),
+        )
+        sys.stdout.write("after, anchored on the scan\n")
+        after = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
+        sys.stdout.write(table(after, args.max_m, args.max_deg) + "\n")
+    return _verdict(after, args.max_m, args.max_deg)
+
+
+def read_poses(path: Path) -> tuple[LocalFrame, dict[str, Rigid3]]:
+    """The frame and the poses that tools/scan_poses.py wrote."""
+    document = json.loads(path.read_text(encoding="utf-8"))
+    given = document["frame"]
+    frame = LocalFrame(
+        latitude_deg=given["latitude_deg"], longitude_deg=given["longitude_deg"], height_m=given["height_m"]
+    )
+    poses = {
+        name: Rigid3(
+            rotation=np.array(entry["cam_from_local_rotation"]),
+            translation=np.array(entry["cam_from_local_translation"]),
+        )
+        for name, entry in document["poses"].items()
+    }
+    return frame, poses
+
+
+def _verdict(rows: Sequence[Row], max_m: float, max_deg: float) -> int:
+    errors = [row.error for row in rows if row.error is not None]
+    metres = float(np.median([e.position_m for e in errors])) if errors else float("nan")
+    degrees = float(np.median([e.angle_deg for e in errors])) if errors else float("nan")
+    good = len(errors) == len(rows) and metres <= max_m and degrees <= max_deg
+    sys.stdout.write(
+        f"median of {len(errors)} of {len(rows)} answers: {metres:.3f} m and {degrees:.3f} degrees "
+        f"(wanted: {max_m:g} m, {max_deg:g} degrees): {'reached' if good else 'NOT reached'}\n"
+    )
+    return 0 if good else 1
+
+
+def _featuredb(*words: str) -> None:
+    """Run a command of featuredb, show what it says, stop where it fails."""
+    sys.stdout.write(f"$ featuredb {' '.join(words)}\n")
+    sys.stdout.flush()
+    start = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "featuredb.cli", *words],
+        cwd=_ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    sys.stdout.write(done.stdout + f"({time.perf_counter() - start:.1f} s)\n")
+    if done.returncode != 0:
+        raise SystemExit(f"exit code {done.returncode}\n{done.stderr}")
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
+    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    parser.add_argument("--held-out", nargs="+", required=True, metavar="NAME")
+    parser.add_argument("--database", type=Path, default=None, help="has the map already; it is copied")
+    parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
+    parser.add_argument("--max-m", type=float, default=0.30, help="of the median; default: 0.30")
+    parser.add_argument("--max-deg", type=float, default=0.25, help="of the median; default: 0.25")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
