@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.render.compiled import compiled_module
 
 _QUERY_ROWS = 100_000  # neighbours of this many points at a time: 15 MB
+_SORTED_CELLS = 8.0  # cells per reach when points are sorted: about as many as there are neighbours
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -18,6 +20,7 @@ class OutlierOptions:
 
     Attributes:
         neighbours: how many nearest neighbours are looked at.
+        fewest: a point with fewer of them in reach is an outlier: alone, or a pair of birds.
         ratio: a point is one if the mean distance to its neighbours is this many times the median of theirs.
         reach_spacings: neighbours are looked for within this many of the scan's spacings, ...
         shortest_reach_m: ... but at least this far.
@@ -25,6 +28,7 @@ class OutlierOptions:
 
     # Eight, as many as surround a point of a grid.
     neighbours: int = 8
+    fewest: int = 4
     # A ratio of neighbours and no distance: scans are denser near the scanner and where strips overlap, and a
     # distance that is odd in one place is usual in another. docs/lidar.md has the distributions.
     ratio: float = 5.0
@@ -40,46 +44,44 @@ class OutlierOptions:
         return 2.0 * self.reach_m(spacing_m)
 
 
-def outlier_ratio(xyz: FloatArray, core: int, reach_m: float, neighbours: int) -> FloatArray:
+def outlier_ratio(xyz: FloatArray, core: int, reach_m: float, options: OutlierOptions) -> FloatArray:
     """Mean distance to the nearest neighbours, as a multiple of the median of the same of those neighbours.
 
-    Neighbours farther than `reach_m` count as that far away, so that the ratio of a point depends only on what
-    lies within twice the reach: pieces of a scan that overlap by that give what the whole scan gives.
+    Neighbours farther than `reach_m` count as that far away, so that the ratio of a point depends only on
+    what lies within twice the reach: pieces of a scan that overlap by that give what the whole scan gives.
 
     Args:
         xyz: (n, 3) metres.
         core: the ratio is asked for the first `core` points; the others are their surroundings.
 
     Returns:
-        (core,) float64; infinity for a point without any neighbour in reach.
+        (core,) float64; infinity for a point with less than `options.fewest` neighbours in reach.
     """
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    mean = np.empty(len(xyz), np.float32)
-    for start in range(0, len(xyz), _QUERY_ROWS):
-        distance, _ = _nearest(tree, xyz[start : start + _QUERY_ROWS], neighbours, reach_m)
-        mean[start : start + _QUERY_ROWS] = np.minimum(distance, reach_m).mean(axis=1)
-    padded = np.append(mean, np.nan)  # what has no neighbour gets row n
-    ratio = np.empty(core)
-    for start in range(0, core, _QUERY_ROWS):
-        end = min(start + _QUERY_ROWS, core)
-        _, index = _nearest(tree, xyz[start:end], neighbours, reach_m)
-        of_neighbours = padded[index]
-        alone = np.isnan(of_neighbours).all(axis=1)
-        of_neighbours[alone] = 1.0
-        ratio[start:end] = mean[start:end] / np.maximum(np.nanmedian(of_neighbours, axis=1), 1e-9)
-        ratio[start:end][alone] = np.inf
-    return ratio
+    loops: Any = compiled_module("featuredb.render.level_loops")
+    local = (xyz - xyz.min(axis=0)).astype(np.float32)
+    # Asking for neighbours in the order of space is three times faster than in that of most files.
+    order = np.argsort(loops.morton_codes(local, np.zeros(3), reach_m / _SORTED_CELLS), kind="stable")
+    points = xyz[order]
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    mean = np.empty(len(points) + 1, np.float32)
+    mean[-1] = np.nan  # what is not there has row n
+    rows = np.empty((len(points), options.neighbours), np.int32)
+    for start in range(0, len(points), _QUERY_ROWS):
+        part = slice(start, min(start + _QUERY_ROWS, len(points)))
+        found: Any = tree.query(points[part], k=options.neighbours + 1, distance_upper_bound=reach_m)
+        mean[part] = np.minimum(found[0][:, 1:], reach_m).mean(axis=1)
+        rows[part] = found[1][:, 1:]
+    ratio = np.full(len(points), np.inf)
+    for start in range(0, len(points), _QUERY_ROWS):
+        part = slice(start, min(start + _QUERY_ROWS, len(points)))
+        some = (rows[part] < len(points)).sum(axis=1) >= options.fewest
+        theirs = np.nanmedian(mean[rows[part][some]], axis=1)
+        ratio[part][some] = mean[part][some] / np.maximum(theirs, 1e-9)
+    unsorted = np.empty(len(points))
+    unsorted[order] = ratio
+    return unsorted[:core]
 
 
 def find_outliers(xyz: FloatArray, core: int, spacing_m: float, options: OutlierOptions) -> NDArray[np.bool_]:
     """(core,) bool, which of the first `core` points are outliers; see `outlier_ratio`."""
-    return outlier_ratio(xyz, core, options.reach_m(spacing_m), options.neighbours) > options.ratio
-
-
-def _nearest(
-    tree: "cKDTree[None]", xyz: FloatArray, neighbours: int, reach_m: float
-) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Distances and rows (n, neighbours) of the nearest other points; infinity and row n beyond the reach."""
-    found: Any = tree.query(xyz, k=neighbours + 1, distance_upper_bound=reach_m)
-    distance, index = found
-    return distance[:, 1:], index[:, 1:]
+    return outlier_ratio(xyz, core, options.reach_m(spacing_m), options) > options.ratio
