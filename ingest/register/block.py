@@ -1,0 +1,148 @@
+"""A photogrammetric block: cameras, poses, points and their observations as plain arrays.
+
+What control points place and adjust. It is made of a reconstruction before there is a map, or of a map
+that has a place already; it goes back into either.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, Placement
+from ingest.colmap_bridge import Model
+from ingest.extract import PhotoFeatures
+from ingest.photo import Photo
+from ingest.precision import (
+    linearise,
+    point_covariances,
+    pose_covariances,
+    residual_variance,
+    upper_triangle,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Block:
+    """Photos, points and observations in one frame, "block", of any scale and orientation.
+
+    Attributes:
+        names: of the k photos.
+        cameras: intrinsics; camera_of: (k,) index into them.
+        cam_from_block: k poses.
+        xyz: (n, 3) points.
+        point_of, photo_of: (m,) int64, what each observation sees, and in which photo.
+        xy: (m, 2) full-size pixels.
+    """
+
+    names: tuple[str, ...]
+    cameras: tuple[Camera, ...]
+    camera_of: NDArray[np.int64]
+    cam_from_block: tuple[Rigid3, ...]
+    xyz: FloatArray
+    point_of: NDArray[np.int64]
+    photo_of: NDArray[np.int64]
+    xy: FloatArray
+
+    def camera(self, photo: int) -> Camera:
+        """Intrinsics of a photo."""
+        return self.cameras[int(self.camera_of[photo])]
+
+    def centers(self) -> FloatArray:
+        """Camera centres (k, 3)."""
+        return np.array([pose.center for pose in self.cam_from_block]).reshape(-1, 3)
+
+    def moved(self, target_from_block: Sim3) -> "Block":
+        """The same block in another frame."""
+        return replace(
+            self,
+            cam_from_block=tuple(target_from_block.act_on_pose(pose) for pose in self.cam_from_block),
+            xyz=target_from_block.act(self.xyz),
+        )
+
+
+def block_of_model(model: Model, photos: Sequence[Photo], features: Sequence[PhotoFeatures]) -> Block:
+    """The block of a reconstruction, in its own frame; photos and features in the order of `model.rows`."""
+    xy = np.zeros((len(model.point_of), 2))
+    for k, found in enumerate(features):
+        rows = model.photo_of == k
+        xy[rows] = found.features.xy[model.keypoint_of[rows]]
+    return Block(
+        names=tuple(photo.name for photo in photos),
+        cameras=model.cameras,
+        camera_of=model.camera_of,
+        cam_from_block=model.cam_from_sfm,
+        xyz=model.xyz,
+        point_of=model.point_of,
+        photo_of=model.photo_of,
+        xy=xy,
+    )
+
+
+def model_of_block(model: Model, block: Block) -> Model:
+    """The reconstruction with the block's cameras, poses and points; the block is in the same frame."""
+    return replace(model, cameras=block.cameras, cam_from_sfm=block.cam_from_block, xyz=block.xyz)
+
+
+def block_of_map(feature_map: FeatureMap) -> Block:
+    """The block of a map, in the map's local frame."""
+    row_of_id = {image.image_id: k for k, image in enumerate(feature_map.images)}
+    observations = feature_map.observations
+    return Block(
+        names=tuple(image.name for image in feature_map.images),
+        cameras=feature_map.cameras,
+        camera_of=np.array([image.camera_id for image in feature_map.images], dtype=np.int64),
+        cam_from_block=tuple(image.cam_from_local for image in feature_map.images),
+        xyz=feature_map.points_local(),
+        point_of=np.asarray(observations.point_index, dtype=np.int64),
+        photo_of=np.array([row_of_id[int(i)] for i in observations.image_id], dtype=np.int64),
+        xy=observations.xy.astype(np.float64),
+    )
+
+
+def map_of_block(
+    feature_map: FeatureMap, block: Block, frame: LocalFrame, placement: Placement, height_datum: str
+) -> FeatureMap:
+    """The map placed anew: poses, points and intrinsics of the block, which is in metres in `frame`.
+
+    Errors and covariances are computed again; ids, descriptors and attribution stay.
+    """
+    poses, points = block.cam_from_block, block.xyz
+    linear = linearise(
+        block.cameras, block.camera_of, poses, points, block.point_of, block.photo_of, block.xy
+    )
+    variance = residual_variance(linear, len(poses), len(points))
+    covariances = point_covariances(linear, len(points), variance)
+    spread = pose_covariances(linear, len(poses), covariances, variance)
+    lengths = np.bincount(block.point_of, minlength=len(points))
+    errors = np.bincount(
+        block.point_of, weights=np.linalg.norm(linear.residual, axis=1), minlength=len(points)
+    ) / np.maximum(lengths, 1)
+    epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
+    return replace(
+        feature_map,
+        epsg=epsg,
+        height_datum=height_datum,
+        frame=frame,
+        cameras=block.cameras,
+        images=tuple(
+            replace(image, cam_from_local=pose, covariance=covariance)
+            for image, pose, covariance in zip(feature_map.images, poses, spread, strict=True)
+        ),
+        points=replace(
+            feature_map.points,
+            utm=frame.utm_from_enu(points, epsg),
+            error_px=errors.astype(np.float32),
+            covariance=upper_triangle(covariances),
+        ),
+        placement=placement,
+        generation=0,
+        parents=(),
+    )
