@@ -95,6 +95,8 @@ class AirborneScan:
         gps_time_s: (n,) float64, adjusted standard GPS time.
         strip: (n,) uint16, from 1.
         object_id: (n,) int32 of the scene's object, SKY_ID (-1) for birds and multipath.
+        face: (n,) int32, row of the faces of the scanned day's scene, `another_day(scene, options.day)`; -1
+            for leaves, cars under way and outliers.
         outlier: (n,) bool, birds and multipath, whatever their class says.
     """
 
@@ -109,6 +111,7 @@ class AirborneScan:
     gps_time_s: FloatArray
     strip: NDArray[np.uint16]
     object_id: NDArray[np.int32]
+    face: NDArray[np.int32]
     outlier: NDArray[np.bool_]
 
     def __len__(self) -> int:
@@ -256,6 +259,7 @@ def _scan_strip(
         "gps_time_s": _GPS_START_S + _TURN_S * strip.number + row * beams.dx / _SPEED_M_S,
         "strip": np.full(len(echoes), strip.number, dtype=np.uint16),
         "object_id": object_id,
+        "face": np.where(echoes.face < len(strip.scene.faces), echoes.face, NOTHING).astype(np.int32),
         "outlier": outlier,
     }
 

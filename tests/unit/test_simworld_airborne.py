@@ -66,6 +66,11 @@ def test_points_lie_where_beams_meet_faces(town: Scene) -> None:
     rows = np.flatnonzero(static(scan, town))
     rows = np.random.default_rng(0).choice(rows, 300, replace=False)
     assert distance_to_faces(scan.xyz[rows], today).max() < 1e-6
+    # And on the one that the truth names.
+    off = scan.xyz[rows] - today.origin[scan.face[rows]]
+    normal = np.cross(today.edge_s, today.edge_t)[scan.face[rows]]
+    assert np.abs(np.einsum("ij,ij->i", off, normal) / np.linalg.norm(normal, axis=1)).max() < 1e-6
+    assert (scan.face[scan.outlier] == -1).all()
 
 
 def test_nothing_stands_between_the_scanner_and_a_point(town: Scene) -> None:
