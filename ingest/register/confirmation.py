@@ -1,6 +1,6 @@
 """Whether pictures confirm a pose: do pieces of the photo, each on its own, put the scan where it does?
 
-The photo is cut into pieces that do not overlap. Each piece of the rendering at the pose is searched in the
+Each piece of the rendering at the pose is searched in the
 photo within a window; without any relation between the two its best place is anywhere in the window, and
 near the middle with the small probability that the area gives. A pose that is right has a third or more of
 its pieces at the middle; a wrong one, even when it was fitted to the same pictures, as many as chance and
@@ -22,8 +22,11 @@ from ingest.register.dense_templates import peaks
 from ingest.register.frame_registration import RenderSource
 from ingest.register.oriented_gradients import GradientOptions, oriented_gradients
 from ingest.register.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.scan_resolution import finest_side_px
 from ingest.register.score_maps import ScoreMaps, TemplateOptions, cut_templates, scores_at, search_around
 from ingest.register.source_pictures import source_picture
+
+_OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +35,8 @@ class ConfirmOptions:
     it.
 
     Attributes:
-        side_px: longer side of the view on which pieces are compared.
+        side_px: longer side of the view on which pieces are compared, where the scan is dense enough:
+        finest_spacing: a pixel is at least this share of the mean distance between scan points.
         search_px: radius of the window in which a piece is searched.
         near_px: a piece agrees with the pose when its best place is this near.
         min_pieces: fewer pieces with structure cannot confirm anything.
@@ -40,20 +44,18 @@ class ConfirmOptions:
         min_log_nfa: smallest evidence, -log10 of the probability that chance puts as many so near, less six
             free parameters' worth.
         min_cells: of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width.
-        max_drift_px: largest mean displacement of agreeing pieces.
     """
 
     side_px: int = 480
-    search_px: int = 20
+    finest_spacing: float = 1.2
+    search_px: int = 16
     near_px: float = 3.0
     min_pieces: int = 25
-    min_agreeing: float = 0.12
+    min_agreeing: float = 0.2
     min_log_nfa: float = 6.0
     min_cells: int = 4
     gradients: GradientOptions = field(default_factory=GradientOptions)
-    templates: TemplateOptions = field(
-        default_factory=lambda: TemplateOptions(size_px=32, spacing_px=32, max_count=400)
-    )
+    templates: TemplateOptions = field(default_factory=lambda: TemplateOptions(max_count=600))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,7 +100,8 @@ def confirm_pose(
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size.
     """
-    view = pinhole_view(photo_gray, camera, options.side_px)
+    finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
+    view = pinhole_view(photo_gray, camera, min(options.side_px, finest))
     maps = _maps(view, cam_from_local, cloud, source, options)
     n = len(maps)
     if n < options.min_pieces:
@@ -118,7 +121,8 @@ def confirm_pose(
     chance = np.pi * (options.near_px + 0.5) ** 2 / (2 * options.search_px + 1) ** 2
     agreeing = int(near.sum())
     # Six parameters can bring three pieces into place whatever they show.
-    log_nfa = float(-binom.logsf(max(agreeing - 3, 0) - 1, n - 3, chance) / np.log(10.0))
+    free, total = max(agreeing // _OVERLAP - 3, 0), n // _OVERLAP - 3
+    log_nfa = float(-binom.logsf(free - 1, total, chance) / np.log(10.0))
     pixels = (maps.origin + places)[near] / (view.camera.width, view.camera.height)
     cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
     score, is_maximum = _around(maps, cam_from_local)

@@ -23,6 +23,7 @@ from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.oriented_gradients import GradientOptions, oriented_gradients
 from ingest.register.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.scan_resolution import finest_side_px, viewing_distance_m
 from ingest.register.score_maps import (
     ScoreMaps,
     TemplateOptions,
@@ -59,15 +60,15 @@ class DenseOptions:
     """
 
     sides_px: tuple[int, ...] = (128, 256, 512)
-    finest_spacing: float = 0.5
+    finest_spacing: float = 1.2
     reach_sigma: float = 2.5
     max_margin: float = 1.6
-    turn_step_deg: float = 9.0
+    turn_step_deg: float = 6.0
     grid_step_px: float = 2.0
     parallax_step_px: float = 5.0
     max_positions_per_axis: int = 5
-    candidates: int = 10
-    kept: int = 4
+    candidates: int = 12
+    kept: int = 6
     separation_px: float = 5.0
     refine_radius_px: int = 12
     score_clip: float = 6.0
@@ -153,7 +154,7 @@ def _vote(
     first = render(cloud, view.camera, prior.cam_from_local, RenderOptions(threads=1, attributes=False))
     depth = first.depth[first.valid].astype(np.float64)
     if len(depth) < 100:
-        depth = np.array([_fallback_depth(prior, cloud)])
+        depth = np.array([viewing_distance_m(cloud, prior.cam_from_local)])
     distance = float(np.median(depth))
     sideways = options.reach_sigma * prior.sigma_horizontal_m / distance
     reach_px = focal * (np.tan(min(tilt, 1.0)) + sideways)
@@ -242,7 +243,18 @@ def _pan_tilts(reach_px: float, camera: Camera, options: DenseOptions) -> FloatA
     reach = min(np.arctan(reach_px / focal), np.radians(40.0))
     side = int(np.ceil(reach * focal / options.grid_step_px))
     steps = np.arange(-side, side + 1) * (options.grid_step_px / focal)
-    return np.array([so3_exp([a, b, 0.0]) for a in steps for b in steps if np.hypot(a, b) <= reach + 1e-9])
+    pan, tilt = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    angle = np.hypot(pan, tilt)
+    pan, tilt, angle = (values[angle <= reach + 1e-9] for values in (pan, tilt, angle))
+    # Rodrigues' formula for axes in the picture's plane.
+    x, y = tilt / np.maximum(angle, 1e-12), pan / np.maximum(angle, 1e-12)
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    rows = [
+        [c + x * x * (1 - c), x * y * (1 - c), y * s],
+        [x * y * (1 - c), c + y * y * (1 - c), -x * s],
+        [-y * s, x * s, c + zero],
+    ]
+    return np.asarray(rows, dtype=np.float64).transpose(2, 0, 1)
 
 
 def _refined(
@@ -273,7 +285,7 @@ def _refined(
         cost,
         np.zeros(6),
         method="Nelder-Mead",
-        options={"initial_simplex": simplex, "maxfev": 500, "xatol": 0.02, "fatol": 0.02, "adaptive": True},
+        options={"initial_simplex": simplex, "maxfev": 300, "xatol": 0.02, "fatol": 0.02, "adaptive": True},
     )
     moved = Rigid3.exp(result.x * scale) @ pose
     total, pieces = _summed(maps, moved, options)
@@ -331,18 +343,6 @@ def _distinct(
 
 def _sides(camera: Camera, prior: FramePrior, cloud: PointCloud, options: DenseOptions) -> list[int]:
     """Longer sides of the octaves that photo and scan can fill."""
-    spacing = float(cloud.nodes.spacing_m.min())
-    distance = _fallback_depth(prior, cloud)
-    finest = (
-        max(camera.width, camera.height) / camera.focal_px * distance / (options.finest_spacing * spacing)
-    )
-    most = min(finest, max(camera.width, camera.height))
-    sides = [side for side in options.sides_px if side <= 1.3 * most]
+    most = finest_side_px(camera, prior.cam_from_local, cloud, options.finest_spacing)
+    sides = [side for side in options.sides_px if side <= 1.2 * most]
     return sides or [options.sides_px[0]]
-
-
-def _fallback_depth(prior: FramePrior, cloud: PointCloud) -> float:
-    """Distance from the prior's camera to the scan along its axis, from the scan's heights."""
-    sample = cloud.xyz[:: max(1, len(cloud) // 2000)]
-    depth = prior.cam_from_local.act(sample)[:, 2]
-    return float(np.median(depth[depth > 1.0])) if (depth > 1.0).any() else 100.0
