@@ -8,12 +8,12 @@ grid, so that points lie neither in rows nor by chance alone. No noise: every er
 cameras of 1280x720 pixels with distortion then look down and obliquely at the points, and each pixel's depth
 is compared with that of the exact ray through its centre.
 
-Pixels whose exact surface has no point within two spacings of the scan are left out: under trees, behind walls
-that face no ray, thin posts. Their share is printed.
+Pixels whose exact surface has no point within two spacings of the scan are left out: under trees, behind
+walls that face no ray, thin posts. Their share is printed.
 
-A pixel is beside an edge where the exact depth jumps by more than a metre within two pixels. Of pixels that are
-off by more than half a metre it is said on which side: nearer is a foreground that grew over what lies behind
-it, farther is a background that shines through.
+A pixel is beside an edge where the exact depth jumps by more than a metre within two pixels. Of pixels that
+are off by more than half a metre it is said on which side: nearer is a foreground that grew over what lies
+behind it, farther is a background that shines through.
 """
 
 import argparse

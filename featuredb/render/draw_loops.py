@@ -10,13 +10,16 @@ Float64 = NDArray[np.float64]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
+_ONE_PIXEL = 0.75  # a disc of this radius reaches past its pixel's neighbours' middles only in a corner
+
 
 @compiled
 def project(x: float, y: float, z: float, lens: Float64) -> tuple[float, float]:
     """Pixel of a point in camera axes by a lens vector; NaN behind the camera and beyond the fold."""
     if z <= 0.0:
         return np.nan, np.nan
-    u, v = x / z, y / z
+    inverse = 1.0 / z
+    u, v = x * inverse, y * inverse
     r2 = u * u + v * v
     if r2 >= lens[14]:
         return np.nan, np.nan
@@ -25,9 +28,9 @@ def project(x: float, y: float, z: float, lens: Float64) -> tuple[float, float]:
         r = np.sqrt(r2)
         theta = np.arctan(r)
         q, scale = theta * theta, theta / r
-    above = 1.0 + q * (lens[4] + q * (lens[5] + q * (lens[6] + q * lens[7])))
-    below = 1.0 + q * (lens[8] + q * (lens[9] + q * lens[10]))
-    scale *= above / below
+    scale *= 1.0 + q * (lens[4] + q * (lens[5] + q * (lens[6] + q * lens[7])))
+    if lens[8] != 0.0 or lens[9] != 0.0 or lens[10] != 0.0:
+        scale /= 1.0 + q * (lens[8] + q * (lens[9] + q * lens[10]))
     p1, p2 = lens[11], lens[12]
     du = u * scale + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
     dv = v * scale + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
@@ -95,7 +98,7 @@ def draw(
             if 0 <= middle_x < width and 0 <= middle_y < height:
                 _put(key, index, apart_m, middle_y, middle_x, np.float32(z), i, apart)
             radius = min(per_spacing * apart * focal / z, widest)
-            if radius <= 0.5:
+            if radius <= _ONE_PIXEL:
                 continue
             a, b = _slopes(planes, side, u, v, z, apart, focal)
             bias = 0.5 * apart / (radius * radius)
@@ -135,10 +138,10 @@ def lies_on(
     """Whether a point lies on the plane of a block, to half a spacing at right angles to the plane."""
     there = plane[0] + plane[1] * (u - (column + 0.5) * side) + plane[2] * (v - (row + 0.5) * side)
     # The slope of depth per metre across the line of sight is that of nearness per pixel, times focal / w.
-    steep2 = (plane[1] * plane[1] + plane[2] * plane[2]) * (focal / w) ** 2
-    if not steep2 < 225.0:  # 86 degrees, or no plane at all
+    slope2 = (plane[1] * plane[1] + plane[2] * plane[2]) * focal * focal
+    if not slope2 < 225.0 * w * w:  # 86 degrees, or no plane at all
         return False
-    return bool(abs(there - w) < 0.5 * apart * w * w * np.sqrt(1.0 + steep2))
+    return bool((there - w) ** 2 < (0.5 * apart * w) ** 2 * (w * w + slope2))
 
 
 @compiled

@@ -20,27 +20,13 @@ _MOMENTS = 9  # n, u, v, uu, uv, vv, w, uw, vw
 
 
 @compiled
-def nearness_of_index(
-    xyz: Float32, index: Int32, pose: Float64, nearness: Float32, first: int, end: int
-) -> None:
-    """Fill nearness (h, w) from each pixel's point; zero where there is none."""
-    for y in range(first, end):
-        for x in range(index.shape[1]):
-            i = index[y, x]
-            nearness[y, x] = 0.0
-            if i >= 0:
-                nearness[y, x] = 1.0 / (
-                    pose[2, 0] * xyz[i, 0] + pose[2, 1] * xyz[i, 1] + pose[2, 2] * xyz[i, 2] + pose[2, 3]
-                )
-
-
-@compiled
 def plane_moments(
     xyz: Float32,
     index: Int32,
     pose: Float64,
     lens: Float64,
     side: int,
+    stride: int,
     moments: Float64,
     first: int,
     end: int,
@@ -48,12 +34,13 @@ def plane_moments(
     """Add up, per block of side x side pixels, the moments of the points that lie in pixels showing them.
 
     Args:
+        stride: every how many-th pixel is asked.
         moments: (blocks down, blocks across, 9) changed; u and v from the block's middle, w is nearness.
         first, end: rows of blocks.
     """
     height, width = index.shape
-    for y in range(first * side, min(end * side, height)):
-        for x in range(width):
+    for y in range(first * side, min(end * side, height), stride):
+        for x in range((y // stride) % stride, width, stride):
             i = index[y, x]
             if i < 0:
                 continue
@@ -140,7 +127,7 @@ def _fit_plane(t: Float64, plane: Float64) -> None:
 
 
 @compiled
-def tilt_splats(
+def splat_nearness(
     xyz: Float32,
     index: Int32,
     apart_m: Float32,
@@ -152,25 +139,35 @@ def tilt_splats(
     first: int,
     end: int,
 ) -> None:
-    """Tilt each splat along its block's plane, where its own point lies on that plane."""
+    """Fill nearness (h, w) from each pixel's point; zero where there is none.
+
+    Where the point lies on its block's plane, the splat is tilted along it.
+    """
     focal = 0.5 * (lens[0] + lens[1])
     for y in range(first, end):
+        row = y // side
         for x in range(index.shape[1]):
             i = index[y, x]
-            plane = planes[y // side, x // side]
-            if i < 0 or not np.isfinite(plane[0]):
+            if i < 0:
+                nearness[y, x] = 0.0
                 continue
             u, v, w = _seen_at(xyz, i, pose, lens)
-            if lies_on(plane, side, y // side, x // side, u, v, w, apart_m[y, x], focal):
-                # Beyond half of its own, a change of nearness comes from a plane that does not reach so far.
-                change = plane[1] * (x + 0.5 - u) + plane[2] * (y + 0.5 - v)
-                nearness[y, x] = w + max(-0.5 * w, min(0.5 * w, change))
+            nearness[y, x] = w
+            column = x // side
+            if row < planes.shape[0] and column < planes.shape[1]:
+                plane = planes[row, column]
+                if lies_on(plane, side, row, column, u, v, w, apart_m[y, x], focal):
+                    # Beyond half of its own, a change of nearness comes from a plane that ends before.
+                    change = plane[1] * (x + 0.5 - u) + plane[2] * (y + 0.5 - v)
+                    nearness[y, x] = w + max(-0.5 * w, min(0.5 * w, change))
 
 
 @compiled
 def close_holes(
     nearness: Float32,
     apart_m: Float32,
+    planes: Float64,
+    side: int,
     closed: Float32,
     radii: Int32,
     focal: float,
@@ -183,10 +180,11 @@ def close_holes(
     """Find pixels between splats of one surface, empty or showing what lies behind, and their nearness.
 
     Args:
+        planes, side: see `plane_slopes`; of shape (0, 0, 3) where nothing is known.
         closed: (k, h, w) morphological closings of `nearness` by squares of the k growing radii.
         reach_per_spacing: the widest radius that may close a hole, as a share of the points' distance.
         filled: (h, w) changed: `nearness`, or that of the surface which closes the hole.
-        source: (h, w) changed: 0, or the radius within which the surface's pixels lie.
+        source: (h, w) changed: 0, or the radius within which the nearest pixels of that surface lie.
     """
     for y in range(first, end):
         for x in range(nearness.shape[1]):
@@ -197,43 +195,70 @@ def close_holes(
                 level = closed[k, y, x]
                 if level <= own:
                     break  # closings by smaller squares are lower still
-                if own > 0.0 and 1.0 / own - 1.0 / level < _SAME_SURFACE * apart_m[y, x]:
+                if own > 0.0 and level - own < _SAME_SURFACE * apart_m[y, x] * own * level:
                     break
-                value, apart = _surface_around(nearness, apart_m, y, x, radii[k], level)
-                if value == 0.0 or reach_per_spacing * apart * focal * level < radii[k] - 0.5:
+                if k > 0:
+                    # Points are at least a pixel apart where they are drawn: a smaller square does as well.
+                    lower = closed[k - 1, y, x]
+                    if lower > 0.0 and (level - lower) * focal < _SAME_SURFACE * lower:
+                        continue
+                value, apart, ring = _surface_around(
+                    nearness, apart_m, y, x, radii[k], level, planes, side, focal
+                )
+                if ring == 0 or reach_per_spacing * apart * focal * level < radii[k] - 0.5:
                     continue
-                if own > 0.0 and 1.0 / own - 1.0 / value < _SAME_SURFACE * apart:
+                if own > 0.0 and value - own < _SAME_SURFACE * apart * own * value:
                     continue
                 filled[y, x] = value
-                source[y, x] = radii[k]
+                source[y, x] = ring
                 break
 
 
 @compiled
 def _surface_around(
-    nearness: Float32, apart_m: Float32, y: int, x: int, radius: int, level: float
-) -> tuple[float, float]:
-    """Weighted mean nearness of the pixels around that lie on the surface at `level`, and their spacing."""
-    total, value, apart = 0.0, 0.0, 0.0
-    step = 1 + radius // 5
-    for ny in range(y - radius, y + radius + 1, step):
-        for nx in range(x - radius, x + radius + 1, step):
-            if not (0 <= ny < nearness.shape[0] and 0 <= nx < nearness.shape[1]):
+    nearness: Float32,
+    apart_m: Float32,
+    y: int,
+    x: int,
+    radius: int,
+    level: float,
+    planes: Float64,
+    side: int,
+    focal: float,
+) -> tuple[float, float, int]:
+    """Nearness of the surface at `level` from its pixels nearest to (y, x), their spacing and distance.
+
+    Rings around the pixel are searched outwards until one holds pixels of that surface; 0 if none does.
+    """
+    for ring in range(1, radius + 1):
+        n, value, apart, off_x, off_y = 0, 0.0, 0.0, 0, 0
+        for dy in range(-ring, ring + 1):
+            step = 1 if abs(dy) == ring else 2 * ring
+            ny = y + dy
+            if not 0 <= ny < nearness.shape[0]:
                 continue
-            w = nearness[ny, nx]
-            if w > 0.0 and abs(1.0 / w - 1.0 / level) < _SAME_SURFACE * apart_m[ny, nx]:
-                weight = _weight(ny - y, nx - x)
-                total += weight
-                value += weight * w
-                apart += weight * apart_m[ny, nx]
-    if total == 0.0:
-        return 0.0, 0.0
-    return value / total, apart / total
-
-
-@compiled
-def _weight(dy: int, dx: int) -> float:
-    return 1.0 / (0.5 + dy * dy + dx * dx) ** 2
+            for dx in range(-ring, ring + 1, step):
+                nx = x + dx
+                if not 0 <= nx < nearness.shape[1]:
+                    continue
+                w = nearness[ny, nx]
+                if w > 0.0 and abs(level - w) < _SAME_SURFACE * apart_m[ny, nx] * w * level:
+                    n += 1
+                    value += w
+                    apart += apart_m[ny, nx]
+                    off_x += dx
+                    off_y += dy
+        if n > 0:
+            value, apart = value / n, apart / n
+            middle_x, middle_y = x + 0.5 + off_x / n, y + 0.5 + off_y / n
+            row, column = y // side, x // side
+            if ring > 1 and row < planes.shape[0] and column < planes.shape[1]:
+                plane = planes[row, column]
+                if lies_on(plane, side, row, column, middle_x, middle_y, value, apart, focal):
+                    change = (plane[1] * off_x + plane[2] * off_y) / n
+                    value -= max(-0.5 * value, min(0.5 * value, change))
+            return value, apart, ring
+    return 0.0, 0.0, 0
 
 
 @compiled
@@ -252,27 +277,27 @@ def paint(
     total = np.zeros(values.shape[1])
     for y in range(first, end):
         for x in range(index.shape[1]):
-            radius, i = source[y, x], index[y, x]
-            if radius == 0:
+            ring, i = source[y, x], index[y, x]
+            if ring == 0:
                 for c in range(values.shape[1]):
                     picture[y, x, c] = values[i, c] if i >= 0 else 0
                 continue
-            weights = 0.0
+            n = 0
             total[:] = 0.0
-            step = 1 + radius // 5  # a hundred or so of the pixels around are enough
-            for ny in range(y - radius, y + radius + 1, step):
-                for nx in range(x - radius, x + radius + 1, step):
+            level = filled[y, x]
+            for dy in range(-ring, ring + 1):
+                step = 1 if abs(dy) == ring else 2 * ring
+                for dx in range(-ring, ring + 1, step):
+                    ny, nx = y + dy, x + dx
                     if not (0 <= ny < index.shape[0] and 0 <= nx < index.shape[1]):
                         continue
                     j, w = index[ny, nx], nearness[ny, nx]
-                    if j < 0 or abs(1.0 / w - 1.0 / filled[y, x]) >= 2.0 * _SAME_SURFACE * apart_m[ny, nx]:
-                        continue
-                    weight = _weight(ny - y, nx - x)
-                    weights += weight
-                    for c in range(values.shape[1]):
-                        total[c] += weight * values[j, c]
+                    if j >= 0 and abs(level - w) < 2.0 * _SAME_SURFACE * apart_m[ny, nx] * w * level:
+                        n += 1
+                        for c in range(values.shape[1]):
+                            total[c] += values[j, c]
             for c in range(values.shape[1]):
-                picture[y, x, c] = np.uint8(total[c] / weights + 0.5) if weights > 0.0 else 0
+                picture[y, x, c] = np.uint8(total[c] / n + 0.5) if n > 0 else 0
 
 
 @compiled

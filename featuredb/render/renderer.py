@@ -1,5 +1,6 @@
 """Draws a point cloud as a camera with distortion sees it."""
 
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,33 +35,60 @@ class RenderOptions:
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
 
+@dataclass(slots=True, kw_only=True)
+class RenderClock:
+    """Where the time of one picture went: `seconds` by stage, in order."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    _last: float = field(default_factory=time.perf_counter)
+
+    def lap(self, stage: str) -> None:
+        """Book the time since the last lap."""
+        now = time.perf_counter()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
+        self._last = now
+
+
 def render(
-    cloud: PointCloud, camera: Camera, cam_from_local: Rigid3, options: RenderOptions | None = None
+    cloud: PointCloud,
+    camera: Camera,
+    cam_from_local: Rigid3,
+    options: RenderOptions | None = None,
+    clock: RenderClock | None = None,
 ) -> Rendering:
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
     The same picture whatever the number of threads; safe to call from several threads at once.
 
+    Args:
+        clock: is told how long each stage took.
+
     Raises:
         MissingExtraError: numba is not installed.
     """
-    options = options or RenderOptions()
+    options, clock = options or RenderOptions(), clock or RenderClock()
     threads = thread_count(options.threads)
     near_m, finest_px = options.splats.near_m, options.splats.finest_px
     rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)
+    clock.lap("cull")
     splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads)
+    clock.lap("draw")
     planes = None
     if options.surfaces.tilt_splats:
         planes = block_planes(cloud.xyz, splats, camera, cam_from_local, threads)
+        clock.lap("planes")
         if planes is not None and np.quantile(apart_px(splats, camera.focal_px), 0.95) > _WORTH_REDRAWING_PX:
             splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads, planes)
+            clock.lap("draw again")
     surfaces = surfaces_of(cloud.xyz, splats, planes, camera, cam_from_local, options.surfaces, threads)
+    clock.lap("close holes")
     rgb = intensity = None
     if options.attributes and cloud.rgb is not None:
         rgb = _painted(cloud.rgb, splats, surfaces, threads)
     if options.attributes and cloud.intensity is not None:
         intensity = _painted(cloud.intensity[:, None], splats, surfaces, threads)[..., 0]
     depth = _finished(splats, surfaces, threads)
+    clock.lap("paint")
     return Rendering(
         camera=camera,
         cam_from_local=cam_from_local,

@@ -11,12 +11,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.compiled import compiled_module
 from featuredb.render.lens import lens_vector
 from featuredb.render.splats import BlockPlanes, Splats
-from featuredb.render.threads import over_rows
+from featuredb.render.threads import mapped, over_rows
 
 _MOMENTS = 9  # of picture_loops.plane_moments
 _BLOCK_PER_SPACING = 1.5  # blocks of three by three then hold about twenty points for a plane
 _SMALLEST_BLOCK_PX = 4  # smaller ones cost more and see only the points' noise
-_RADII_PX = (1, 2, 3, 4, 6, 9, 14, 21, 32)  # of closings; each is tried from the largest down
+_DENSE_PX = 2.0  # where nearly every pixel shows a point of its own, every fourth is enough for a plane
+_RADII_PX = (1, 2, 3, 5, 8, 13, 21, 32)  # of closings; each is tried from the largest down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,29 +70,25 @@ def surfaces_of(
     loops = compiled_module("featuredb.render.picture_loops")
     pose, height = cam_from_local.matrix()[:3], camera.height
     index, apart = splats.index, splats.apart_m
-    nearness = np.empty(index.shape, np.float32)
+    nearness, lens = np.empty(index.shape, np.float32), lens_vector(camera)
+    planes, side = (np.empty((0, 0, 3)), 1) if surface is None else (surface.planes, surface.side)
     over_rows(
-        lambda first, end: loops.nearness_of_index(xyz, index, pose, nearness, first, end), height, threads
+        lambda first, end: loops.splat_nearness(
+            xyz, index, apart, pose, lens, planes, side, nearness, first, end
+        ),
+        height,
+        threads,
     )
-    if surface is not None:
-        lens, planes, side = lens_vector(camera), surface.planes, surface.side
-        over_rows(
-            lambda first, end: loops.tilt_splats(
-                xyz, index, apart, pose, lens, planes, side, nearness, first, end
-            ),
-            height,
-            threads,
-        )
     source = np.zeros(index.shape, np.int32)
     if not options.close_holes or splats.points_drawn == 0:
         return Surfaces(nearness=nearness, filled=nearness, source=source)
     reach, focal = options.reach_per_spacing, camera.focal_px
     radii = _radii(splats, reach, focal)
-    closed = np.stack([_closing(nearness, int(r)) for r in radii])
+    closed = _closings(nearness, radii, threads)
     filled = np.empty_like(nearness)
     over_rows(
         lambda first, end: loops.close_holes(
-            nearness, apart, closed, radii, focal, reach, filled, source, first, end
+            nearness, apart, planes, side, closed, radii, focal, reach, filled, source, first, end
         ),
         height,
         threads,
@@ -116,11 +113,13 @@ def block_planes(
         return None
     loops = compiled_module("featuredb.render.picture_loops")
     pose, lens, index = cam_from_local.matrix()[:3], lens_vector(camera), splats.index
-    side = max(int(np.ceil(_BLOCK_PER_SPACING * float(np.median(apart)))), _SMALLEST_BLOCK_PX)
+    typical = float(np.median(apart))
+    side = max(int(np.ceil(_BLOCK_PER_SPACING * typical)), _SMALLEST_BLOCK_PX)
+    stride = 2 if typical < _DENSE_PX else 1
     blocks = -(-camera.height // side), -(-camera.width // side)
     moments, planes = np.zeros((*blocks, _MOMENTS)), np.empty((*blocks, 3))
     over_rows(
-        lambda first, end: loops.plane_moments(xyz, index, pose, lens, side, moments, first, end),
+        lambda first, end: loops.plane_moments(xyz, index, pose, lens, side, stride, moments, first, end),
         blocks[0],
         threads,
     )
@@ -134,8 +133,13 @@ def _radii(splats: Splats, reach_per_spacing: float, focal_px: float) -> NDArray
     return np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < widest + 0.5], np.int32)
 
 
-def _closing(nearness: NDArray[np.float32], radius_px: int) -> NDArray[np.float32]:
-    """Grey-scale closing by a square of 2 radius + 1 pixels."""
-    square = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
-    closed: NDArray[np.float32] = cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, square)
+def _closings(nearness: NDArray[np.float32], radii: NDArray[np.int32], threads: int) -> NDArray[np.float32]:
+    """Grey-scale closings (k, h, w) by squares of 2 radius + 1 pixels."""
+    closed = np.empty((len(radii), *nearness.shape), np.float32)
+
+    def close(k: int) -> None:
+        square = np.ones((2 * radii[k] + 1, 2 * radii[k] + 1), np.uint8)
+        cv2.morphologyEx(nearness, cv2.MORPH_CLOSE, square, dst=closed[k])
+
+    mapped(close, range(len(radii)), threads)
     return closed
