@@ -43,7 +43,8 @@ class ScanOptions:
         density_per_m2: pulses of one strip per square metre of its swath; overlaps have twice that.
         margin_m: how far the scan reaches beyond the town.
         range_noise_m: standard deviation along the beam.
-        strip_shift_m: standard deviation of each strip's displacement, per axis; half of it in height.
+        strip_shift_m: standard deviation of each strip's displacement from their mean, per axis; half of it
+            in height.
         divergence_mrad: full angle of the beam.
         sway_deg: amplitude of the aircraft's roll and pitch; they are known, and only unsettle the pattern.
         birds, multipath: shares of pulses whose only return is above the town, or below its ground.
@@ -129,10 +130,16 @@ def scan_town(scene: Scene, options: ScanOptions = ScanOptions()) -> AirborneSca
     today = another_day(scene, options.day)
     reflectance = scene_reflectance(scene)
     columns: list[dict[str, NDArray]] = []  # type: ignore[type-arg]
-    for i, (flight_from_local, track_y, reach_x) in enumerate(_strips(scene, options, heading)):
+    strips = _strips(scene, options, heading)
+    # What all strips share is an error of the datum, which nobody could see: their mean is taken out.
+    shifts = rng.normal(0, options.strip_shift_m, (len(strips), 3)) * [1, 1, 0.5]
+    shifts -= shifts.mean(axis=0)
+    for i, (flight_from_local, track_y, reach_x) in enumerate(strips):
         moment = 1000 * options.seed + i
         faces = Faces.concatenate([today.faces, moving_cars(today, moment)])
-        strip = _Strip(scene=today, faces=faces, reflectance=reflectance, options=options, number=i + 1)
+        strip = _Strip(
+            scene=today, faces=faces, reflectance=reflectance, options=options, number=i + 1, shift=shifts[i]
+        )
         columns.append(_scan_strip(strip, flight_from_local, track_y, reach_x, rng))
     merged = {name: np.concatenate([c[name] for c in columns]) for name in columns[0]}
     return AirborneScan(frame=scene.frame, epsg=scene.epsg, **merged)
@@ -140,13 +147,14 @@ def scan_town(scene: Scene, options: ScanOptions = ScanOptions()) -> AirborneSca
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Strip:
-    """What the steps of one strip share; faces in the local frame."""
+    """What the steps of one strip share: faces and its displacement `shift` (3,) in the local frame."""
 
     scene: Scene
     faces: Faces
     reflectance: Reflectance
     options: ScanOptions
     number: int
+    shift: FloatArray
 
 
 def _strips(
@@ -243,14 +251,13 @@ def _scan_strip(
     direction, true_xyz = direction[inside], true_xyz[inside]
 
     noise = rng.normal(0, options.range_noise_m, len(echoes))
-    shift = rng.normal(0, options.strip_shift_m, 3) * [1, 1, 0.5]
     number, returns = return_numbers(echoes.beam)
     counts = _COUNTS * rng.normal(1.0, 0.03) * strength * rng.normal(1.0, 0.05, len(echoes))
     counts += rng.normal(0, 12.0, len(echoes))
     row = echoes.beam / beams.shape[1]
     object_id = _object_id(strip, echoes, outlier)
     return {
-        "xyz": true_xyz + direction * noise[:, None] + shift,
+        "xyz": true_xyz + direction * noise[:, None] + strip.shift,
         "intensity": np.clip(np.round(counts), 1, 65_535).astype(np.uint16),
         "classification": _classes(strip, object_id, true_xyz, outlier, rng),
         "return_number": number,
