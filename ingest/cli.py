@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ingest.pipeline import IngestOptions
+    from ingest.register.gcp_model import Survey
     from ingest.report import IngestReport
 
 _STAGES = ("scan", "extract", "match", "reconstruct", "build")
@@ -28,6 +29,7 @@ def register(subparsers: Any) -> None:
     photos.add_argument("folder", metavar="FOLDER", type=Path, help="folder of photos, searched through")
     _add_selection(photos)
     _add_making(photos)
+    _add_control(photos)
     _add_running(photos)
     photos.set_defaults(run=run_photos)
 
@@ -87,6 +89,20 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_control(parser: argparse.ArgumentParser) -> None:
+    from ingest.cli_register import add_control_arguments
+
+    group = parser.add_argument_group("ground control points")
+    group.add_argument(
+        "--gcp",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="control points, OpenDroneMap's gcp_list.txt, which place the map instead of the photos' GPS",
+    )
+    add_control_arguments(group)
+
+
 def _add_running(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how the job runs")
     group.add_argument("--workers", type=int, default=None, help="processes; default: one per core")
@@ -127,6 +143,8 @@ def run_photos(args: argparse.Namespace) -> int:
 
 def summary(report: "IngestReport") -> str:
     """A few lines for the terminal; the report has the rest."""
+    from ingest.register.gcp_evidence import residual_table
+
     lines = [
         f"{report.count('registered')} of {len(report.photos)} files registered, "
         f"{report.count('not_registered')} not, {report.count('skipped')} skipped, {report.seconds:.1f} s"
@@ -138,8 +156,11 @@ def summary(report: "IngestReport") -> str:
             lines.append(
                 f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
                 f"{outcome.photos} photos, {outcome.points} points, EPSG:{outcome.epsg}, "
-                f"GPS residual {outcome.residual_rms_m or 0.0:.2f} m"
+                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m"
             )
+        if outcome.control is not None and outcome.control.control.marks:
+            lines.extend(f"note: {text}" for text in outcome.control.file.notes)
+            lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
     for photo in report.photos:
         if photo.status != "registered":
             lines.append(f"  {photo.name}: {photo.reason_code}: {photo.reason}")
@@ -171,8 +192,20 @@ def _options(args: argparse.Namespace) -> "IngestOptions":
         name=args.name,
         work=args.work,
         stop_after=args.stop_after,
+        survey=_survey(args),
         **_given(workers=args.workers),
     )
+
+
+def _survey(args: argparse.Namespace) -> "Survey | None":
+    """The control points of --gcp."""
+    if args.gcp is None:
+        return None
+    from ingest.cli_register import control_options
+    from ingest.register.gcp_file import read_control_file
+    from ingest.register.gcp_model import Survey
+
+    return Survey(file=read_control_file(args.gcp, args.gcp_crs), options=control_options(args))
 
 
 def _given(**values: Any) -> dict[str, Any]:

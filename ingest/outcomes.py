@@ -19,6 +19,7 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         created: of committed maps, whether this ingest made them visible.
     """
     placement, feature_map = component.placement, component.feature_map
+    figures = component.control.evidence if component.control is not None else placement.figures
     if feature_map is None:
         return MapOutcome(
             map_id="",
@@ -29,9 +30,10 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
             photos=len(component.photos),
             points=len(component.model.xyz),
             observations=len(component.model.point_of),
-            gates=placement.figures,
+            gates=figures,
             cameras=_cameras(component, options),
             track_lengths=component.model.track_lengths().astype(np.int32),
+            control=component.control,
         )
     return MapOutcome(
         map_id=feature_map.map_id,
@@ -45,11 +47,12 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         height_datum=feature_map.height_datum,
         scale=feature_map.placement.local_from_sfm.scale,
         residual_rms_m=feature_map.placement.residual_rms_m,
-        gates=placement.figures,
+        gates=figures,
         cameras=_cameras(component, options),
         errors_px=feature_map.points.error_px,
         track_lengths=feature_map.points.track_length,
         plan=_plan(component, feature_map),
+        control=component.control,
     )
 
 

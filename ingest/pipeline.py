@@ -20,6 +20,7 @@ from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes
 from ingest.photo import Photo
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, make_maps
+from ingest.register.gcp_model import Survey
 from ingest.report import IngestReport, MapOutcome
 from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder
 from ingest.stage_clock import StageClock
@@ -45,6 +46,8 @@ class IngestOptions:
         workers: processes of extraction and matching; 1 runs everything in this process.
         work: work folder; default inside the database (see ingest.workspace.default_root).
         stop_after: end after that stage and keep its results for the next run.
+        survey: control points, which place the maps instead of the photos' GPS. A map's id does not depend
+            on them: it is the photos' and the options', wherever it is placed.
     """
 
     scan: ScanOptions = field(default_factory=ScanOptions)
@@ -54,6 +57,7 @@ class IngestOptions:
     workers: int = field(default_factory=lambda: max(1, os.cpu_count() or 1))
     work: Path | None = None
     stop_after: Stage | None = None
+    survey: Survey | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -109,6 +113,7 @@ def ingest_photos(
                 progress=progress,
                 clock=clock,
                 stop_after=options.stop_after,
+                survey=options.survey,
             )
     with clock.stage("commit"):
         outcomes = _commit(database, result, options)
@@ -117,7 +122,7 @@ def ingest_photos(
         database=database.url,
         folder=str(folder),
         started=started,
-        options=dataclasses.asdict(options),
+        options=dataclasses.asdict(dataclasses.replace(options, survey=None)),
         versions=library_versions(),
         pairs=result.pairs,
         verified_pairs=result.verified_pairs,
@@ -216,5 +221,10 @@ def _warnings(
         return (
             f"No reconstruction: {result.verified_pairs} of {result.pairs} pairs of photos have enough "
             "verified matches. Photos of one place must overlap by more than half.",
+        )
+    if options.survey is not None and any(o.status == "already_there" for o in outcomes):
+        return (
+            "A map of these photos is there already and keeps its place; to place it by the control points: "
+            "featuredb register DB MAP --gcp FILE",
         )
     return ()

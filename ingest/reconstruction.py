@@ -24,6 +24,7 @@ from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
 from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions
 from ingest.photo import Photo
+from ingest.register.gcp_model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.sfm import SfmOptions, SfmTask, reconstruct
 from ingest.stage_clock import StageClock
@@ -71,6 +72,7 @@ class Component:
         with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
         placement: accepted or refused with a reason.
         feature_map: None where there is none, for `reason_code` and `reason`.
+        control: of the placement by control points, where there are some.
     """
 
     model: Model
@@ -80,6 +82,7 @@ class Component:
     feature_map: FeatureMap | None
     reason_code: str = ""
     reason: str = ""
+    control: ControlledPlacement | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +117,7 @@ def make_maps(
     progress: Progress = no_progress,
     clock: StageClock | None = None,
     stop_after: Stage | None = None,
+    survey: Survey | None = None,
 ) -> Reconstructed:
     """Reconstruct and place photos.
 
@@ -121,6 +125,7 @@ def make_maps(
         photos: usable ones, in a fixed order.
         identity: of the map of the component with that number.
         stop_after: end there; what is done is kept for the next run.
+        survey: control points, which then place the maps instead of GPS.
     """
     clock = clock or StageClock()
     with clock.stage("extract") as counts:
@@ -158,7 +163,7 @@ def make_maps(
 
     with clock.stage("build"):
         components = [
-            _component(model, usable, features, identity(number), options)
+            _component(model, usable, features, identity(number), options, survey)
             for number, model in enumerate(models)
         ]
     progress("build", len(components), len(components))
@@ -274,6 +279,7 @@ def _component(
     features: Sequence[PhotoFeatures],
     identity: MapIdentity,
     options: MapMakingOptions,
+    survey: Survey | None,
 ) -> Component:
     """Place one model and build its map where the placement is accepted."""
     chosen = [photos[r] for r in model.rows]
@@ -290,6 +296,9 @@ def _component(
         reason_code=placed.reason or "",
         reason=placed.message,
     )
+    if survey is not None:
+        chosen_features = [features[r] for r in model.rows]
+        return _by_control(component, frame, chosen_features, identity, options, survey)
     if (
         placed.reason is not None
         or frame is None
@@ -314,6 +323,33 @@ def _component(
             reason="no point is placed well enough: the photos' rays are parallel",
         )
     return replace(component, feature_map=feature_map, reason="")
+
+
+def _by_control(
+    component: Component,
+    frame: LocalFrame | None,
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapMakingOptions,
+    survey: Survey,
+) -> Component:
+    """The component placed by control points; GPS, where it was accepted, says what they leave open."""
+    control = place_by_survey(component.model, component.photos, features, frame, component.placement, survey)
+    component = replace(component, control=control)
+    placed = control.placement
+    if placed.reason is not None or control.map_placement is None:
+        return replace(component, reason_code=placed.reason or "", reason=placed.message)
+    datum = control.height_datum(options.maps.height_datum)
+    feature_map = build_map(
+        control.model,
+        control.map_placement,
+        control.frame,
+        component.photos,
+        features,
+        identity,
+        replace(options.maps, height_datum=datum),
+    )
+    return replace(component, model=control.model, feature_map=feature_map, reason_code="", reason="")
 
 
 def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from ingest.register.gcp_model import ControlledPlacement
 from ingest.workspace import atomic_file, write_json
 
 FileStatus = Literal["registered", "not_registered", "skipped"]
@@ -142,6 +143,7 @@ class MapOutcome:
         descriptors: observations with descriptors.
         errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
         plan: None where the map has no place.
+        control: the placement by control points, where there are some.
     """
 
     map_id: str
@@ -162,6 +164,7 @@ class MapOutcome:
     errors_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     track_lengths: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     plan: PlanView | None = None
+    control: ControlledPlacement | None = None
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ import math
 from html import escape
 
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
+from ingest.register.gcp_report import control_html
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.report_plots import histograms_png, plan_png
 
@@ -56,11 +57,12 @@ def _map(outcome: MapOutcome) -> str:
     reason = ""
     if outcome.status == "refused":
         reason = f'<p class="note stop"><b>{escape(outcome.reason_code)}</b>: {escape(outcome.reason)}</p>'
+    method = "GPS" if outcome.control is None else "control points"
     facts = [
         ("photos", str(outcome.photos)),
         ("points", f"{outcome.points:,}"),
         ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
-        ("residual to GPS", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
+        (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
         ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
         ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
         ("map id", outcome.map_id or "none"),
@@ -75,10 +77,17 @@ def _map(outcome: MapOutcome) -> str:
         f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
         + table((), facts, names=(0,))
         + pictures
+        + _control(outcome)
         + _cameras(outcome)
         + folded("Gates and their figures", outcome.gates)
         + "</section>"
     )
+
+
+def _control(outcome: MapOutcome) -> str:
+    if outcome.control is None or not outcome.control.control.marks:
+        return ""
+    return control_html(outcome.control.placement, outcome.control.control)
 
 
 def _cameras(outcome: MapOutcome) -> str:

@@ -53,7 +53,7 @@ def plan_png(plan: PlanView) -> bytes:
     _draw_side(side, plan, shown, colours, plan_box, (side_low, side_high))
     figure.colorbar(ScalarMappable(colours, "viridis"), cax=bar, label="height of points, m")
     bar.tick_params(labelsize=8)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def histograms_png(outcome: MapOutcome) -> bytes:
@@ -83,7 +83,7 @@ def histograms_png(outcome: MapOutcome) -> bytes:
     for axes in (left, right):
         axes.set_ylabel("points")
         _tidy(axes)
-    return _png(figure)
+    return png_bytes(figure)
 
 
 def residual_exaggeration(residuals_m: FloatArray, extent_m: float) -> int:
@@ -285,7 +285,8 @@ def _tidy(axes: Any) -> None:
         axis.get_major_formatter().set_scientific(False)
 
 
-def _png(figure: Figure) -> bytes:
+def png_bytes(figure: Figure) -> bytes:
+    """A figure as PNG."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure)
     figure.savefig(buffer, format="png")

@@ -1,4 +1,4 @@
-"""Bundle adjustment of a block with control points (Triggs et al., Bundle Adjustment, 2000; sections 4 and 6).
+"""Bundle adjustment of a block with control points (Triggs et al., 2000; sections 4 and 6).
 
 Unknowns: poses, lenses that enough photos share, control points, and a sample of the block's own points,
 which are eliminated (Schur complement). Observations: keypoints (Cauchy loss), marks, surveyed coordinates,
@@ -31,7 +31,6 @@ from ingest.register.control_system import (
     system_of,
     trust_of,
 )
-
 
 # Damping over the diagonal of the normal matrix. The block as a whole hangs on a few coordinates, a billionth
 # of what holds its photos together, so that any damping would keep it where it is: none to begin with.

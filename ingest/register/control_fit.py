@@ -5,7 +5,7 @@ that agree, and for every single mark the place where its ray meets the ground t
 show. A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least
 trimmed squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on.
 
-Where heights are unknown only horizontal distances count; then which way is up comes from elsewhere (`Vertical`).
+Where heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
 """
 
 import itertools
@@ -286,7 +286,7 @@ def _sigma(
     parameters = 7 if vertical is None else 4
     freedom = max(equations - parameters, 1)
     spread = float(np.median(lengths)) * _SIGMA_OF_MEDIAN[axes] * (equations / freedom) ** 0.5
-    return max(spread, options.min_sigma_m)
+    return float(max(spread, options.min_sigma_m))
 
 
 def _choose(

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control import Control
@@ -127,10 +128,10 @@ def _point(adjusted: Adjusted, control: Control, outcome: Outcome, point: int) -
     )
 
 
-def _met(adjusted: Adjusted, control: Control, rows: FloatArray, start: FloatArray) -> FloatArray:
+def _met(adjusted: Adjusted, control: Control, rows: NDArray[np.int64], start: FloatArray) -> FloatArray:
     """Where the marks of a point that took no part meet; where it was at the start if they do not."""
     if len(rows) >= 2:
-        index = np.asarray(rows, dtype=np.int64)
+        index = rows
         xyz = intersect(adjusted.block, control.photo_of[index], control.xy[index], 1.0)
         if xyz is not None:
             return xyz

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -226,7 +227,8 @@ def _global_jacobian(
     rows = np.repeat(np.arange(2 * m), 6)
     columns = (6 * linear.photo_of[:, None, None] + np.arange(6)).repeat(2, axis=1).ravel()
     values = [by_pose.ravel()]
-    all_rows, all_columns = [rows], [columns]
+    all_rows: list[NDArray[Any]] = [rows]
+    all_columns: list[NDArray[Any]] = [columns]
     camera_of = problem.block.camera_of[linear.photo_of]
     rotations = np.array([p.rotation for p in state.poses])
     translations = np.array([p.translation for p in state.poses])
@@ -269,7 +271,7 @@ def _jacobian_by_index(
     return sparse.csr_array((np.nan_to_num(by_point).ravel(), (rows, columns)), shape=shape)
 
 
-def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
+def _block_diagonal(blocks: NDArray[np.floating[Any]]) -> sparse.csr_array:
     n = len(blocks)
     return sparse.csr_array(sparse.bsr_array((blocks, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n)))
 
@@ -294,8 +296,8 @@ def solve(system: System, damping: float) -> tuple[FloatArray, FloatArray]:
 def moved(problem: Problem, state: State, step: FloatArray, points_step: FloatArray) -> State:
     """The state after a step.
 
-    What the step moves as a whole is done as a similarity, exactly: half a degree, harmless for control points
-    that are good to a metre, would by its second order break what keypoints hold to millimetres.
+    What the step moves as a whole is done as a similarity, exactly: half a degree, harmless for control
+    points that are good to a metre, would by its second order break what keypoints hold to millimetres.
     """
     k = len(state.poses)
     whole_tangent = problem.similarity @ step[: 6 * k]

@@ -177,7 +177,7 @@ def _control_sigma(
         # Few residuals of one kind say little about it: all kinds together then.
         chosen = columns if own >= 3.0 else slice(0, 3)
         total = max(float(redundancy[:, chosen].sum()), 1.0)
-        return max((float(squared[:, chosen].sum()) / total) ** 0.5, options.min_control_sigma_m)
+        return float(max((float(squared[:, chosen].sum()) / total) ** 0.5, options.min_control_sigma_m))
 
     horizontal, vertical = sigma(slice(0, 2)), sigma(slice(2, 3))
     return np.array([horizontal, horizontal, vertical]), freedom
@@ -213,10 +213,11 @@ def _worst_mark(
 ) -> int | None:
     rows = np.flatnonzero(weights.marks)
     tests: list[tuple[float, int]] = []
-    total, statistics = 0.0, {}
-    for row in rows:
+    total = 0.0
+    statistics: dict[int, tuple[float, float]] = {}
+    for row in rows.tolist():
         own = weights.mark_px**2 * np.eye(2) - adjusted.mark_spread[row]
-        statistics[int(row)] = _statistic(linear.residual[row], own)
+        statistics[row] = _statistic(linear.residual[row], own)
         total += float((linear.residual[row] ** 2).sum()) / weights.mark_px**2
     for row, (statistic, predicted) in statistics.items():
         chance = _chance(statistic, 2, total, statistic)

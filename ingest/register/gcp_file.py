@@ -11,7 +11,7 @@ pixel, whose centre is (0.5, 0.5). See https://docs.opendronemap.org/gcp/.
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,7 +126,7 @@ def parse_control_file(text: str, where: str, crs: str | None = None) -> Control
     system, body = _header(filled, where, crs)
     if not body:
         raise ControlFileError(f"{where}: expected a mark per line ({_COLUMNS}), found only a header")
-    lines = _collect((lambda n=n, line=line: _parse_line(n, line) for n, line in body), where)
+    lines = _collect(body, where)
     points, notes = _points(lines, where)
     marks, more_notes = _marks(points, where)
     xyz = np.array([[group[0].x, group[0].y, group[0].z] for group in points.values()])
@@ -210,12 +210,12 @@ def _number(field: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _collect(parsers: Iterable[Callable[[], _Line]], where: str) -> list[_Line]:
+def _collect(body: Iterable[tuple[int, str]], where: str) -> list[_Line]:
     """All lines, or one error that names every line at fault."""
     lines, faults = [], []
-    for parse in parsers:
+    for number, line in body:
         try:
-            lines.append(parse())
+            lines.append(_parse_line(number, line))
         except ControlFileError as error:
             faults.append(str(error))
     _raise(faults, where)

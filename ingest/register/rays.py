@@ -75,7 +75,7 @@ def on_ground(block: Block, photo: int, xy: FloatArray) -> FloatArray | None:
     if len(rows) < _NEIGHBOURS:
         return None
     camera = block.camera(photo)
-    distance, nearest = cKDTree(block.xy[rows]).query(xy, k=_NEIGHBOURS)
+    distance, nearest = (np.asarray(v) for v in cKDTree(block.xy[rows]).query(xy, k=_NEIGHBOURS))
     if distance[_NEIGHBOURS // 2] > _MAX_DISTANCE_SHARE * np.hypot(camera.width, camera.height):
         return None
     points = block.xyz[block.point_of[rows[nearest]]]
