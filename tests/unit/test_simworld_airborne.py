@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld import airborne
+from featuredb.simworld import strip as classes
 from featuredb.simworld.airborne import AirborneScan, ScanOptions, scan_town
 from featuredb.simworld.days import DayOptions, another_day
 from featuredb.simworld.echoes import RANGE_RESOLUTION_M
@@ -99,7 +99,7 @@ def test_nothing_stands_between_the_scanner_and_a_point(town: Scene) -> None:
 def test_noise_is_as_asked(town: Scene) -> None:
     """On open ground and flat roofs the heights scatter by the range noise around the faces."""
     scan = scan_town(town, replace(CLEAN, range_noise_m=0.03, density_per_m2=1.0))
-    ground = static(scan, town) & (scan.classification == airborne.GROUND)
+    ground = static(scan, town) & (scan.classification == classes.GROUND)
     plan_y = (scan.xyz[ground] @ town.enu_from_town)[:, 1]
     flat = (plan_y > -0.5 * 150.0 + 1) & (plan_y < town.plan.river[0] - 1)
     off = scan.xyz[ground][flat, 2] - town.plan.height(plan_y[flat])
@@ -129,7 +129,7 @@ def test_density_and_overlap(town: Scene, scan: AirborneScan) -> None:
     """Pulses per square metre of one strip in the open, and twice that where strips overlap."""
     town_xy = scan.xyz @ town.enu_from_town
     first = (scan.return_number == 1) & (np.abs(town_xy[:, :2]) < [70.0, 65.0]).all(axis=1)
-    first &= scan.classification == airborne.GROUND
+    first &= scan.classification == classes.GROUND
     cells = np.floor(town_xy[first, :2] / 4.0).astype(int)
     _, inverse, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     strips = np.zeros((len(count), 4), bool)
@@ -157,37 +157,37 @@ def test_trees_give_several_returns_and_let_the_ground_be_seen(town: Scene, scan
     for i in big:  # beams near the vertical that pass well inside a crown
         under |= np.hypot(*(scan.xyz[:, :2] - center[i, :2]).T) < 0.5 * radii[i, 0]
     below = under & ~scan.outlier & (np.abs(scan.scan_angle_deg) < 12)
-    reached = np.unique(pulse[below & (scan.classification == airborne.GROUND)])
+    reached = np.unique(pulse[below & (scan.classification == classes.GROUND)])
     assert 0.05 < len(reached) / len(np.unique(pulse[below])) < 0.5
     leaf = (scan.object_id >= TREE_ID) & (scan.object_id < TREE_ID + 10_000)
     assert scan.number_of_returns[leaf].max() >= 3
     # Leaves lie inside crowns, within the noise.
     p = scan.xyz[leaf][::7]
     inside = [(np.sum(((p - c) / (r + 0.2)) ** 2, axis=1) < 1) for c, r in zip(center, radii, strict=True)]
-    trunk = scan.classification[leaf][::7] != airborne.HIGH_VEGETATION
+    trunk = scan.classification[leaf][::7] != classes.HIGH_VEGETATION
     assert np.mean(np.any(inside, axis=0) | trunk) > 0.99
 
 
 def test_classes_follow_what_was_hit(town: Scene, scan: AirborneScan) -> None:
     building = (scan.object_id >= BUILDING_ID) & (scan.object_id < TREE_ID)
-    assert (scan.classification[building & ~scan.outlier] == airborne.BUILDING).all()
+    assert (scan.classification[building & ~scan.outlier] == classes.BUILDING).all()
     assert {1, 2, 4, 5, 6, 7, 9, 17, 18} <= set(np.unique(scan.classification).tolist())
-    noise = np.isin(scan.classification, (airborne.LOW_NOISE, airborne.HIGH_NOISE))
+    noise = np.isin(scan.classification, (classes.LOW_NOISE, classes.HIGH_NOISE))
     assert (noise <= scan.outlier).all()
     n = scan.outlier.sum()
     assert noise.sum() / n == pytest.approx(OPTIONS.noise_labelled, abs=4 * np.sqrt(0.21 / n))
     assert n / (scan.return_number == 1).sum() == pytest.approx(0.002, rel=0.2)
     above = scan.xyz[:, 2] - town.plan.height((scan.xyz @ town.enu_from_town)[:, 1])
-    assert (above[scan.classification == airborne.HIGH_NOISE] > 20).all()
+    assert (above[scan.classification == classes.HIGH_NOISE] > 20).all()
     # A detour at a roof may end above the ground, one at a street does not.
-    assert (above[scan.classification == airborne.LOW_NOISE] < 0).mean() > 0.8
+    assert (above[scan.classification == classes.LOW_NOISE] < 0).mean() > 0.8
 
 
 def test_intensity_is_the_infrared_of_materials_and_not_the_photo(town: Scene, scan: AirborneScan) -> None:
     reflectance = scene_reflectance(town)
     red, slate = (reflectance.of_texture[texture_index(name)] for name in ("roof_red", "roof_slate"))
     assert red > 2 * slate
-    open_ground = (scan.classification == airborne.GROUND) & (scan.number_of_returns == 1)
+    open_ground = (scan.classification == classes.GROUND) & (scan.number_of_returns == 1)
     town_xy = (scan.xyz @ town.enu_from_town)[:, :2]
     street = np.zeros(len(scan), dtype=bool)
     for s in town.plan.streets:
@@ -198,7 +198,7 @@ def test_intensity_is_the_infrared_of_materials_and_not_the_photo(town: Scene, s
     asphalt = np.median(scan.intensity[open_ground & street])
     lawn = np.median(scan.intensity[open_ground & ~street])
     assert lawn > 1.8 * asphalt
-    water = (scan.classification == airborne.WATER) & (np.abs(scan.scan_angle_deg) > 4)
+    water = (scan.classification == classes.WATER) & (np.abs(scan.scan_angle_deg) > 4)
     assert np.median(scan.intensity[water]) < 0.3 * asphalt
     assert water.sum() > 20
 
