@@ -15,6 +15,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.near_frame import near_enu_from_utm
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.render.cloud import CloudNodes, PointCloud
+from featuredb.render.levels import point_spacing
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, count_points, list_scans, scan_points
 
@@ -173,6 +174,7 @@ def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, int
         intensity=np.ascontiguousarray(_bytes(parts, ("intensity",))[:, 0]) if intensity else None,
         classification=np.ascontiguousarray(_bytes(parts, ("classification",))[:, 0]),
         nodes=_nodes(xyz, parts),
+        spacing_m=point_spacing(xyz),
     )
 
 

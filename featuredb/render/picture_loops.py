@@ -252,7 +252,8 @@ def _surface_around(
             value, apart = value / n, apart / n
             middle_x, middle_y = x + 0.5 + off_x / n, y + 0.5 + off_y / n
             row, column = y // side, x // side
-            if ring > 1 and row < planes.shape[0] and column < planes.shape[1]:
+            # Where points are about a pixel apart, a slope between two pixels is not worth its price.
+            if apart * focal * value > 2.0 and row < planes.shape[0] and column < planes.shape[1]:
                 plane = planes[row, column]
                 if lies_on(plane, side, row, column, middle_x, middle_y, value, apart, focal):
                     change = (plane[1] * off_x + plane[2] * off_y) / n
