@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
@@ -45,7 +46,9 @@ class AnchorOptions:
     Attributes:
         frames: which frames, and how each is registered.
         agreement: of frames with each other.
-        structure, adjust: of the placing.
+        structure, adjust: of the placing. Tracks and correspondences are trusted to a pixel in 2000, as the
+            pairs of structure projection are: what a lens model leaves is the same in all photos of a map,
+            so that thousands of tracks agree on it, and would outvote the scan.
         min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
             verdict is good, but two that were found independently and agree cannot both be wrong.
         max_placement_sigmas: how far the map may move in the plane and turn, in standard deviations of its
@@ -65,7 +68,7 @@ class AnchorOptions:
     frames: FramesOptions = field(default_factory=FramesOptions)
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
-    adjust: AdjustLidarOptions = field(default_factory=AdjustLidarOptions)
+    adjust: AdjustLidarOptions = field(default_factory=lambda: AdjustLidarOptions(min_sigma_rel=0.0005))
     min_agreeing: int = 2
     max_placement_sigmas: float = 6.0
     min_move_m: float = 2.0
@@ -234,7 +237,9 @@ def _alone(
     refused: dict[str, str] = {}
     for frame in frames:
         image = frame.image
-        structure = project_structure(feature_map, [_registered(frame)], cloud, options.structure)
+        structure = project_structure(
+            feature_map, [_registered(frame, feature_map.cameras)], cloud, options.structure
+        )
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue
@@ -251,8 +256,13 @@ def _alone(
     return lone, refused
 
 
-def _registered(frame: TriedFrame) -> RegisteredImage:
-    return RegisteredImage(image_id=frame.image.image_id, registration=frame.registration)
+def _registered(frame: TriedFrame, lens: Sequence[Camera]) -> RegisteredImage:
+    """The frame with the lens that it was registered with."""
+    return RegisteredImage(
+        image_id=frame.image.image_id,
+        registration=frame.registration,
+        camera=lens[frame.image.camera_id],
+    )
 
 
 def _too_little(
@@ -304,25 +314,25 @@ def _place(
     """The map by structure projection and adjustment, again with a better lens while that changes.
 
     A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
-    of the way, and the next registration finds others.
+    of the way, and the next registration finds others. Each round places the map as it was.
     """
     placed: FeatureMap | None = None
     rounds: list[PlaceRound] = []
     for number in range(options.lens_rounds):
-        base = placed or feature_map
+        lens = (placed or feature_map).cameras
+        registered = [_registered(frame, lens) for frame in frames]
         start = time.perf_counter()
-        registered = [_registered(frame) for frame in frames]
-        structure = project_structure(base, registered, cloud, options.structure)
+        structure = project_structure(feature_map, registered, cloud, options.structure)
         structure_s = time.perf_counter() - start
         if not structure.accepted:
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
-        adjustment = adjust_to_scan(base, structure, registered, cloud, options.adjust)
+        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, options.adjust)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
-            placed = adjusted_map(base, adjustment, cloud)
+            placed = adjusted_map(feature_map, adjustment, cloud)
         else:
-            placed = placed_map(base, structure, cloud)
+            placed = placed_map(feature_map, structure, cloud)
         rounds.append(
             PlaceRound(
                 frames=tuple(frames),
@@ -337,8 +347,7 @@ def _place(
         )
         progress("place", number + 1, options.lens_rounds)
         change = max(
-            abs(new.focal_px / old.focal_px - 1.0)
-            for new, old in zip(placed.cameras, base.cameras, strict=True)
+            abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(placed.cameras, lens, strict=True)
         )
         if change < options.lens_settled or number + 1 == options.lens_rounds:
             break
