@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -35,9 +36,10 @@ class AdjustLidarOptions:
 
     Attributes:
         min_control: correspondences of registered frames; fewer leave lens and height to the surface alone.
-        min_track_px: of a keypoint's standard deviation; smaller ones are luck.
-        min_control_rel: of a correspondence between photo and scan, as a share of the photo's longer side:
-            a pixel in 4000.
+        min_sigma_rel: least standard deviation of keypoints and of correspondences with the scan, as a share
+            of the photo's longer side: a pixel in 4000. Tracks alone may fit to a third of that, but what
+            lens models leave is common to neighbours and does not average out; trusted to their noise,
+            thousands of tracks outvote the frames' correspondences (tools/scan_poses.py shows it).
         min_surface_m: of a scan's surface against map points; roughness of grass and pavement.
         focal_rel: standard deviation of the focal length's prior: structure from motion over flat ground
             was 25 % off on `brighton`.
@@ -47,21 +49,20 @@ class AdjustLidarOptions:
         steps: of the solver in each round.
         settled_m: see above; far below a scan's noise.
         reach_m: a plane further from a point says nothing of it.
-        max_reprojection_growth: of the median reprojection error; more means that scan and photos
-            contradict each other.
+        max_reprojection_growth: of the median reprojection error, or of half of `min_sigma_rel` where it is
+            smaller; more means that scan and photos contradict each other.
         surface: the scan as planes; finer than for the similarity, since single points are moved.
     """
 
     min_control: int = 60
-    min_track_px: float = 0.5
-    min_control_rel: float = 0.00025
+    min_sigma_rel: float = 0.00025
     min_surface_m: float = 0.03
     focal_rel: float = 0.3
     center_rel: float = 0.02
     distortion: float = 0.1
     rounds: int = 25
     steps: int = 4
-    settled_m: float = 5e-4
+    settled_m: float = 1e-3
     reach_m: float = 1.0
     max_reprojection_growth: float = 0.1
     surface: SurfaceOptions = field(default_factory=lambda: SurfaceOptions(max_surface_points=250_000))
@@ -154,7 +155,8 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
 
     `local_from_sfm` becomes the similarity next to the old one; what is left over is the adjustment itself.
     """
-    assert adjustment.block is not None and adjustment.covariance is not None  # accepted
+    assert adjustment.block is not None
+    assert adjustment.covariance is not None  # accepted
     map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
     block = adjustment.block.moved(map_from_cloud)
     whole = _nearest_similarity(block_of_map(feature_map).centers(), block.centers())
@@ -209,7 +211,7 @@ def _iterate(start: Block, control: Control, surface: Surface, options: AdjustLi
         sigmas = _sigmas(block, control, planes, options)
         moved = solve(block, control, planes, start.cameras, sigmas, options.steps)
         settled = np.median(np.linalg.norm(moved.xyz - block.xyz, axis=1)) < options.settled_m
-        settled &= np.linalg.norm(moved.centers() - block.centers(), axis=1).max() < 10 * options.settled_m
+        settled &= np.linalg.norm(moved.centers() - block.centers(), axis=1).max() < 5 * options.settled_m
         block = moved
         if settled:
             break
@@ -227,15 +229,19 @@ def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> Planes:
 
 def _sigmas(block: Block, control: Control, planes: Planes, options: AdjustLidarOptions) -> Sigmas:
     """Each kind of residual weighs by its own spread as it is now."""
-    longer = max(max(camera.width, camera.height) for camera in block.cameras)
+    longer = _longer_side(block)
     return Sigmas(
-        track_px=max(options.min_track_px, _spread(_track_residuals(block))),
-        control_px=max(options.min_control_rel * longer, _spread(_control_residuals(block, control))),
+        track_px=max(options.min_sigma_rel * longer, _spread(_track_residuals(block))),
+        control_px=max(options.min_sigma_rel * longer, _spread(_control_residuals(block, control))),
         surface_m=max(options.min_surface_m, _spread(planes.offset)),
         focal_rel=options.focal_rel,
         center_rel=options.center_rel,
         distortion=options.distortion,
     )
+
+
+def _longer_side(block: Block) -> int:
+    return max(max(camera.width, camera.height) for camera in block.cameras)
 
 
 def _spread(residuals: FloatArray) -> float:
@@ -245,16 +251,23 @@ def _spread(residuals: FloatArray) -> float:
 
 
 def _track_residuals(block: Block) -> FloatArray:
-    return linearise(
-        *(block.cameras, block.camera_of, block.cam_from_block),
-        *(block.xyz, block.point_of, block.photo_of, block.xy),
-    ).residual
+    return _residuals(block, block.xyz, block.point_of, block.photo_of, block.xy)
 
 
 def _control_residuals(block: Block, control: Control) -> FloatArray:
+    return _residuals(block, control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy)
+
+
+def _residuals(
+    block: Block,
+    points: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    xy: FloatArray,
+) -> FloatArray:
+    """Observed minus projected (m, 2), pixels."""
     return linearise(
-        *(block.cameras, block.camera_of, block.cam_from_block),
-        *(control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy),
+        block.cameras, block.camera_of, block.cam_from_block, points, point_of, photo_of, xy
     ).residual
 
 
@@ -280,7 +293,7 @@ def _gate(
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
     limit = (1.0 + options.max_reprojection_growth) * max(
-        before["reprojection_median_px"], options.min_track_px
+        before["reprojection_median_px"], 0.5 * options.min_sigma_rel * _longer_side(block)
     )
     if after["reprojection_median_px"] > limit:
         return "REPROJECTION", (

@@ -28,17 +28,21 @@ class DepthFilterOptions:
             eave.
         max_grazing_deg: largest angle between ray and normal; at 75 degrees a pixel across the ray is four
             along the surface.
-        window_px: side of the window (odd) around a pixel, in pixels of the rendering.
+        window: samples along each side (odd) of the window around a pixel. They are half a spacing of the
+            scan's points apart, so that the window sees the same number of points whether the scan is denser
+            than the picture or far sparser.
         min_window_points: different scan points in the window; three make any plane fit.
-        min_window_share: pixels of the window with a depth; a window over a hole's edge has fewer.
+        min_window_share: samples of the window that show a scan point near the pixel's own depth, relative
+            to the share of such pixels in the whole picture (a scattered scan leaves gaps between splats
+            everywhere); a window over a hole has fewer.
     """
 
     max_depth_m: float = 1000.0
     max_step_rel: float = 0.015
     max_grazing_deg: float = 75.0
-    window_px: int = 7
+    window: int = 7
     min_window_points: int = 5
-    min_window_share: float = 0.7
+    min_window_share: float = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -61,20 +65,28 @@ class SurfaceHits:
 
 
 def reliable_depth(rendering: Rendering, options: DepthFilterOptions) -> NDArray[np.bool_]:
-    """(h, w) bool: depths that are no closed holes, nor across a silhouette, nor beyond the far plane.
+    """(h, w) bool: depths that are neither across a silhouette nor beyond the far plane.
 
     The step across a silhouette is told from a slope by inverse depth, which is affine over the image of a
     plane: its second differences vanish there and stand out at a discontinuity.
     """
     seen = rendering.valid & (rendering.depth <= options.max_depth_m)
     inverse = np.where(seen, 1.0 / np.where(seen, rendering.depth, 1.0), 0.0).astype(np.float32)
-    reach = options.window_px // 2 + 1
+    reach = (options.window // 2 + 1) * sample_stride(rendering)
     kernel = np.zeros((2 * reach + 1, 1), np.float32)
     kernel[0, 0] = kernel[-1, 0] = 0.5
     kernel[reach, 0] = -1.0
     bend = np.maximum(np.abs(cv2.filter2D(inverse, -1, kernel)), np.abs(cv2.filter2D(inverse, -1, kernel.T)))
     flat = bend * np.where(seen, rendering.depth, 0.0) <= options.max_step_rel
-    return np.asarray(seen & flat & (rendering.index >= 0))
+    return np.asarray(seen & flat)
+
+
+def sample_stride(rendering: Rendering) -> int:
+    """Pixels that are half the distance of neighbouring scan points in the rendering, at least 1."""
+    shown = rendering.index[rendering.index >= 0]
+    points = np.count_nonzero(np.bincount(shown)) if len(shown) else 0
+    pixels = np.count_nonzero(rendering.valid)
+    return max(1, round(0.5 * (pixels / points) ** 0.5)) if points else 1
 
 
 def surface_at(
@@ -88,17 +100,18 @@ def surface_at(
     good = reliable_depth(rendering, options)
     height, width = good.shape
     column, row = np.floor(pixels).astype(np.int64).T
-    reach = options.window_px // 2
+    stride = sample_stride(rendering)
+    reach = options.window // 2 * stride
     inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
     rows = np.flatnonzero(inside)
     rows = rows[good[row[rows], column[rows]]]
-    offset = np.arange(-reach, reach + 1)
+    offset = np.arange(-reach, reach + 1, stride)
     window = (
         row[rows, None, None] + offset[None, :, None],
         column[rows, None, None] + offset[None, None, :],
     )
-    index = rendering.index[window].reshape(len(rows), -1)
-    depth = rendering.depth[window].reshape(len(rows), -1)
+    index = rendering.index[window].reshape(len(rows), options.window**2)
+    depth = rendering.depth[window].reshape(len(rows), options.window**2)
     centre = rendering.depth[row[rows], column[rows]]
     near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * options.max_step_rel)
     index = np.where(near, index, -1)
@@ -106,8 +119,9 @@ def surface_at(
     first = np.concatenate(
         [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
     )
+    shown = np.count_nonzero(rendering.index >= 0) / max(np.count_nonzero(rendering.valid), 1)
     enough = (first.sum(axis=1) >= options.min_window_points) & (
-        near.mean(axis=1) >= options.min_window_share
+        near.mean(axis=1) >= options.min_window_share * shown
     )
     rows, ordered, first = rows[enough], ordered[enough], first[enough]
     return _intersect(rendering, cloud, pixels, rows, ordered, first, options)

@@ -1,7 +1,7 @@
 """Sparse least squares of a block against a scan: what bundle adjustment libraries do not offer.
 
-pycolmap's adjustment knows positions of images and fixed points; it has no residual from a point to a surface.
-Here three kinds of residuals meet: the tracks' reprojection errors, scan points seen by registered frames
+pycolmap's adjustment knows positions of images and fixed points; it has no residual from a point to a
+surface. Here three kinds of residuals meet: the tracks' reprojection errors, scan points seen by registered frames
 (control), and distances of the map's points from the scan's planes. Levenberg-Marquardt with Cauchy weights;
 the points are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 6.1).
 """

@@ -80,7 +80,7 @@ class StructurePlacement:
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
         new_from_old: similarity of the scan's local frame that moves the map from its present place to
-            the new one; None where none could be estimated.
+            the new one, None when refused.
         covariance: (7, 7) of its left perturbation, None when refused.
         pairs: the 3D/3D pairs, None without frames.
         inliers: (n,) bool of the pairs.
@@ -146,7 +146,7 @@ def project_structure(
     inliers = near.copy()
     inliers[near] = fit.inliers
     if reason is not None:
-        return _refused(reason, message, count, clock, pairs, figures, inliers, fit.target_from_source)
+        return _refused(reason, message, count, clock, pairs, figures, inliers)
     return _onto_surface(source, pairs, inliers, fit, cloud, figures, clock, options)
 
 
@@ -199,7 +199,8 @@ def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: Po
 
     The new placement's `local_from_sfm` is the old one followed by the move, both in the map's frame.
     """
-    assert structure.new_from_old is not None and structure.covariance is not None  # accepted
+    assert structure.new_from_old is not None
+    assert structure.covariance is not None  # accepted
     move, covariance = move_in_map_frame(feature_map, structure.new_from_old, structure.covariance, cloud)
     placement = Placement(
         method="lidar",
@@ -375,14 +376,13 @@ def _refused(
     pairs: Pairs | None = None,
     figures: dict[str, Any] | None = None,
     inliers: NDArray[np.bool_] | None = None,
-    sim: Sim3 | None = None,
 ) -> StructurePlacement:
     nothing = np.full(points, np.nan)
     none = np.zeros(0 if pairs is None else len(pairs), dtype=bool)
     return StructurePlacement(
         reason=reason,
         message=message,
-        new_from_old=sim,
+        new_from_old=None,
         covariance=None,
         pairs=pairs,
         inliers=none if inliers is None else inliers,

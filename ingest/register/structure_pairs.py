@@ -109,7 +109,8 @@ def _pairs_of_frame(
     options: PairOptions,
 ) -> Pairs:
     pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
-    assert pose is not None and covariance is not None  # accepted
+    assert pose is not None
+    assert covariance is not None  # accepted
     camera = registered.camera or feature_map.cameras[image.camera_id]
     width = min(options.render_width_px, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))

@@ -83,7 +83,7 @@ class GicpOutcome:
 
 
 def surface_near(cloud: PointCloud, points: FloatArray, options: SurfaceOptions) -> Surface | None:
-    """The part of the scan around points (n, 3), thinned by its levels of detail; None where there is none."""
+    """The scan around points (n, 3), thinned by its levels of detail; None where there is none."""
     low, high = points.min(axis=0) - options.margin_m, points.max(axis=0) + options.margin_m
     rows = _rows_inside(cloud, low, high, options.max_surface_points)
     if len(rows) < options.neighbours:
@@ -121,7 +121,7 @@ def _rows_inside(cloud: PointCloud, low: FloatArray, high: FloatArray, limit: in
         )
         xy = cloud.xyz[rows, :2]
         rows = rows[((xy >= low[:2]) & (xy <= high[:2])).all(axis=1)]
-        if taken and total + len(rows) > limit:
+        if total + len(rows) > limit:
             # A random part of the next level: better than to leave the surface half as dense as it may be.
             part = max(limit - total, 0)
             taken.append(np.random.default_rng(0).choice(rows, part, replace=False))

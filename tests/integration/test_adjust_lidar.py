@@ -1,0 +1,283 @@
+"""Adjustment by a scan: it mends a lens that a similarity cannot, and refuses what contradicts the photos."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap
+from ingest.precision import linearise
+from ingest.register.adjust_lidar import (
+    AdjustLidarOptions,
+    LidarAdjustment,
+    adjust_to_scan,
+    adjusted_map,
+)
+from ingest.register.block import Block, block_of_map, map_of_block
+from ingest.register.scan_block import Control, Planes, Sigmas, solve
+from ingest.register.structure import StructurePlacement, placed_map, project_structure
+from ingest.register.structure_pairs import RegisteredImage
+from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
+
+pytest.importorskip("numba")
+pytest.importorskip("small_gicp")
+
+_LONG = 1.15  # how much longer the wrong lens is
+
+
+@pytest.fixture(scope="module")
+def world() -> ScannedMap:
+    return scanned_map()
+
+
+@pytest.fixture(scope="module")
+def wrong_lens(world: ScannedMap) -> ScannedMap:
+    """The same map with a focal length 15 % too long, as nadir photos let it: adjusted without a scan.
+
+    Heights and camera heights stretch with the focal length; the reprojection errors hardly tell.
+    """
+    truth = block_of_map(world.feature_map).moved(world.back)
+    middle = np.array([1.0, 1.0, _LONG])
+    stretched = replace(
+        truth,
+        cameras=(CAMERA.with_focal(CAMERA.focal_px * _LONG),),
+        cam_from_block=tuple(
+            Rigid3(rotation=p.rotation, translation=-p.rotation @ (p.center * middle))
+            for p in truth.cam_from_block
+        ),
+        xyz=truth.xyz * middle,
+    )
+    nothing = Control(xyz=np.zeros((0, 3)), photo_of=np.zeros(0, np.int64), xy=np.zeros((0, 2)))
+    free = Planes(offset=np.full(len(truth.xyz), np.nan), normals=np.zeros((len(truth.xyz), 3)))
+    sigmas = Sigmas(
+        track_px=0.5, control_px=1.0, surface_m=1.0, focal_rel=1e-6, center_rel=1e-6, distortion=0.1
+    )
+    settled = solve(stretched, nothing, free, stretched.cameras, sigmas, 30).moved(world.back.inverse())
+    wrong = map_of_block(
+        world.feature_map, settled, FRAME, world.feature_map.placement, world.feature_map.height_datum
+    )
+    return replace_map(world, wrong)
+
+
+def replace_map(world: ScannedMap, feature_map: FeatureMap) -> ScannedMap:
+    return replace(world, feature_map=feature_map)
+
+
+def _registered_by_its_lens(world: ScannedMap, image: int, seed: int) -> RegisteredImage:
+    """A frame registered through the map's wrong lens: its pose is the one that fits its correspondences."""
+    frame = world.registered(image, correspondences=150, seed=seed)
+    lens, found = world.feature_map.cameras[0], frame.registration
+    pose, none = found.cam_from_local, np.zeros(len(found.pixels), np.int64)
+    assert pose is not None
+    for _ in range(20):
+        linear = linearise(
+            (lens,), none[:1], [pose], found.points_local, np.arange(len(none)), none, found.pixels
+        )
+        jacobian = linear.by_pose.reshape(-1, 6)
+        pose = Rigid3.exp(np.linalg.lstsq(jacobian, linear.residual.ravel(), rcond=None)[0]) @ pose
+    return replace(frame, registration=replace(found, cam_from_local=pose))
+
+
+def _heights_off(feature_map: FeatureMap, world: ScannedMap) -> FloatArray:
+    return np.array(
+        [
+            i.cam_from_local.center[2] - p.center[2]
+            for i, p in zip(feature_map.images, world.true_poses, strict=True)
+        ]
+    )
+
+
+def _adjusted(world: ScannedMap, frames: tuple[int, ...]) -> tuple[StructurePlacement, LidarAdjustment]:
+    registered = [_registered_by_its_lens(world, k, seed) for seed, k in enumerate(frames)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    assert structure.accepted, structure.message
+    return structure, adjust_to_scan(world.feature_map, structure, registered, world.cloud)
+
+
+def test_the_fixture_is_as_treacherous_as_it_says(wrong_lens: ScannedMap) -> None:
+    block = block_of_map(wrong_lens.feature_map)
+    residual = linearise(
+        block.cameras,
+        block.camera_of,
+        block.cam_from_block,
+        block.xyz,
+        block.point_of,
+        block.photo_of,
+        block.xy,
+    ).residual
+    assert np.median(np.linalg.norm(residual, axis=1)) < 1.0
+
+
+@pytest.mark.parametrize("frames", [(4,), (0, 4, 8)])
+def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]) -> None:
+    structure, adjustment = _adjusted(wrong_lens, frames)
+    assert adjustment.accepted, adjustment.message
+    by_similarity = placed_map(wrong_lens.feature_map, structure, wrong_lens.cloud)
+    by_scan = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    # The similarity lays the points on the ground and leaves the cameras metres too high.
+    assert np.abs(_heights_off(by_similarity, wrong_lens)).min() > 3.0
+    assert np.abs(_heights_off(by_scan, wrong_lens)).max() < 0.5
+    assert by_scan.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.01)
+    seen = np.unique(by_scan.observations.point_index)
+    errors = np.linalg.norm(by_scan.points_local(FRAME) - wrong_lens.true_points, axis=1)[seen]
+    assert np.median(errors) < 0.06
+    after = adjustment.figures["after"]
+    assert after["reprojection_median_px"] < 1.0
+    assert after["surface_median_m"] < adjustment.figures["before"]["surface_median_m"]
+
+
+def test_the_adjusted_map_keeps_what_is_not_geometry(wrong_lens: ScannedMap) -> None:
+    _, adjustment = _adjusted(wrong_lens, (4,))
+    before = wrong_lens.feature_map
+    after = adjusted_map(before, adjustment, wrong_lens.cloud)
+    assert after.map_id == before.map_id
+    assert after.frame == before.frame
+    assert after.height_datum == wrong_lens.cloud.height_datum
+    assert after.placement.method == "lidar"
+    assert [i.sha256 for i in after.images] == [i.sha256 for i in before.images]
+    assert np.array_equal(after.observations.xy, before.observations.xy)
+
+
+def test_a_right_lens_stays(world: ScannedMap) -> None:
+    _, adjustment = _adjusted(world, (0, 4, 8))
+    assert adjustment.accepted, adjustment.message
+    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    assert after.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.005)
+    for image, pose in zip(after.images, world.true_poses, strict=True):
+        assert np.linalg.norm(image.cam_from_local.center - pose.center) < 0.3
+
+
+def test_frames_without_correspondences_count_by_their_pairs(world: ScannedMap) -> None:
+    registered = [world.registered(k) for k in (0, 4, 8)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    adjustment = adjust_to_scan(world.feature_map, structure, registered, world.cloud)
+    assert adjustment.accepted, adjustment.message
+    assert adjustment.figures["control"] == int(structure.inliers.sum())
+
+
+def test_too_little_control_is_refused(world: ScannedMap) -> None:
+    registered = [world.registered(4, correspondences=20)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    assert adjust_to_scan(world.feature_map, structure, registered, world.cloud).reason == "NO_CONTROL"
+
+
+def test_no_scan_under_the_map_is_refused(world: ScannedMap) -> None:
+    registered = [world.registered(4, correspondences=150)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    away = plain_cloud(world.cloud.xyz + np.array([900.0, 0.0, 0.0]))
+    assert adjust_to_scan(world.feature_map, structure, registered, away).reason == "NO_SCAN"
+
+
+def test_a_scan_that_contradicts_the_photos_is_refused(world: ScannedMap) -> None:
+    """A scan twice as rugged as the ground, and a lens that may not change to make up for it."""
+    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    rugged = np.array([1.0, 1.0, 2.0])
+    high = [
+        replace(r, registration=replace(r.registration, points_local=r.registration.points_local * rugged))
+        for r in registered
+    ]
+    options = AdjustLidarOptions(reach_m=5.0, focal_rel=1e-6, center_rel=1e-6, distortion=1e-6)
+    scan = plain_cloud(world.cloud.xyz.astype(np.float64) * rugged)
+    adjustment = adjust_to_scan(world.feature_map, structure, high, scan, options)
+    assert adjustment.reason == "REPROJECTION"
+    assert adjustment.block is None
+
+
+def test_an_adjustment_that_does_not_gain_is_refused(world: ScannedMap) -> None:
+    """Control that pulls the map off the scan: correspondences all 2 m too high."""
+    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    high = [
+        replace(
+            r,
+            registration=replace(
+                r.registration, points_local=r.registration.points_local + np.array([0.0, 0.0, 2.0])
+            ),
+        )
+        for r in registered
+    ]
+    options = AdjustLidarOptions(reach_m=5.0, min_surface_m=5.0)
+    assert adjust_to_scan(world.feature_map, structure, high, world.cloud, options).reason == "SURFACE"
+
+
+def test_a_lens_that_folds_is_refused(world: ScannedMap) -> None:
+    """A barrel so strong that the polynomial turns back inside the picture."""
+    folding = Camera(model="RADIAL", width=1200, height=900, params=(1000.0, 600.0, 450.0, -0.9, 0.0))
+    assert folding.tan_of_fold < 0.75  # the corner is at 0.75
+    bad = replace(world.feature_map, cameras=(folding,))
+    registered = [world.registered(4, correspondences=150)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    options = AdjustLidarOptions(distortion=1e-6, focal_rel=1e-6, center_rel=1e-6, rounds=1, steps=1)
+    assert adjust_to_scan(bad, structure, registered, world.cloud, options).reason == "LENS"
+
+
+def test_the_solver_against_a_dense_one() -> None:
+    """One undamped step of the Schur complement is the least-squares step of the whole system."""
+    rng = np.random.default_rng(0)
+    small = scanned_map(points=40, seed=1)
+    block = block_of_map(small.feature_map).moved(small.back)
+    block = replace(block, xyz=block.xyz + rng.normal(0, 0.02, block.xyz.shape))
+    control = small.registered(4, correspondences=30).registration
+    seen = Control(xyz=control.points_local, photo_of=np.full(len(control.pixels), 4), xy=control.pixels)
+    planes = Planes(
+        offset=rng.normal(0, 0.02, len(block.xyz)), normals=np.tile([0.0, 0.0, 1.0], (len(block.xyz), 1))
+    )
+    # So wide that all Cauchy weights are 1 and the system is quadratic.
+    sigmas = Sigmas(
+        track_px=1e3, control_px=1e3, surface_m=1e2, focal_rel=10.0, center_rel=10.0, distortion=1e2
+    )
+    solved = solve(block, seen, planes, block.cameras, sigmas, 40)
+    assert _cost(solved, seen, planes, block, sigmas) < _cost(block, seen, planes, block, sigmas)
+    # At the optimum no direction lowers the cost: central differences over poses, points and lens.
+    for attempt in range(12):
+        step = rng.normal(0, 1, 3) * 2e-3
+        row = int(rng.integers(len(block.xyz)))
+        moved = solved.xyz.copy()
+        moved[row] += step
+        other = replace(solved, xyz=moved)
+        if attempt % 2:
+            photo = int(rng.integers(9))
+            poses = list(solved.cam_from_block)
+            poses[photo] = Rigid3.exp(np.concatenate([step * 1e-2, step])) @ poses[photo]
+            other = replace(solved, cam_from_block=tuple(poses))
+        assert _cost(other, seen, planes, block, sigmas) >= _cost(solved, seen, planes, block, sigmas)
+
+
+def _cost(block: Block, control: Control, planes: Planes, start: Block, sigmas: Sigmas) -> float:
+    """The objective written out, independently of the solver's Jacobians."""
+    total = 0.0
+    for camera_points, pixels, sigma in (
+        (
+            [
+                block.cam_from_block[p].act(block.xyz[i])
+                for i, p in zip(block.point_of, block.photo_of, strict=True)
+            ],
+            block.xy,
+            sigmas.track_px,
+        ),
+        (
+            [block.cam_from_block[p].act(x) for x, p in zip(control.xyz, control.photo_of, strict=True)],
+            control.xy,
+            sigmas.control_px,
+        ),
+    ):
+        residual = (pixels - block.cameras[0].project(np.array(camera_points))) / sigma
+        total += float(np.log1p((residual**2).sum(axis=1)).sum())
+    offset = planes.offset + (planes.normals * (block.xyz - start.xyz)).sum(axis=1)
+    total += float(np.log1p((offset / sigmas.surface_m) ** 2).sum())
+    a, b = np.array(block.cameras[0].params), np.array(start.cameras[0].params)
+    widths = np.array(
+        [sigmas.focal_rel * b[0], *[sigmas.center_rel * 1200] * 2, sigmas.distortion, sigmas.distortion]
+    )
+    return total + float((((a - b) / widths) ** 2).sum())
+
+
+def test_the_placement_s_similarity_is_next_to_the_truth(world: ScannedMap) -> None:
+    _, adjustment = _adjusted(world, (0, 4, 8))
+    after = adjusted_map(world.feature_map, adjustment, world.cloud)
+    assert np.abs(Sim3.log(after.placement.local_from_sfm)[:4]).max() < 0.01
