@@ -93,8 +93,12 @@ def _best(views: FrameViews, prior: FramePrior, clock: "_Clock") -> _Judged | No
     judged: list[_Judged] = []
     for start in _starts(views, prior, clock):
         judged.append(_polished(views, start, clock))
-        sure = judged[-1].confirmation.log_nfa >= options.sure_confirmation_log_nfa
-        if judged[-1].confirmation.confirmed and (sure or start.log_nfa >= options.decisive_log_nfa):
+        confirmation = judged[-1].confirmation
+        # Decisive features stand alone where the pictures have too little to compare.
+        silent = confirmation.pieces < options.verdict.min_confirmation_pieces
+        if start.log_nfa >= options.decisive_log_nfa and (confirmation.confirmed or silent):
+            return judged[-1]
+        if confirmation.confirmed and confirmation.log_nfa >= options.sure_confirmation_log_nfa:
             return judged[-1]
     return max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
 
@@ -223,6 +227,7 @@ def _evidence(
         candidates=found.candidates,
         log_nfa=found.log_nfa,
         confirmed=confirmation.confirmed,
+        confirmation_pieces=confirmation.pieces,
         confirmation_log_nfa=confirmation.log_nfa,
         confirmation_message=confirmation.message,
         cells=cells,

@@ -21,6 +21,8 @@ class VerdictOptions:
         min_inliers: fewer independent inliers are never believed.
         min_agreement: smallest share of the parts of the photo where the scan should be seen that hold inliers.
         min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
+        min_log_nfa_alone: features with that much evidence among their unguided matches need no confirmation
+            where the pictures have fewer than `min_confirmation_pieces` pieces to compare.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
         max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
             axes together. Generous: people and devices understate their errors.
@@ -33,6 +35,8 @@ class VerdictOptions:
     min_inliers: int = 20
     min_agreement: float = 0.2
     min_cells: int = 6
+    min_log_nfa_alone: float = 60.0
+    min_confirmation_pieces: int = 25
     rival_share: float = 0.5
     max_prior_sigmas: float = 6.0
     max_position_sigma_share: float = 0.05
@@ -46,7 +50,7 @@ class FrameEvidence:
     Attributes:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them, see VerdictOptions.
-        confirmed, confirmation_log_nfa, confirmation_message: see ingest.register.confirmation.
+        confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message: see ingest.register.confirmation.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
@@ -58,6 +62,7 @@ class FrameEvidence:
     candidates: int
     log_nfa: float
     confirmed: bool
+    confirmation_pieces: int
     confirmation_log_nfa: float
     confirmation_message: str
     cells: int
@@ -73,7 +78,9 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     e, o = evidence, options
     if e.inliers < o.min_inliers:
         return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {o.min_inliers} needed"
-    if not e.confirmed:
+    # Pictures that show too little of the scan to be asked contradict nothing; decisive features need no help.
+    silent = e.confirmation_pieces < o.min_confirmation_pieces and e.log_nfa >= o.min_log_nfa_alone
+    if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
