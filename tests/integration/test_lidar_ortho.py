@@ -200,6 +200,16 @@ def test_fine_images_are_averaged_to_the_scan(tmp_path: Path) -> None:
     assert sharp.std() > 2 * rgb.std() + 15
 
 
+def test_large_images_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    utm = points()
+    ortho = open_ortho(write(tmp_path / "o.tif", picture()))
+    whole = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    monkeypatch.setattr("featuredb.lidar.ortho._MAX_READ_PX", 5000)
+    parts = colour_by_ortho(utm, EPSG, None, ortho, FINE)
+    np.testing.assert_array_equal(parts[1], whole[1])
+    np.testing.assert_allclose(parts[0].astype(int), whole[0], atol=1)
+
+
 def test_unusable_images_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.tif").write_text("no image")
     with pytest.raises(ScanFileError, match="GDAL reads"):

@@ -1,6 +1,7 @@
 """Scan and ortho image of a world as files, and the ortho image against the painted ground."""
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import rasterio
 from numpy.typing import NDArray
 
 from featuredb.cli import simworld as command
-from featuredb.errors import GeodesyError, InvalidValueError
+from featuredb.errors import GeodesyError, InvalidValueError, MissingExtraError
 from featuredb.geo.crs import scan_crs
 from featuredb.geo.wkt import utm_wkt
 from featuredb.lidar.geotiff import write_geotiff
@@ -213,6 +214,14 @@ def test_writers_refuse_what_they_cannot_write(tmp_path: Path, town: Scene) -> N
     las = laspy.read(tmp_path / "c.las")
     assert las.header.point_format.id == 7
     np.testing.assert_array_equal(np.stack([las.red, las.green, las.blue], axis=1) >> 8, rgb)
+
+
+@pytest.mark.parametrize("package", ["laspy", "lazrs", "rasterio"])
+def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match=rf"{package}.*featuredb\[lidar\]"):
+        write_scan_world(tmp_path / "w", OPTIONS)
+    assert not (tmp_path / "w").exists()
 
 
 def test_the_command_writes_scan_and_ortho(
