@@ -160,29 +160,22 @@ def _mark_spread(problem: Problem, state: State, covariance: FloatArray) -> Floa
 
 
 def similarity_of_change(block: Block) -> FloatArray:
-    """(7, 6 k): the best similarity of a change of poses, from each camera's centre and what it looks at.
+    """(7, 6 k): the best similarity of a change of poses, from what becomes of each centre and orientation.
 
-    The second point keeps it well defined where all cameras lie on a line.
+    A turn counts by how far it moves what the camera looks at; so the similarity is well defined even where
+    all cameras lie on a line.
     """
     k = len(block.names)
-    rows = np.zeros((7, 6 * k))
-    jacobians, movers = [], []
-    depth = _depths(block)
-    for photo, pose in enumerate(block.cam_from_block):
-        for distance in (0.0, depth[photo]):
-            in_camera = np.array([0.0, 0.0, distance])
-            place = pose.rotation.T @ (in_camera - pose.translation)
-            jacobians.append(point_jacobian(place))
-            # cam_from_local becomes exp(omega, nu) cam_from_local: the place moves by the inverse.
-            x, y, z = in_camera
-            cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            movers.append((photo, -pose.rotation.T @ np.hstack([-cross, np.eye(3)])))
-    stacked = np.array(jacobians)
-    middle = stacked.reshape(-1, 7)
-    inverse = np.linalg.pinv(middle.T @ middle, rcond=1e-14)
-    for jacobian, (photo, mover) in zip(jacobians, movers, strict=True):
-        rows[:, 6 * photo : 6 * photo + 6] += inverse @ jacobian.T @ mover
-    return rows
+    wanted, given = np.zeros((6 * k, 7)), np.zeros((6 * k, 6 * k))
+    for photo, (pose, depth) in enumerate(zip(block.cam_from_block, _depths(block), strict=True)):
+        rows = slice(6 * photo, 6 * photo + 3)
+        turns = slice(6 * photo + 3, 6 * photo + 6)
+        # cam_from_local becomes exp(omega, nu) cam_from_local: centre and axes move by the inverse.
+        wanted[rows] = point_jacobian(pose.center)
+        given[rows, 6 * photo + 3 : 6 * photo + 6] = -pose.rotation.T
+        wanted[turns, 1:4] = depth * np.eye(3)
+        given[turns, 6 * photo : 6 * photo + 3] = -depth * pose.rotation.T
+    return np.asarray(np.linalg.lstsq(wanted, given, rcond=None)[0])
 
 
 def _depths(block: Block) -> FloatArray:

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control import Control
 from ingest.register.control_adjust import Adjusted
 from ingest.register.control_test import Outcome, leave_one_out, mark_linear
 from ingest.register.gcp_file import Mark
-from ingest.register.rays import intersect
 
 _SAME_TARGET_PX = 10.0  # a mark that near to where another point shows is that point's target
 
@@ -71,14 +69,13 @@ def residuals_of(
     """All residuals, those of what was left out included."""
     points = tuple(_point(adjusted, control, outcome, p) for p in range(len(control.names)))
     linear = mark_linear(adjusted, control)
-    # A point that took no part is judged by where its own marks meet, its marks by where it was surveyed.
-    places = np.array([p.found_m if p.used else _surveyed_place(p) for p in points])
+    places = np.array([p.found_m for p in points])
     marks = tuple(
         _mark(
             adjusted,
             control,
             row,
-            linear.residual[row] if outcome.weights.points[control.point_of[row]] else None,
+            linear.residual[row],
             bool(outcome.weights.marks[row]),
             places,
         )
@@ -87,20 +84,12 @@ def residuals_of(
     return points, marks
 
 
-def _surveyed_place(point: PointResidual) -> FloatArray:
-    """The surveyed position, at the height where its marks meet if its own is unknown."""
-    place = np.array(point.surveyed_m)
-    place[2] = place[2] if np.isfinite(place[2]) else point.found_m[2]
-    return place
-
-
 def _point(adjusted: Adjusted, control: Control, outcome: Outcome, point: int) -> PointResidual:
     weights = outcome.weights
     rows = control.marks_of(point)
     used = bool(weights.points[point])
-    found = (
-        adjusted.control_xyz[point] if used else _met(adjusted, control, rows, adjusted.control_xyz[point])
-    )
+    located = bool(weights.marks[rows].any())
+    found = adjusted.control_xyz[point] if located else np.full(3, np.nan)
     residual = control.surveyed[point] - found
     single = np.array(residual)
     remark = ""
@@ -128,21 +117,11 @@ def _point(adjusted: Adjusted, control: Control, outcome: Outcome, point: int) -
     )
 
 
-def _met(adjusted: Adjusted, control: Control, rows: NDArray[np.int64], start: FloatArray) -> FloatArray:
-    """Where the marks of a point that took no part meet; where it was at the start if they do not."""
-    if len(rows) >= 2:
-        index = rows
-        xyz = intersect(adjusted.block, control.photo_of[index], control.xy[index], 1.0)
-        if xyz is not None:
-            return xyz
-    return start
-
-
 def _mark(
     adjusted: Adjusted,
     control: Control,
     row: int,
-    residual: FloatArray | None,
+    residual: FloatArray,
     used: bool,
     places: FloatArray,
 ) -> MarkResidual:
@@ -151,14 +130,18 @@ def _mark(
     shown = np.full((len(places), 2), np.nan)
     in_front = np.isfinite(places).all(axis=1)
     shown[in_front] = camera.project(pose.act(places[in_front]))
-    rest = control.xy[row] - shown[point] if residual is None else np.asarray(residual)
     remark = ""
-    if not used and residual is not None:
+    if not used and np.isfinite(places[point]).all():
         remark = (
-            f"mark of {mark.point} in {mark.photo} (line {mark.line}) is {np.hypot(*rest):.0f} px off: "
+            f"mark of {mark.point} in {mark.photo} (line {mark.line}) is {np.hypot(*residual):.0f} px off: "
             + _likely(control, row, shown)
         )
-    return MarkResidual(mark=mark, residual_px=rest, used=used, remark=remark)
+    return MarkResidual(
+        mark=mark,
+        residual_px=residual if np.isfinite(places[point]).all() else np.full(2, np.nan),
+        used=used,
+        remark=remark,
+    )
 
 
 def _likely(control: Control, row: int, shown: FloatArray) -> str:

@@ -27,7 +27,8 @@ class Weights:
 
     Attributes:
         mark_px: of a mark's pixel coordinate. control_m: (3,) of a surveyed coordinate.
-        marks: (m,) bool, points: (n,) bool: those that take part; a point that does not has no marks.
+        marks: (m,) bool: those that take part.
+        points: (n,) bool: those whose surveyed coordinates take part; the others only tie photos together.
         ground_m: (n,) of a point's height as the block's ground has it, for points that one photo shows;
             infinity for the others, whose marks say more.
     """
@@ -196,8 +197,9 @@ def _control_equations(problem: Problem, state: State, size: int) -> tuple[spars
     ground = offset + 3 * np.arange(len(state.control)) + 2
     diagonal[ground] += 1.0 / problem.weights.ground_m**2
     gradient[ground] += (problem.start.control - state.control)[:, 2] / problem.weights.ground_m**2
-    # Points that take no part have no equation at all: they stay where they are.
-    idle = np.repeat(~problem.weights.points, 3)
+    # Points without marks have no equation at all: they stay where they are.
+    marked = np.isin(np.arange(len(state.control)), problem.control.point_of[problem.weights.marks])
+    idle = np.repeat(~marked, 3)
     diagonal[offset:][idle] = 1.0
     total = sparse.csr_array(normal) + sparse.diags_array(diagonal)
     if problem.vertical is not None:

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
 from featuredb.geometry.arrays import FloatArray
@@ -31,6 +32,8 @@ class TestOptions:
 
     Attributes:
         significance: chance of naming a good observation as wrong, over the whole file.
+        readmission: chance above which a point that was left out comes back; well above the former, so
+            that none goes back and forth.
         min_mark_px: marks nearer than that are not called wrong: people mark to one to three pixels.
         min_point_m: the same for points; better surveys are rare.
         max_mark_px: marks within that take part from the start.
@@ -41,6 +44,7 @@ class TestOptions:
     """
 
     significance: float = 0.01
+    readmission: float = 0.05
     min_mark_px: float = 5.0
     min_point_m: float = 0.05
     max_mark_px: float = 12.0
@@ -88,7 +92,7 @@ def initial_weights(
         )
         near |= np.isin(rows, hypothesis.marks)
         points[point] = inlier
-        marks[rows] = near & inlier
+        marks[rows] = near
         if near.sum() == 1:
             center = placed.cam_from_block[int(control.photo_of[rows[near][0]])].center
             ground[point] = options.ground_share * float(np.linalg.norm(xyz[point] - center))
@@ -189,23 +193,41 @@ def _tested(
     """The weights without the worst contradiction; marks that turn out to fit come back."""
     linear = mark_linear(adjusted, control)
     errors = np.linalg.norm(linear.residual, axis=1)
-    back = ~weights.marks & weights.points[control.point_of] & (errors <= options.min_mark_px)
-    if back.any():
-        return replace(weights, marks=weights.marks | back)
+    located = np.isin(np.arange(len(weights.points)), control.point_of[weights.marks])
+    back = ~weights.marks & located[control.point_of] & (errors <= options.min_mark_px)
+    points_back = located & ~weights.points & _fitting(adjusted, control, weights, freedom, options)
+    if back.any() or points_back.any():
+        return replace(weights, marks=weights.marks | back, points=weights.points | points_back)
     worst_mark = _worst_mark(adjusted, control, weights, linear, options)
     if worst_mark is not None:
         marks = weights.marks.copy()
         marks[worst_mark] = False
         points = weights.points.copy()
         point = control.point_of[worst_mark]
-        points[point] = marks[control.marks_of(int(point))].any()
+        points[point] &= marks[control.marks_of(int(point))].any()
         return replace(weights, marks=marks, points=points)
     worst_point = _worst_point(adjusted, control, weights, freedom, options)
     if worst_point is not None:
         points = weights.points.copy()
         points[worst_point] = False
-        return replace(weights, points=points, marks=weights.marks & points[control.point_of])
+        return replace(weights, points=points)
     return weights
+
+
+def _fitting(
+    adjusted: Adjusted, control: Control, weights: Weights, freedom: float, options: TestOptions
+) -> NDArray[np.bool_]:
+    """(n,) points that fit the others well, whether they took part or not."""
+    fitting = np.zeros(len(control.names), dtype=bool)
+    for point in range(len(control.names)):
+        known = np.isfinite(control.surveyed[point])
+        rest = (control.surveyed[point] - adjusted.control_xyz[point])[known]
+        spread = adjusted.control_covariance(point)[np.ix_(known, known)]
+        statistic = float(rest @ np.linalg.solve(np.diag(weights.control_m[known] ** 2) + spread, rest))
+        axes = int(known.sum())
+        chance = float(f_distribution.sf(statistic / axes, axes, max(freedom, 1.0)))
+        fitting[point] = chance > options.readmission or np.linalg.norm(rest) <= options.min_point_m
+    return fitting
 
 
 def _worst_mark(

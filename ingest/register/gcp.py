@@ -38,8 +38,12 @@ GcpReason = Literal[
     "DEGENERATE_LINE",
     "RESIDUALS",
     "SCALE",
+    "UPSIDE_DOWN",
     "CONTRADICTS_GPS",
 ]
+
+
+_STEEP = 0.5  # sine of 30 degrees: half the photos look up more steeply than photos of a place ever do
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -322,6 +326,14 @@ def _gate(
             reason="SCALE",
             message=f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} "
             "is needed: the control points are too close together for their accuracy",
+        )
+    looks_up = float(np.median([pose.rotation[2, 2] for pose in placement.block.cam_from_block]))
+    if looks_up > _STEEP:
+        return replace(
+            placement,
+            reason="UPSIDE_DOWN",
+            message="the control points put the cameras under the ground, looking up; x and y of the survey "
+            "are probably exchanged, or heights have the wrong sign",
         )
     if gps_local is not None and np.isfinite(gps_local[:, 0]).any():
         offset = np.nanmedian(gps_local[:, :2] - placement.block.centers()[:, :2], axis=0)
