@@ -27,7 +27,7 @@ from ingest.register.structure import StructurePlacement, move_in_map_frame
 from ingest.register.structure_pairs import RegisteredImage
 from ingest.register.surface_fit import Surface, SurfaceOptions, plane_distances, surface_near
 
-AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "REPROJECTION", "SURFACE", "LENS"]
+AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +49,11 @@ class AdjustLidarOptions:
         steps: of the solver in each round.
         settled_m: see above; far below a scan's noise.
         reach_m: a plane further from a point says nothing of it.
-        max_reprojection_growth: of the median reprojection error, or of half of `min_sigma_rel` where it is
-            smaller; more means that scan and photos contradict each other.
+        max_control_rel: median miss of the correspondences after the adjustment, as a share of the photo's
+            longer side: 8 pixels in 4000. Honest ones miss by about two; more means that frames, map and
+            scan contradict each other, and that robust weights have put the frames aside.
+        max_reprojection_growth: of the median reprojection error, or of `reprojection_floor_rel` of the
+            longer side where it is smaller (half a pixel in 4000).
         surface: the scan as planes; finer than for the similarity, since single points are moved.
     """
 
@@ -64,7 +67,9 @@ class AdjustLidarOptions:
     steps: int = 4
     settled_m: float = 1e-3
     reach_m: float = 1.0
+    max_control_rel: float = 0.002
     max_reprojection_growth: float = 0.1
+    reprojection_floor_rel: float = 0.000125
     surface: SurfaceOptions = field(default_factory=lambda: SurfaceOptions(max_surface_points=250_000))
 
 
@@ -292,8 +297,14 @@ def _gate(
     before, after = figures["before"], figures["after"]
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
+    allowed = options.max_control_rel * _longer_side(block)
+    if after["control_median_px"] > allowed:
+        return "CONTROL", (
+            f"the frames' correspondences still miss by {after['control_median_px']:.1f} pixels, at most "
+            f"{allowed:.1f} are believed"
+        )
     limit = (1.0 + options.max_reprojection_growth) * max(
-        before["reprojection_median_px"], 0.5 * options.min_sigma_rel * _longer_side(block)
+        before["reprojection_median_px"], options.reprojection_floor_rel * _longer_side(block)
     )
     if after["reprojection_median_px"] > limit:
         return "REPROJECTION", (

@@ -119,7 +119,7 @@ def surface_at(
     first = np.concatenate(
         [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
     )
-    shown = np.count_nonzero(rendering.index >= 0) / max(np.count_nonzero(rendering.valid), 1)
+    shown = (rendering.index >= 0).sum() / max(int(rendering.valid.sum()), 1)
     enough = (first.sum(axis=1) >= options.min_window_points) & (
         near.mean(axis=1) >= options.min_window_share * shown
     )

@@ -1,9 +1,10 @@
 """Sparse least squares of a block against a scan: what bundle adjustment libraries do not offer.
 
 pycolmap's adjustment knows positions of images and fixed points; it has no residual from a point to a
-surface. Here three kinds of residuals meet: the tracks' reprojection errors, scan points seen by registered frames
-(control), and distances of the map's points from the scan's planes. Levenberg-Marquardt with Cauchy weights;
-the points are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern synthesis, 6.1).
+surface. Here three kinds of residuals meet: the tracks' reprojection errors, scan points seen by registered
+frames (control), and distances of the map's points from the scan's planes. Levenberg-Marquardt with Cauchy
+weights; the points are eliminated by the Schur complement (Triggs et al., Bundle adjustment: a modern
+synthesis, 6.1).
 """
 
 from dataclasses import dataclass, replace
@@ -166,8 +167,8 @@ def _terms(
     cost = sum(float(np.log1p((r**2).sum(axis=1)).sum()) for _, r in weighted)
     return _Terms(
         cost=cost + float((prior_residual**2).sum()),
-        shared=sparse.vstack([shared[0], shared[1], no_shared, prior]).tocsr(),
-        by_point=sparse.vstack(by_point).tocsr(),
+        shared=sparse.csr_matrix(sparse.vstack([shared[0], shared[1], no_shared, prior])),
+        by_point=sparse.csr_matrix(sparse.vstack(by_point)),
         residual=residual,
     )
 

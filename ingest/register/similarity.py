@@ -149,7 +149,7 @@ def refine_similarity(start: Sim3, pairs: Pairs, options: SimilarityOptions) -> 
     more than its pose allows, and the inverse of the normal equations is an honest covariance. Pairs carry
     Geman-McClure weights at their robust spread; how far neighbours err alike dilutes them all.
     """
-    information = np.linalg.inv(pairs.covariance)
+    information: FloatArray = np.asarray(np.linalg.inv(pairs.covariance), dtype=np.float64)
     sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
     dilution = 1.0
     for _ in range(2):  # the dilution is known after the first

@@ -184,8 +184,19 @@ def test_a_scan_that_contradicts_the_photos_is_refused(world: ScannedMap) -> Non
     options = AdjustLidarOptions(reach_m=5.0, focal_rel=1e-6, center_rel=1e-6, distortion=1e-6)
     scan = plain_cloud(world.cloud.xyz.astype(np.float64) * rugged)
     adjustment = adjust_to_scan(world.feature_map, structure, high, scan, options)
-    assert adjustment.reason == "REPROJECTION"
+    assert adjustment.reason == "CONTROL"
     assert adjustment.block is None
+
+
+def test_bending_the_photos_to_the_scan_is_refused(world: ScannedMap) -> None:
+    """Waves that are not there, and tracks that are hardly trusted: the map bends, and its photos tell."""
+    registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
+    structure = project_structure(world.feature_map, registered, world.cloud)
+    xyz = world.cloud.xyz.astype(np.float64)
+    xyz[:, 2] += 0.4 * np.sin(xyz[:, 0] / 2.0) * np.sin(xyz[:, 1] / 2.0)
+    options = AdjustLidarOptions(min_sigma_rel=0.05)
+    adjustment = adjust_to_scan(world.feature_map, structure, registered, plain_cloud(xyz), options)
+    assert adjustment.reason == "REPROJECTION"
 
 
 def test_an_adjustment_that_does_not_gain_is_refused(world: ScannedMap) -> None:
@@ -201,7 +212,7 @@ def test_an_adjustment_that_does_not_gain_is_refused(world: ScannedMap) -> None:
         )
         for r in registered
     ]
-    options = AdjustLidarOptions(reach_m=5.0, min_surface_m=5.0)
+    options = AdjustLidarOptions(reach_m=5.0, min_surface_m=5.0, max_control_rel=1.0)
     assert adjust_to_scan(world.feature_map, structure, high, world.cloud, options).reason == "SURFACE"
 
 

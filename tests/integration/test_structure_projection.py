@@ -159,7 +159,7 @@ def test_too_few_points_on_the_scan_are_refused(world: ScannedMap) -> None:
 def test_pairs_on_a_strip_are_refused(world: ScannedMap) -> None:
     seen = world.feature_map.observations
     # Where x is zero the ground is level along y.
-    kept = np.abs(world.true_points[seen.point_index, 0]) < 0.8
+    kept = np.abs(world.true_points[seen.point_index, 0]) < 1.2
     strip = replace(
         world.feature_map,
         observations=replace(seen, **{name: getattr(seen, name)[kept] for name in seen.__dataclass_fields__}),
