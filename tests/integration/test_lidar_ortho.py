@@ -204,7 +204,7 @@ def test_large_images_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monk
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
     whole = colour_by_ortho(utm, EPSG, None, ortho, FINE)
-    monkeypatch.setattr("featuredb.lidar.ortho._MAX_READ_PX", 5000)
+    monkeypatch.setattr("featuredb.lidar.ortho_image._MAX_READ_PX", 5000)
     parts = colour_by_ortho(utm, EPSG, None, ortho, FINE)
     np.testing.assert_array_equal(parts[1], whole[1])
     np.testing.assert_allclose(parts[0].astype(int), whole[0], atol=1)
