@@ -24,15 +24,18 @@ LOCAL_FROM_BLOCK = Sim3(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SurveyedBlock:
-    """Attributes:
-    block: in a frame of its own; LOCAL_FROM_BLOCK is the truth.
-    control_local: (n, 3) true positions of the control points, local frame.
-    marks: pixels by (point, photo), with noise.
+    """A block whose true place is known.
+
+    Attributes:
+        block: in a frame of its own; local_from_block is the truth.
+        control_local: (n, 3) true positions of the control points, local frame.
+        marks: pixels by (point, photo), with noise.
     """
 
     block: Block
     control_local: FloatArray
     marks: Mapping[tuple[int, int], FloatArray]
+    local_from_block: Sim3 = LOCAL_FROM_BLOCK
 
     def control(
         self, surveyed: FloatArray, marks: Mapping[tuple[int, int], FloatArray] | None = None
