@@ -38,6 +38,7 @@ class OrthoOptions:
         flight_height_m: of the aerial photos over the town's origin.
         spacing_m: between aerial photos, both ways.
         margin_m: how far it reaches beyond the town.
+        shift_m: east, north: how far from its place it shows everything; real ones and real scans disagree.
         season: factors on red, green, blue of what is green.
         contrast, gamma: of the other camera and its processing.
         day: what differs from the day of the photos: sun, cars, leaves.
@@ -49,6 +50,7 @@ class OrthoOptions:
     flight_height_m: float = 1200.0
     spacing_m: float = 260.0
     margin_m: float = 30.0
+    shift_m: tuple[float, float] = (0.0, 0.0)
     season: tuple[float, float, float] = (1.18, 1.0, 0.80)
     contrast: float = 0.92
     gamma: float = 0.88
@@ -106,7 +108,11 @@ def make_ortho(scene: Scene, options: OrthoOptions = OrthoOptions()) -> Ortho:
         picture = _rectified(today, options, scene.enu_from_town @ station, ground[window], i)
         cv2.copyTo(picture, mine[window].view(np.uint8), rgb[window])
     return Ortho(
-        rgb=_developed(rgb, options), epsg=scene.epsg, west=west, north=north, pixel_m=options.pixel_m
+        rgb=_developed(rgb, options),
+        epsg=scene.epsg,
+        west=west + options.shift_m[0],
+        north=north + options.shift_m[1],
+        pixel_m=options.pixel_m,
     )
 
 
