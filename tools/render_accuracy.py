@@ -1,6 +1,6 @@
 """Rendered depth against ray-cast truth: how far off, where, and how many holes.
 
-    uv run python tools/render_accuracy.py [--density 8 50] [--seed 7] [--out FOLDER]
+    uv run python tools/render_accuracy.py [--density 8 25] [--seed 7] [--out FOLDER]
 
 A simulated town is sampled by casting rays: `density` per square metre straight down and, for the walls, an
 eighth of that from each of four sides, 40 degrees off the vertical; a random quarter of a four times denser
@@ -34,7 +34,9 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
-from featuredb.simworld.photograph import render_depth, render_view
+from featuredb.simworld.look import scene_look
+from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.raster import render as cast_rays
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import look_pose
 from featuredb.simworld.town import make_town
@@ -87,19 +89,15 @@ def _cast(
     camera = Camera.from_focal(side, side, SCAN_DISTANCE_M / step, model="SIMPLE_PINHOLE")
     pose = look_pose(np.zeros(3), heading, pitch)
     pose = Rigid3(rotation=pose.rotation, translation=np.array([0.0, 0.0, SCAN_DISTANCE_M]))
-    depth = render_depth(scene, camera, pose).depth
-    colour = render_view(scene, camera, pose, moment=seed_of_day(scene))
+    cast = cast_rays(scene.faces, scene.ellipsoids, camera, pose, look=scene_look(scene))
+    assert cast.rgb is not None
+    depth, colour = cast.depth, cast.rgb
     x, y = pixel_rays(camera)
     kept = np.isfinite(depth) & (rng.random(depth.shape) < 0.25)
     z = depth[kept].astype(np.float64)
     points = pose.inverse().act(np.column_stack([x[kept] * z, y[kept] * z, z]))
     inside = in_town(scene, points)
     return points[inside], colour[kept][inside]
-
-
-def seed_of_day(scene: Scene) -> int:
-    """Moving cars of this moment are in the colours, not in the depths; any moment will do."""
-    return scene.seed
 
 
 def in_town(scene: Scene, points: FloatArray) -> NDArray[np.bool_]:
@@ -183,8 +181,13 @@ def measure(scene: Scene, cloud: PointCloud, out: Path | None, options: RenderOp
             comparison, error = compare(scene, tree, reach_m, rendering)
             parts.append(comparison)
             if out is not None and k == 0:
-                path = out / f"{name.replace(' ', '_')}_{len(cloud)}.png"
-                cv2.imwrite(str(path), error_picture(rendering, error))
+                path = out / f"{name.replace(' ', '_')}_{len(cloud) // 1000}k.jpg"
+                cv2.imwrite(
+                    str(path),
+                    cv2.resize(
+                        error_picture(rendering, error), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
+                    ),
+                )
         both = Comparison(
             error=np.concatenate([p.error for p in parts]),
             edge=np.concatenate([p.edge for p in parts]),
@@ -196,7 +199,7 @@ def measure(scene: Scene, cloud: PointCloud, out: Path | None, options: RenderOp
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument(
-        "--density", type=float, nargs="+", default=[8.0, 50.0], help="rays per m2 from above"
+        "--density", type=float, nargs="+", default=[8.0, 25.0], help="rays per m2 from above"
     )
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--out", type=Path, help="folder for pictures")
