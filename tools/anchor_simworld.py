@@ -1,0 +1,146 @@
+"""The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
+
+    python -m tools.anchor_simworld [--size short|full] [--seed N] [--ortho] [--work DIR]
+
+1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
+   intensities only, an ortho image of another day, and the same of another town at the same place.
+2. `featuredb ingest photos` places the map by GPS; `featuredb lidar add` adds the scan, coloured by --ortho.
+3. `featuredb anchor --auto` places the map on the scan of the other town, which it must refuse, and then on
+   its own.
+4. The map's cameras and the held-out queries are compared with the truth, before and after.
+
+Exit code 0 if the map was placed, and the other town's scan was refused.
+"""
+
+import argparse
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.simworld.scan_world import ScanWorld, make_scan_world
+from featuredb.simworld.scoring import PoseError, pose_error
+from featuredb.simworld.truth import Truth
+from featuredb.store import Database
+from reloc.client import Client
+from reloc.service.options import ServeOptions
+from reloc.service.serve import start_server
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        world = make_scan_world(work / f"world-{args.size}-{args.seed}", args.seed, args.size, args.workers)
+        mapped = work / f"mapped-{args.size}-{args.seed}"
+        if not mapped.exists():
+            _featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
+        refused = _anchored(work, mapped, world, args.ortho, other=True)[1]
+        database, placed = _anchored(work, mapped, world, args.ortho, other=False)
+        queries = world.world.images("queries") if args.queries else []
+        say = sys.stdout.write
+        say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
+        for name, path in (("placed by GPS", mapped), ("placed by the scan", database)):
+            _tell(name, Database.open(path), world.world.truth, queries)
+    return 0 if placed and not refused else 1
+
+
+def _anchored(work: Path, mapped: Path, world: ScanWorld, ortho: bool, *, other: bool) -> tuple[Path, bool]:
+    """A copy of the database with one of the scans, anchored; and whether the map was placed."""
+    database = work / f"anchored-{'other' if other else 'own'}-{'ortho' if ortho else 'intensity'}"
+    shutil.rmtree(database, ignore_errors=True)
+    shutil.copytree(mapped, database)
+    scan, image = (world.other_scan, world.other_ortho) if other else (world.scan, world.ortho)
+    coloured = ("--ortho", str(image)) if ortho else ()
+    _featuredb("lidar", "add", str(database), str(scan), *coloured)
+    map_id = Database.open(database).snapshot().maps()[0].map_id
+    photos, out = world.world.folder / "drone", work / f"{database.name}-report"
+    words = ("anchor", str(database), map_id, "--photos", str(photos), "--out", str(out), "--auto", "--quiet")
+    return database, _featuredb(*words, may_refuse=True) == 0
+
+
+def _tell(name: str, database: Database, truth: Truth, queries: Sequence[Path]) -> None:
+    snapshot = database.snapshot()
+    feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
+    metres, degrees = camera_errors(feature_map, truth)
+    sys.stdout.write(
+        f"{name}: cameras of the map median {np.median(metres):.3f} m, {np.median(degrees):.3f} degrees; "
+        f"worst {metres.max():.3f} m\n"
+    )
+    if not queries:
+        return
+    errors = _ask(database, truth, queries)
+    if errors:
+        position = np.array([e.position_m for e in errors])
+        angle = np.array([e.angle_deg for e in errors])
+        sys.stdout.write(
+            f"{name}: {len(errors)} of {len(queries)} queries answered, median {np.median(position):.3f} m, "
+            f"{np.median(angle):.3f} degrees; worst {position.max():.3f} m\n"
+        )
+
+
+def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, FloatArray]:
+    """Metres and degrees between the map's images and the truth."""
+    truth_from_map = truth.frame.enu_from(feature_map.frame)
+    metres, degrees = [], []
+    for image in feature_map.images:
+        true = truth.images[f"drone/{image.name}"].cam_from_local
+        pose = image.cam_from_local @ truth_from_map.inverse()
+        metres.append(float(np.linalg.norm(pose.center - true.center)))
+        degrees.append(pose.angle_to_deg(true))
+    return np.array(metres), np.array(degrees)
+
+
+def _ask(database: Database, truth: Truth, queries: Sequence[Path]) -> list[PoseError]:
+    errors = []
+    with (
+        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
+        Client(server.endpoints[0]) as client,
+    ):
+        for path in queries:
+            reply = client.localise(path, timeout_s=60.0)
+            if reply.utm is not None:
+                utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
+                name = f"queries/{path.name}"
+                errors.append(pose_error(truth, name, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw))
+    return errors
+
+
+def _featuredb(*words: str, may_refuse: bool = False) -> int:
+    """Run a command of featuredb and show what it says; 1 is an answer where it may refuse."""
+    sys.stdout.write(f"$ featuredb {' '.join(words)}\n")
+    sys.stdout.flush()
+    done = subprocess.run(
+        [sys.executable, "-m", "featuredb.cli", *words],
+        cwd=_ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    sys.stdout.write(done.stdout)
+    if done.returncode != 0 and not (may_refuse and done.returncode == 1):
+        raise SystemExit(f"exit code {done.returncode}\n{done.stderr}")
+    return done.returncode
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--size", choices=("short", "full"), default="short")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--ortho", action="store_true", help="colour the scan by the ortho image")
+    parser.add_argument("--queries", action=argparse.BooleanOptionalAction, default=True)
+    parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
+    parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
