@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from featuredb.store import Database
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
+from schemas import load_schema
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, write_hill_photos
 from tests.support.hill_scan import EPSG, write_hill_scan
 from tests.support.maps import random_map
@@ -120,6 +122,7 @@ def test_auto_places_the_map_on_the_scan(
     assert Database.open(database).snapshot().get(child.map_id).status == "active"
 
     document = json.loads((out / "anchor.json").read_text())
+    jsonschema.validate(document, load_schema("ingest/anchor"))
     assert document["placement"]["reason"] is None
     assert any(name.startswith("(B)") for name in document["times_s"])
     assert any(name.startswith("(C)") for name in document["times_s"])
@@ -184,6 +187,7 @@ def test_a_scan_of_another_place_moves_nothing(
     assert Database.open(database).poll_version() == version
     assert only_map(database).placement.method == "gps"
     document = json.loads((out / "anchor.json").read_text())
+    jsonschema.validate(document, load_schema("ingest/anchor"))
     assert document["placement"]["reason"] == "NO_FRAME"
     assert document["frames"]
     assert all(frame["reason"] for frame in document["frames"])
