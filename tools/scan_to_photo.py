@@ -1,9 +1,9 @@
 """Poses of photos by registering each one directly to a coloured scan, by dense correspondences.
 
-What tools/scan_poses.py runs. It shares no code with the map, anchoring or localisation: laspy reads the scan,
-PROJ makes the topocentric frame, numpy rasters and renders, OpenCV matches and solves. The first pose comes
-from SIFT between the photo and a nadir raster of the scan; then the scan is rendered from that pose, tracked
-into the photo at thousands of places, and all photos' poses are estimated together with one camera.
+What tools/scan_poses.py runs. It shares no code with the map, anchoring or localisation: laspy reads the
+scan, PROJ makes the topocentric frame, numpy rasters and renders, OpenCV matches and solves. The first pose
+comes from SIFT between the photo and a nadir raster of the scan; then the scan is rendered from that pose,
+tracked into the photo at thousands of places, and all photos' poses are estimated together with one camera.
 """
 
 from dataclasses import dataclass, field, replace
@@ -118,7 +118,7 @@ class Frame:
 
 
 def nadir_raster(scan: Scan) -> tuple[NDArray[np.uint8], Floats, Floats]:
-    """Picture, heights (NaN where empty) and south-west corner of the scan's top seen from above, north up."""
+    """The scan from above, north up: picture, heights (NaN where empty) and the south-west corner."""
     low = scan.xyz.min(axis=0)
     column, row = ((scan.xyz[:, :2] - low[:2]) / RASTER_M).astype(np.int64).T
     shape = (int(row.max()) + 1, int(column.max()) + 1)
@@ -208,7 +208,7 @@ def render(scan: Scan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDA
     offsets = [(i, j) for i in range(-radius, radius + 1) for j in range(-radius, radius + 1)]
     offsets.sort(key=lambda o: -(o[0] ** 2 + o[1] ** 2))  # a point's own pixel wins over its neighbours'
     for dy, dx in offsets:
-        column, row = (projected[rows].round().astype(np.int64) + (dx, dy)).T
+        column, row = (projected[rows].round().astype(np.int64) + np.array([dx, dy])).T
         ok = (column >= 0) & (column < lens.width) & (row >= 0) & (row < lens.height)
         layer = np.full(index.shape, np.inf)
         layer_index = np.full(index.shape, -1, np.int64)
@@ -295,7 +295,7 @@ def adjust(
 
 
 def _linearise(photo: Photo, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:
-    """Residuals (n, 2) photo minus projection, and the projections' Jacobian (2n, 13): pose, then the lens' values."""
+    """Photo minus projection (n, 2), and the projection's Jacobian (2n, 13) by pose and `Lens.values`."""
     projected, j = cv2.projectPoints(photo.world, pose[:3], pose[3:], lens.matrix(), lens.distortion())
     jacobian = np.column_stack([j[:, :6], j[:, 6] + j[:, 7], j[:, 8:10], j[:, 10:14]])
     return photo.pixels - projected[:, 0], jacobian
