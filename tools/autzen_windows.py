@@ -175,7 +175,8 @@ def _measured_offset(place: Place) -> Floats:
     for name, rows, columns in [*parts, ("whole", slice(0, h), slice(0, w))]:
         found, height = _best_shift(ortho[rows, columns], scan[rows, columns], ok[rows, columns])
         print(f"offset, {name}: columns {found[0]:+.1f}, rows {found[1]:+.1f}, correlation {height:.3f}")
-    return place.on_ground(found[None])[0] - place.on_ground(np.zeros((1, 2)))[0]
+    offset: Floats = place.on_ground(found[None])[0] - place.on_ground(np.zeros((1, 2)))[0]
+    return offset
 
 
 def _best_shift(a: NDArray[Any], b: NDArray[Any], ok: NDArray[np.bool_]) -> tuple[Floats, float]:
@@ -230,8 +231,8 @@ def _photos(
     for c, r in spots[::3]:
         yield "mirrored", c, r, np.ascontiguousarray(place.gray[r : r + _SIZE, c : c + _SIZE][:, ::-1])
     for c, r in spots[1::3]:
-        # The picture of one end with the prior at the other: 600 pixels are 183 m.
-        far = ((c + 650) % (w - _SIZE), (r + 600) % (h - _SIZE))
+        # The picture of one end with the prior in the corner farthest from it, out of the search's reach.
+        far = (0 if 2 * c >= w - _SIZE else w - _SIZE, 0 if 2 * r >= h - _SIZE else h - _SIZE)
         yield "elsewhere", *far, place.gray[r : r + _SIZE, c : c + _SIZE]
     for i, path in enumerate(_foreign(folders, 8)):
         gray = decode_gray(path)
