@@ -368,6 +368,6 @@ def _with_frames(options: AnchorOptions, frames: int | None) -> AnchorOptions:
         return options
     return replace(
         options,
-        frames=replace(options.frames, frames=frames, max_tries=max(options.frames.max_tries, frames + 5)),
+        frames=replace(options.frames, frames=frames, max_tries=max(options.frames.max_tries, frames + 3)),
         min_agreeing=min(options.min_agreeing, frames),
     )
