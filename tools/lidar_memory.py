@@ -2,9 +2,10 @@
 
     python tools/lidar_memory.py --points 100_000_000 --folder /tmp/scan
 
-The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so that making
-it needs little memory, too. The command runs in a process of its own; the memory of that process and all its children
-(resident set) is sampled ten times a second, and the largest the kernel has seen of the process is asked for in the end.
+The scan is an airborne one of a rolling land with houses and trees, written strip by strip as LAS 1.4, so
+that making it needs little memory, too. The command runs in a process of its own; the memory of that process
+and all its children (resident set) is sampled ten times a second, and the largest the kernel has seen of the
+process is asked for in the end.
 """
 
 import argparse
@@ -54,7 +55,7 @@ def make_scan(path: Path, points: int, density: float, seed: int) -> None:
 def _surface(
     rng: np.random.Generator, east: np.ndarray, north: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Height, class and intensity: hills, a house on every second block of 40 m, trees, one in 20,000 astray."""
+    """Height, class and intensity: hills, a house on every second block of 40 m, trees, strays."""
     height = 40.0 + 8.0 * np.sin(east / 173.0) * np.cos(north / 131.0) + rng.normal(0.0, 0.02, len(east))
     label = np.full(len(east), 2, np.uint8)
     value = (120 + 40 * np.sin(east / 7.0) + rng.normal(0, 8, len(east))).clip(1, 255)
@@ -92,7 +93,7 @@ def tree_rss_bytes(root: int) -> int:
 
 
 def measure(command: list[str]) -> dict[str, float]:
-    """Run a command; wall and CPU seconds, peak of the tree by sampling, peak of the process by the kernel."""
+    """Run a command; wall and CPU seconds, peak memory of the tree and of the process."""
     started, peak = time.perf_counter(), 0
     process = subprocess.Popen(command, stdout=sys.stderr)
     done = threading.Event()

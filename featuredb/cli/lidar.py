@@ -118,7 +118,7 @@ def run_picture(args: argparse.Namespace) -> int:
 
 
 def summary(scan: ScanSummary, outcome: str) -> str:
-    """What a surveyor wants to check: counts, CRS, units, datum, bounds, density, classes, what was dropped."""
+    """What a surveyor wants to check: counts, CRS, units, datum, bounds, density, classes, losses."""
     row, box = scan.row, scan.box
     area_m2 = scan.points * scan.spacing_m**2
     lines = [("files", f"{len(row['files'])} with {scan.points_in_files:,} points")]

@@ -1,8 +1,9 @@
 """The coordinate system of a scan: what a file says, what a person says, and the way from there to UTM.
 
-Files state it as WKT, as GeoTIFF keys, wrongly, or not at all. Here it becomes a horizontal CRS, a height datum,
-and the unit of heights, each with the reason why it was taken so; what cannot be known is demanded, never
-guessed. Heights keep their datum (featuredb.geo.datum) and only change their unit, except where they are
+Files state it as WKT, as GeoTIFF keys, wrongly, or not at all. Here it becomes a horizontal CRS, a height
+datum, and the unit of heights, each with the reason why it was taken so; what cannot be known is demanded,
+never guessed. Heights keep their datum (featuredb.geo.datum) and only change their unit, except where they
+are
 ellipsoidal: those go with the horizontal coordinates to WGS84.
 
 X is easting or longitude and Y northing or latitude, as the LAS specification has it, whatever order of axes
@@ -40,9 +41,12 @@ _DATUM_NAMES: tuple[tuple[str, HeightDatum], ...] = (
     ("egm2008", "egm2008"),
     ("ellipsoid", "ellipsoidal"),
 )
-_DEMAND = "state the coordinate system by --crs, e.g. --crs EPSG:32612, or with the heights' own, --crs EPSG:6556+5703"
-# The area of use of a CRS is a box around countries and zones; surveys reach a little beyond. Three degrees are
-# half a UTM zone: what lies farther out was read with the wrong CRS or the wrong unit.
+_DEMAND = (
+    "state the coordinate system by --crs, e.g. --crs EPSG:32612, or with that of the heights, "
+    "--crs EPSG:6556+5703"
+)
+# The area of use of a CRS is a box around countries and zones; surveys reach a little beyond. Three degrees
+# are half a UTM zone: what lies farther out was read with the wrong CRS or the wrong unit.
 _AREA_MARGIN_DEG = 3.0
 
 
@@ -192,8 +196,8 @@ def scan_crs(
 def utm_transform(crs: ScanCrs, low: FloatArray, high: FloatArray, epsg: int | None = None) -> UtmTransform:
     """The transform of a scan with a box of file coordinates to UTM.
 
-    The zone is that of the box's centre unless given. Of the operations that PROJ knows between the datums and
-    has all files for, the one with the best stated accuracy at the place is taken, for all points alike.
+    The zone is that of the box's centre unless given. Of the operations that PROJ knows between the datums
+    and has all files for, the one with the best stated accuracy at the place is taken, for all points alike.
 
     Args:
         low, high: (3,) corners of the scan's box, file coordinates.
@@ -251,8 +255,8 @@ def _chosen_crs(
             return CRS.from_user_input(override), "--crs", []
         except CRSError as error:
             raise GeodesyError(
-                f"--crs: expected an EPSG code such as EPSG:2949 or EPSG:6556+5703, WKT or a PROJ string, found "
-                f"{override!r:.200} ({error})"
+                f"--crs: expected an EPSG code such as EPSG:2949 or EPSG:6556+5703, WKT or a PROJ string, "
+                f"found {override!r:.200} ({error})"
             ) from error
     if wkt is not None and wkt.strip():
         try:
@@ -275,8 +279,8 @@ def _check_axes(crs: CRS, source: str) -> None:
         and directions != {"north"}
     ):
         raise GeodesyError(
-            f"the CRS {crs.name!r} ({source}) counts towards {' and '.join(sorted(directions))}; scans are read "
-            "as easting and northing only: transform the file first"
+            f"the CRS {crs.name!r} ({source}) counts towards {' and '.join(sorted(directions))}; scans are "
+            "read as easting and northing only: transform the file first"
         )
 
 
@@ -295,7 +299,8 @@ def _height_unit(
         axis = vertical.axis_info[0]
         if axis.direction.lower() == "down":
             raise GeodesyError(
-                f"the vertical CRS {vertical.name!r} counts depths downwards; expected heights: transform the file"
+                f"the vertical CRS {vertical.name!r} counts depths downwards; expected heights: "
+                "transform the file"
             )
         return axis.unit_name, axis.unit_conversion_factor, f"unit of the vertical CRS {vertical.name}"
     code = (geo_keys or {}).get(4099)
@@ -304,11 +309,13 @@ def _height_unit(
         return name, metres, "the file's GeoTIFF key of vertical units"
     axis = crs.axis_info[0]
     if crs.is_projected and axis.unit_conversion_factor != 1.0:
-        # LAStools, PDAL's reader and the surveyors' habit agree: what names no vertical CRS has one unit throughout.
+        # LAStools, PDAL's reader and the surveyors' habit agree: what names no vertical CRS has one unit
+        # throughout.
         return (
             axis.unit_name,
             axis.unit_conversion_factor,
-            "no vertical CRS is named: taken to be the horizontal unit; --height-unit m, ft or us-ft says otherwise",
+            "no vertical CRS is named: taken to be the horizontal unit; "
+            "--height-unit m, ft or us-ft says otherwise",
         )
     return "metre", 1.0, "no vertical CRS is named: taken to be metres; --height-unit says otherwise"
 
@@ -342,14 +349,14 @@ def _name(crs: CRS) -> str:
 def _geographic_box(
     crs: ScanCrs, source: CRS, low: FloatArray, high: FloatArray
 ) -> tuple[float, float, float, float]:
-    """West, south, east, north in degrees of a scan's box; within decametres, which is enough to choose by."""
+    """West, south, east, north in degrees of a scan's box, roughly; it is only for choosing by."""
     if source.is_geocentric:
         radius = float(np.linalg.norm((np.asarray(low) + np.asarray(high)) / 2.0))
         if not 6.3e6 < radius < 6.5e6:
             raise GeodesyError(
                 f"the CRS {crs.name!r} ({crs.source}) is geocentric, but the coordinates from "
-                f"{_numbers(low)} to {_numbers(high)} lie {radius / 1e3:,.0f} km from the Earth's centre, expected "
-                f"6,350 to 6,400: it is not the CRS of these points; {_DEMAND}"
+                f"{_numbers(low)} to {_numbers(high)} lie {radius / 1e3:,.0f} km from the Earth's centre, "
+                f"expected 6,350 to 6,400: it is not the CRS of these points; {_DEMAND}"
             )
     corners = np.array(
         [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
@@ -398,8 +405,8 @@ def _check_area(
     where = f"latitude {latitude:.4f}, longitude {longitude:.4f}"
     if beyond > _AREA_MARGIN_DEG:
         raise GeodesyError(
-            f"with the CRS {name} the scan would lie at {where}, {beyond:.1f} degrees outside the area that the "
-            f"CRS is for ({area.name}); {_DEMAND}"
+            f"with the CRS {name} the scan would lie at {where}, {beyond:.1f} degrees outside the area "
+            f"that the CRS is for ({area.name}); {_DEMAND}"
         )
     if beyond > 0.0:
         return (f"{where} lies {beyond:.2f} degrees outside the area that {name} is for ({area.name})",)

@@ -103,8 +103,8 @@ def _own_projection(keys: GeoKeys, demand: str) -> CRS:
     projection, geodetic = keys.get(_PROJECTION), _geodetic(keys)
     if axes is None or geodetic is None or projection not in (1, 8, 11):
         raise GeodesyError(
-            f"the file's GeoTIFF keys define a projection of their own that is not understood: {_shown(keys)}; "
-            f"{demand}"
+            f"the file's GeoTIFF keys define a projection of their own that is not understood: "
+            f"{_shown(keys)}; {demand}"
         )
     conversion: CoordinateOperation
     if projection == 1:

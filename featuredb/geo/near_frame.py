@@ -1,8 +1,8 @@
 """UTM to a local frame for millions of points: polynomials that stand in for PROJ where they are as good.
 
-Over some kilometres the way from UTM to a topocentric frame is a smooth function that polynomials of degree two or
-three follow to fractions of a millimetre, forty times faster. They are fitted to exact values and checked on others;
-where they are not good enough the exact way is taken.
+Over some kilometres the way from UTM to a topocentric frame is a smooth function that polynomials of degree
+two or three follow to fractions of a millimetre, forty times faster. They are fitted to exact values and
+checked on others; where they are not good enough the exact way is taken.
 """
 
 import numpy as np

@@ -1,7 +1,8 @@
-"""A scan from files into the database, in bounded memory: read and sort by tile, then tile by tile, then publish.
+"""A scan from files into the database, in bounded memory: sort by tile, clean tile by tile, publish.
 
-Everything before the last step happens in a work folder. A job that was killed goes on there: what is finished is
-not done again. Files that are wrong in any way are found in the first step, which leaves nothing behind.
+Everything before the last step happens in a work folder. A job that was killed goes on there: what is
+finished is not done again. Files that are wrong in any way are found in the first step, which leaves nothing
+behind.
 """
 
 import json
@@ -218,7 +219,7 @@ def _read_all(
 
 
 def _colour_bits(largest: int) -> int:
-    """8 or 16 for the range that a file's colours use, 0 for none: some formats have the field and leave it black."""
+    """8 or 16 for the range that a file's colours use, 0 for none: many leave the fields black."""
     return 0 if largest <= 0 else 8 if largest <= _LARGEST_8_BIT else 16
 
 

@@ -71,7 +71,7 @@ def _without_outliers(
     outliers: OutlierOptions | None,
     colouring: Colouring | None,
 ) -> tuple[NDArray[Any], int, int]:
-    """Points of a block, then those around it that colouring needs; how many are the block's; outliers dropped."""
+    """Points of a block and then around it; how many are the block's; how many outliers it had."""
     reach_m = 0.0 if outliers is None else outliers.margin_m(plan.spacing_m)
     colour_m = 0.0 if colouring is None else colouring.options.margin_m
     around = np.empty(0, SPILLED)

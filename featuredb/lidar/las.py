@@ -1,6 +1,7 @@
-"""LAS 1.2 to 1.4, LAZ and COPC files: what the header says, and the points, chunk by chunk. The home of laspy.
+"""LAS 1.2 to 1.4, LAZ and COPC files: what the header says, and the points by chunks. The home of laspy.
 
-A file is read as a stream, so its size does not matter. Whatever is wrong with it becomes a `ScanFileError` that
+A file is read as a stream, so its size does not matter. Whatever is wrong with it becomes a `ScanFileError`
+that
 names the file: what was expected, what was found, what to do.
 """
 
@@ -24,6 +25,8 @@ NOISE_CLASSES = (7, 18)  # ASPRS: low noise, high noise
 _UNCLASSIFIED = 1
 _WKT_RECORD, _KEYS_RECORD = 2112, 34735
 _HASH_BYTES = 1 << 20
+_SHORTEST_HEADER, _HEADER_1_4 = 227, 375
+_RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60  # bytes of a VLR and an EVLR without their data
 # The longest coordinate that any CRS in metres or feet has, generously; beyond it scale or offset are broken.
 _LONGEST_COORDINATE = 1e9
 
@@ -88,7 +91,8 @@ def open_scan_file(path: Path) -> ScanFile:
     """Read a file's header, check it, and take its SHA-256.
 
     Raises:
-        ScanFileError: no such file, not LAS or LAZ, no points, truncated, or a header that contradicts itself.
+        ScanFileError: no such file, not LAS or LAZ, no points, truncated, or a header that contradicts
+            itself.
         MissingExtraError: laspy is not installed.
     """
     if not path.is_file():
@@ -145,13 +149,15 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
             points = _raw_points(chunk)
             if len(points) and not (np.abs(points.xyz) < _LONGEST_COORDINATE).all():
                 raise ScanFileError(
-                    f"{path}: expected coordinates below 1e9, found others after point {found}; the file is broken"
+                    f"{path}: expected coordinates below 1e9, found others after point {found}; "
+                    "the file is broken"
                 )
             found += len(points)
             yield points
     if found != expected:
         raise ScanFileError(
-            f"{path}: expected {expected} points by the header, found {found}; the file is truncated, fetch it again"
+            f"{path}: expected {expected} points by the header, found {found}; the file is truncated, "
+            "fetch it again"
         )
 
 
@@ -161,7 +167,8 @@ def _laspy() -> ModuleType:
         import lazrs  # noqa: F401  # laspy's reader of LAZ
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"Reading scans needs the package {error.name}, which is not installed: pip install 'featuredb[lidar]'"
+            f"Reading scans needs the package {error.name}, which is not installed: "
+            "pip install 'featuredb[lidar]'"
         ) from error
     module: ModuleType = laspy
     return module
@@ -191,16 +198,35 @@ def _check_magic(path: Path, size: int) -> None:
     if size == 0:
         raise ScanFileError(f"{path}: expected a LAS, LAZ or COPC file, found an empty file; fetch it again")
     with path.open("rb") as stream:
-        start = stream.read(227)
+        start = stream.read(_HEADER_1_4)
     if start[:4] != b"LASF":
         raise ScanFileError(
             f"{path}: expected a LAS, LAZ or COPC file, which begins with 'LASF', found {start[:4]!r}; "
             "convert it, e.g. with PDAL"
         )
-    if len(start) < 227:
+    if len(start) < _SHORTEST_HEADER:
         raise ScanFileError(
-            f"{path}: expected a header of at least 227 bytes, found {len(start)}; the file is truncated"
+            f"{path}: expected a header of at least {_SHORTEST_HEADER} bytes, found {len(start)}; "
+            "the file is truncated"
         )
+    _check_record_counts(path, start, size)
+
+
+def _check_record_counts(path: Path, start: bytes, size: int) -> None:
+    """Records that the header counts must have room in the file, or reading them would not end."""
+    header_size, points_at, records = struct.unpack_from("<HII", start, 94)
+    if header_size + records * _RECORD_HEADER > points_at or points_at > size:
+        raise ScanFileError(
+            f"{path}: expected {records} records between byte {header_size} and the points at "
+            f"byte {points_at} of {size}; the header is broken or the file truncated, fetch it again"
+        )
+    if start[24:26] == b"\x01\x04" and len(start) >= _HEADER_1_4:
+        extended_at, extended = struct.unpack_from("<QI", start, 235)
+        if extended and extended_at + extended * _EXTENDED_RECORD_HEADER > size:
+            raise ScanFileError(
+                f"{path}: expected {extended} extended records from byte {extended_at} on, found a file "
+                f"of {size} bytes; the file is truncated, fetch it again"
+            )
 
 
 def _check_header(path: Path, header: Any, size: int) -> None:
@@ -210,8 +236,8 @@ def _check_header(path: Path, header: Any, size: int) -> None:
     scales, offsets = np.array(header.scales), np.array(header.offsets)
     if not (np.isfinite([scales, offsets]).all() and (scales > 0).all()):
         raise ScanFileError(
-            f"{path}: expected positive scales and finite offsets, found {scales.tolist()} and {offsets.tolist()}; "
-            "the header is broken"
+            f"{path}: expected positive scales and finite offsets, found {scales.tolist()} and "
+            f"{offsets.tolist()}; the header is broken"
         )
     if not header.are_points_compressed:
         needed = header.offset_to_point_data + header.point_count * header.point_format.size

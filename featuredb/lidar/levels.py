@@ -1,7 +1,8 @@
 """Levels of detail of the store: which level and node a point goes to.
 
-The loops are those of featuredb.render.levels. The grid is the same for all scans and tiles: cells of level l have
-an edge of 4 m / 2^l and are counted from zero of UTM, so that pieces of a scan give what the whole would.
+The loops are those of featuredb.render.levels. The grid is the same for all scans and tiles: cells of level l
+have an edge of 4 m / 2^l and are counted from zero of UTM, so that pieces of a scan give what the whole
+would.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.render.compiled import compiled_module
 
-# The coarsest level has a point every 4 m: some 16,000 in a tile of flat land, small enough to load for kilometres.
+# The coarsest level has a point every 4 m: some 16,000 in a tile of flat land, small enough to load for
+# kilometres.
 COARSEST_SPACING_M = 4.0
 FINEST_LEVEL = 12  # 1 mm
 NODE_BITS = 5  # a node is a cube of 2^5 cells of its level, as featuredb.render.levels has them
@@ -53,7 +55,8 @@ def order_by_level(utm: FloatArray, finest: int) -> LevelOrder:
     """
     loops: Any = compiled_module("featuredb.render.level_loops")
     cell_m = COARSEST_SPACING_M / 2.0**finest
-    # Nodes of level 0 are the largest cells of the grid: counting from their corners keeps the grid the same for all.
+    # Nodes of level 0 are the largest cells of the grid: counting from their corners keeps the grid the same
+    # for all.
     node_m = COARSEST_SPACING_M * 2**NODE_BITS
     origin = np.floor(utm.min(axis=0) / node_m) * node_m
     local = (utm - origin).astype(np.float32)

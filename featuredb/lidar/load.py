@@ -79,8 +79,8 @@ def load_cloud(
         scan_ids: the scans to load; None for all that are not retired.
 
     Returns:
-        The cloud, with levels as they are stored: level l has a point every 4 m / 2^l. Without any point where no
-        scan reaches into the box.
+        The cloud, with levels as they are stored: level l has a point every 4 m / 2^l. Without any point
+            where no scan reaches into the box.
 
     Raises:
         ScanNotFoundError: the database has no scan, or not one of those.
@@ -103,8 +103,8 @@ def load_cloud(
         if total > options.largest_points:
             if level == 0:
                 raise ScanError(
-                    f"expected at most {options.largest_points} points, found {total} in the coarsest level alone; "
-                    "ask for a smaller area"
+                    f"expected at most {options.largest_points} points, found {total} in the coarsest level "
+                    "alone; ask for a smaller area"
                 )
             break
         for scan in touched:
@@ -179,7 +179,7 @@ def _cloud(frame: LocalFrame, datum: str, parts: Sequence[_Part], rgb: bool, int
 
 
 def _bytes(parts: Sequence[_Part], names: Sequence[str]) -> NDArray[np.uint8]:
-    """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity's or a middle grey."""
+    """Columns of all parts as (n, columns) uint8; where a point has no value, its intensity or a grey."""
     values = np.empty((sum(len(part.utm) for part in parts), len(names)), np.uint8)
     for axis, name in enumerate(names):
         row = 0

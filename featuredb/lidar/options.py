@@ -30,8 +30,8 @@ class AddOptions:
     height_datum: str | None = None
     epsg: int | None = None
     outliers: OutlierOptions | None = field(default_factory=OutlierOptions)
-    # Specular glints and the darkest returns are a few per thousand to a percent of airborne scans, and spread
-    # over most of the raw range; one percent at each end leaves the contrast to the rest.
+    # Specular glints and the darkest returns are a few per thousand to a percent of airborne scans, and
+    # spread over most of the raw range; one percent at each end leaves the contrast to the rest.
     intensity_low_percent: float = 1.0
     intensity_high_percent: float = 99.0
     # About 400 bytes per point at the peak (neighbour search): a million are 0.4 GB.

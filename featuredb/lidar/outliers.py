@@ -1,4 +1,4 @@
-"""Statistical outlier removal: points that are much farther from their neighbours than those are from theirs."""
+"""Statistical outlier removal: points much farther from their neighbours than those are from theirs."""
 
 from dataclasses import dataclass
 from typing import Any

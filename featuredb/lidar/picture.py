@@ -20,7 +20,8 @@ _LIGHT = np.array([-0.5, 0.5, 0.7071])  # from the north-west, 45 degrees up, as
 
 
 def write_plan_view(database: Database, scan: ScanSummary, path: Path) -> None:
-    """Write a PNG of a scan: its colours, else its intensities, else shaded heights; north up, with a scale bar.
+    """Write a PNG of a scan: its colours, else its intensities, else shaded heights; north up, with a scale
+    bar.
 
     Raises:
         ScanError: the file cannot be written.

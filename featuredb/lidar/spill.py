@@ -1,7 +1,9 @@
-"""First pass over a scan: its points in UTM, sorted into temporary files by tile, and what one pass can count.
+"""First pass over a scan: its points in UTM, sorted into temporary files by tile, and what one pass can
+count.
 
-Tiles with too many points for the memory are split into quarters until each piece, a `Block`, is small enough. Edges
-of blocks are edges of the store's tiles halved again and again, and so never cut a voxel of the levels of detail.
+Tiles with too many points for the memory are split into quarters until each piece, a `Block`, is small
+enough. Edges of blocks are edges of the store's tiles halved again and again, and so never cut a voxel of the
+levels of detail.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -161,8 +163,8 @@ class Spill:
     def spacing_m(self) -> float:
         """Typical distance between neighbouring points in plan: the root of the area that one point has.
 
-        The area is that of the smallest plan cells, 2 m or larger by powers of two, that hold eight points on average:
-        holes and surroundings without points do not count.
+        The area is that of the smallest plan cells, 2 m or larger by powers of two, that hold eight points on
+        average: holes and surroundings without points do not count.
         """
         points = sum(self._tiles.values())
         cells, edge = self._occupied, _CELL_M

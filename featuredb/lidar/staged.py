@@ -122,8 +122,8 @@ class Staged:
         points, outliers = sum(f["points"] for f in facts), sum(f["outliers"] for f in facts)
         if points == 0:
             raise ScanError(
-                f"expected points that have neighbours, found {outliers} that are all outliers; add the scan with "
-                "--keep-outliers if they are meant"
+                f"expected points that have neighbours, found {outliers} that are all outliers; add the scan "
+                "with --keep-outliers if they are meant"
             )
         low = np.min([f["low"] for f in facts if f["low"]], axis=0)
         high = np.max([f["high"] for f in facts if f["high"]], axis=0)

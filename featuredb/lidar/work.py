@@ -1,4 +1,4 @@
-"""The folder of an unfinished job: one process at a time, kept when killed, gone when finished or hopeless."""
+"""The folder of an unfinished job: for one process, kept when killed, gone when finished or hopeless."""
 
 import json
 import os

@@ -1,7 +1,8 @@
 """The LiDAR scans of a database: tables `lidar` and `lidar_points`, in the manner of `maps` and its children.
 
-Points are written first, under a fresh `write_id`, tile by tile; the row in `lidar` that names it is written last,
-by compare-and-swap. A database without these tables has no scans; the first one makes them. Scans have versions of
+Points are written first, under a fresh `write_id`, tile by tile; the row in `lidar` that names it is written
+last, by compare-and-swap. A database without these tables has no scans; the first one makes them. Scans have
+versions of
 their own: a rollback of maps leaves them alone.
 """
 
@@ -175,8 +176,8 @@ def commit_scan(
     if written != row["points"]:
         raise StoreError(f"scan {row['scan_id']}: expected {row['points']} points, {written} were written")
     full = {
-        **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason": "",
-        "created_at": datetime.now(UTC),
+        **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason":
+        "", "created_at": datetime.now(UTC),
     }  # fmt: skip
     winner = retry_stale(f"commit of scan {row['scan_id']}", lambda: _add_row(database, full))
     return winner == write_id, winner
@@ -306,7 +307,7 @@ def _live(rows: Iterable[Row], scan_id: str) -> Row | None:
 
 
 def _add_row(database: Database, row: Row) -> str:
-    """Add the row unless the scan is visible; a retired row of the same id gives way. Returns the write id."""
+    """Add the row unless the scan is visible; a retired one gives way. Returns the visible write id."""
     table = database.table(LIDAR)
     rows = read_rows(table)
     visible = _live(rows, row["scan_id"])

@@ -2,8 +2,8 @@
 
 `maps` has one row per map and decides what is visible. The child tables hold the rows of images, points and
 observations; each row names the `write_id` of the commit attempt that wrote it, and counts only when a row of
-`maps` names that `write_id`. `lidar` and `lidar_points` hold scans in the same way, and are made when the first
-scan is added. See docs/store.md.
+`maps` names that `write_id`. `lidar` and `lidar_points` hold scans in the same way, and are made when the
+first scan is added. See docs/store.md.
 """
 
 from dataclasses import dataclass

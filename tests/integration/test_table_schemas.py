@@ -5,13 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema
+import numpy as np
 import pytest
 from deltalake import DeltaTable
 
+from featuredb.lidar.add import add_scan
 from featuredb.store import Database
-from featuredb.store.tables import TABLES
+from featuredb.store.tables import LIDAR_TABLES
+from featuredb.store.tables import TABLES as MAP_TABLES
 from schemas import load_schema, schema_names
+from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map
+
+TABLES = (*MAP_TABLES, *LIDAR_TABLES)
 
 
 @pytest.fixture(scope="module")
@@ -20,6 +26,9 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Database:
     database.commit_map(random_map(1))
     database.commit_map(random_map(2, points=0, images=0, parents=("map-1",)))
     database.retire("map-1", "test")
+    folder = tmp_path_factory.mktemp("scans")
+    add_scan(database, [write_scan(folder / "a.laz", grid_points(200), red=np.full(200, 9))])
+    add_scan(database, [write_scan(folder / "b.laz", grid_points(200), point_format=6)])
     return database
 
 

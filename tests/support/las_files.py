@@ -24,7 +24,7 @@ def grid_points(count: int = 3000, seed: int = 0, spacing: float = 0.5) -> NDArr
     east, north = np.divmod(np.arange(count), side)
     plan = np.stack([east, north], axis=1) * spacing + rng.uniform(-0.1, 0.1, (count, 2)) * spacing
     height = 100.0 + np.sin(plan[:, 0] / 9.0) + np.cos(plan[:, 1] / 7.0)
-    return np.column_stack([plan + [WEST, SOUTH], height])
+    return np.column_stack([plan + np.array([WEST, SOUTH]), height])
 
 
 def write_scan(

@@ -9,7 +9,8 @@ from featuredb.geo.crs import FOOT_M, US_SURVEY_FOOT_M, ScanCrs, scan_crs, utm_t
 from featuredb.geo.geotiff_keys import crs_of_geo_keys
 from featuredb.geo.utm import utm_from_geodetic
 
-# Oregon's Lambert conformal conic on NAD83(HARN) in international feet, as the Autzen scan has it, user-defined.
+# Oregon's Lambert conformal conic on NAD83(HARN) in international feet, as the Autzen scan has it, user-
+# defined.
 OREGON_FEET = (
     'PROJCS["NAD_1983_HARN_Lambert_Conformal_Conic",GEOGCS["GCS_North_American_1983_HARN",'
     'DATUM["NAD83_High_Accuracy_Regional_Network",SPHEROID["GRS_1980",6378137,298.257222101,'
@@ -21,8 +22,10 @@ OREGON_FEET = (
     'UNIT["foot",0.3048,AUTHORITY["EPSG","9002"]]]'
 )
 OREGON_KEYS: dict[int, int | float | str] = {
-    1024: 1, 1026: "NAD_1983_HARN_Lambert_Conformal_Conic|", 2048: 32767, 2050: 6152, 3072: 32767, 3074: 32767,
-    3075: 8, 3076: 9002, 3078: 43.0, 3079: 45.5, 3084: -120.5, 3085: 41.75, 3086: 1312335.958005249, 3087: 0.0,
+    1024: 1, 1026: "NAD_1983_HARN_Lambert_Conformal_Conic|", 2048: 32767, 2050: 6152, 3072: 32767, 3074:
+        32767,
+    3075: 8, 3076: 9002, 3078: 43.0, 3079: 45.5, 3084: -120.5, 3085: 41.75, 3086: 1312335.958005249, 3087:
+        0.0,
 }  # fmt: skip
 STADIUM = np.array([[637_450.0, 851_900.0, 420.0], [637_460.0, 851_950.0, 598.0]])
 
@@ -174,12 +177,18 @@ def test_what_names_no_place_is_refused(given: dict[str, object], message: str) 
 def test_coordinates_that_contradict_the_system_are_refused() -> None:
     geocentric = scan_crs(override="EPSG:4978")
     with pytest.raises(GeodesyError, match="4,945 km from the Earth's centre"):
-        utm_transform(geocentric, np.array([515_368.0, 4_918_340.0, 2_322.0]), np.array([515_401.0, 4_918_381.0, 2338.0]))
+        utm_transform(
+            geocentric,
+            np.array([515_368.0, 4_918_340.0, 2_322.0]),
+            np.array([515_401.0, 4_918_381.0, 2338.0]),
+        )
     elsewhere = np.array([5_000_000.0, 851_900.0, 0.0])  # metres of another country
     with pytest.raises(GeodesyError, match="outside the area"):
         utm_transform(scan_crs(override="EPSG:2949"), elsewhere, elsewhere)
     with pytest.raises(GeodesyError, match="--crs"):
-        utm_transform(scan_crs(override="EPSG:4326"), np.array([500_000.0, 5e6, 0.0]), np.array([500_001.0, 5e6, 0.0]))
+        utm_transform(
+            scan_crs(override="EPSG:4326"), np.array([500_000.0, 5e6, 0.0]), np.array([500_001.0, 5e6, 0.0])
+        )
 
 
 def test_keys_that_define_a_projection_make_that_of_the_wkt() -> None:
@@ -196,10 +205,23 @@ def test_keys_of_the_other_projections() -> None:
          3082: 1_000_000.0, 3083: 0.0}, ""
     )  # fmt: skip
     mercator = crs_of_geo_keys(
-        {3072: 32767, 2048: 4326, 3075: 1, 3076: 9001, 3080: 9.0, 3081: 0.0, 3082: 500_000.0, 3083: 0.0, 3092: 0.9996},
+        {
+            3072: 32767,
+            2048: 4326,
+            3075: 1,
+            3076: 9001,
+            3080: 9.0,
+            3081: 0.0,
+            3082: 500_000.0,
+            3083: 0.0,
+            3092: 0.9996,
+        },
         "",
     )
-    for made, code, point in ((albers, 3005, (885_022.0, 629_157.0)), (mercator, 32632, (512_345.0, 5_012_345.0))):
+    for made, code, point in (
+        (albers, 3005, (885_022.0, 629_157.0)),
+        (mercator, 32632, (512_345.0, 5_012_345.0)),
+    ):
         geographic = made.geodetic_crs
         ours = Transformer.from_crs(made, geographic, always_xy=True).transform(*point)
         theirs = Transformer.from_crs(code, geographic, always_xy=True).transform(*point)
@@ -208,13 +230,17 @@ def test_keys_of_the_other_projections() -> None:
 
 def test_keys_with_heights() -> None:
     assert scan_crs(geo_keys={3072: 3005, 4096: 5713}).vertical_name.startswith("CGVD28")
-    assert scan_crs(geo_keys={3072: 6556, 4096: 5103}).height_datum == "navd88"  # the datum's code for the CRS's
+    assert (
+        scan_crs(geo_keys={3072: 6556, 4096: 5103}).height_datum == "navd88"
+    )  # the datum's code for the CRS's
     in_feet = scan_crs(geo_keys={3072: 2949, 4099: 9003})
     assert in_feet.height_unit_m == pytest.approx(US_SURVEY_FOOT_M)
 
 
 def test_points_outside_the_projection_are_an_error_and_not_infinite() -> None:
     crs = scan_crs(override="EPSG:2949")
-    transform = utm_transform(crs, np.array([273_357.0, 5_274_357.0, 789.0]), np.array([273_642.0, 5_274_642.0, 829.0]))
+    transform = utm_transform(
+        crs, np.array([273_357.0, 5_274_357.0, 789.0]), np.array([273_642.0, 5_274_642.0, 829.0])
+    )
     with pytest.raises(GeodesyError, match="cannot express"):
         transform.apply(np.array([[1e9, 1e9, 0.0]]))

@@ -1,0 +1,529 @@
+"""Scans of every kind go into a database and come back; broken ones leave nothing."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from deltalake import DeltaTable
+from scipy.spatial import cKDTree
+
+from featuredb.cli.main import main
+from featuredb.errors import (
+    ConflictError,
+    FeatureDbError,
+    GeodesyError,
+    ScanError,
+    ScanFileError,
+    ScanNotFoundError,
+)
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.lidar.add import Progress, add_scan
+from featuredb.lidar.load import LoadOptions, load_cloud, scan_frame
+from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+from featuredb.lidar.work import work_folder
+from featuredb.store import Database
+from featuredb.store.maintenance import VacuumOptions, compact, vacuum
+from featuredb.store.scans import find_scan, list_scans, retire_scan
+from featuredb.store.sql import SqlSession
+from featuredb.store.verify import verify
+from tests.support.las_files import SOUTH, WEST, grid_points, write_scan
+
+OPTIONS = AddOptions()
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Database:
+    return Database(str(tmp_path / "scans.db"))
+
+
+def stored(database: Database) -> dict[str, np.ndarray]:
+    """All rows of lidar_points, read by deltalake itself, sorted by place."""
+    table = DeltaTable(f"{database.url}/lidar_points").to_pyarrow_table()
+    columns = {name: table[name].to_numpy() for name in table.column_names}
+    order = np.lexsort([columns["height"], columns["northing"], columns["easting"]])
+    return {name: values[order] for name, values in columns.items()}
+
+
+def sorted_rows(xyz: np.ndarray) -> np.ndarray:
+    return xyz[np.lexsort([xyz[:, 2], xyz[:, 1], xyz[:, 0]])]
+
+
+def folder_state(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("version", "point_format", "suffix"),
+    [("1.2", 0, ".las"), ("1.2", 3, ".laz"), ("1.3", 1, ".laz"), ("1.4", 6, ".las"), ("1.4", 8, ".laz")],
+)
+def test_all_versions_come_back_point_for_point(
+    database: Database, tmp_path: Path, version: str, point_format: int, suffix: str
+) -> None:
+    xyz = grid_points()
+    xyz[:, 0] -= 10.0  # across the edge between two tiles: 500 000 = 976.56 tiles, so move to one
+    xyz[:, 0] += np.ceil(WEST / 512.0) * 512.0 - WEST
+    path = write_scan(
+        tmp_path / f"scan{suffix}",
+        xyz,
+        version=version,
+        point_format=point_format,
+        intensity=np.arange(len(xyz)) % 1000,
+        classification=np.where(xyz[:, 2] > 100, 6, 2),
+    )
+    result = add_scan(database, [path])
+    assert result.created
+    found = stored(database)
+    utm = np.stack([found[name] for name in ("easting", "northing", "height")], axis=1)
+    with laspy.open(path) as reader:
+        las = reader.read()
+        expected = np.stack([las.x, las.y, las.z], axis=1)
+    np.testing.assert_allclose(utm, sorted_rows(expected), atol=1e-6)
+    assert len(set(found["tile"])) == 2
+    assert set(found["zone"]) == {32632}
+    assert result.scan.classes == {2: int((xyz[:, 2] <= 100).sum()), 6: int((xyz[:, 2] > 100).sum())}
+    assert result.scan.points == result.scan.points_in_files == len(xyz)
+    assert sum(result.scan.level_points) == len(xyz)
+    assert result.scan.has_intensity
+    assert not result.scan.colour  # formats with colours have them all zero here
+    assert verify(database).ok
+    assert not (Path(database.url) / "_work").exists()
+
+
+def test_colours_of_8_and_16_bits(database: Database, tmp_path: Path) -> None:
+    xyz = grid_points()
+    rng = np.random.default_rng(0)
+    rgb = rng.integers(0, 256, (len(xyz), 3))
+    for name, factor in (("narrow", 1), ("wide", 257)):
+        moved = xyz + np.array([0.0, 5000.0 * factor, 0.0])
+        path = write_scan(
+            tmp_path / f"{name}.laz",
+            moved,
+            red=rgb[:, 0] * factor,
+            green=rgb[:, 1] * factor,
+            blue=rgb[:, 2] * factor,
+        )
+        scan = add_scan(database, [path]).scan
+        assert scan.colour == "file"
+        cloud = load_cloud(database, scan_frame(scan), scan_ids=[scan.scan_id])
+        assert cloud.rgb is not None
+        assert cloud.intensity is None
+        local = scan_frame(scan).enu_from_utm(moved, 32632)
+        nearest = np.argmin(np.linalg.norm(cloud.xyz[:200, None] - local[None], axis=2), axis=1)
+        np.testing.assert_array_equal(cloud.rgb[:200], rgb[nearest])
+
+
+def test_without_colour_and_intensity_there_are_places_and_classes(
+    database: Database, tmp_path: Path
+) -> None:
+    xyz = grid_points()
+    scan = add_scan(database, [write_scan(tmp_path / "bare.laz", xyz, point_format=6)]).scan
+    cloud = load_cloud(database, scan_frame(scan))
+    assert cloud.rgb is None
+    assert cloud.intensity is None
+    assert (cloud.classification == 1).all()  # 0, never classified, is unclassified
+    assert len(cloud) == len(xyz)
+
+
+def test_noise_withheld_and_outliers_are_dropped_and_counted(database: Database, tmp_path: Path) -> None:
+    xyz = grid_points()
+    classes = np.full(len(xyz), 2)
+    classes[:30], classes[30:40] = 7, 18
+    withheld = np.zeros(len(xyz), np.uint8)
+    withheld[35:60] = 1
+    xyz[100, 2] += 50.0
+    path = write_scan(tmp_path / "noisy.laz", xyz, classification=classes, withheld=withheld)
+    scan = add_scan(database, [path]).scan
+    assert (scan.row["dropped_noise"], scan.row["dropped_withheld"], scan.row["dropped_outliers"]) == (
+        40,
+        20,
+        1,
+    )
+    assert scan.points == len(xyz) - 61
+    np.testing.assert_allclose(
+        np.sort(stored(database)["easting"]),
+        np.sort(np.delete(xyz, [*range(60), 100], axis=0)[:, 0]),
+        atol=6e-4,
+    )
+    kept = add_scan(database, [path], AddOptions(outliers=None)).scan
+    assert kept.points == len(xyz) - 60
+    everything = write_scan(tmp_path / "only.laz", xyz, classification=np.full(len(xyz), 7))
+    with pytest.raises(ScanError, match="3000 are classified as noise"):
+        add_scan(database, [everything])
+    assert len(list_scans(database)) == 2
+
+
+def test_adding_twice_changes_nothing(database: Database, tmp_path: Path) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points())
+    first = add_scan(database, [path])
+    state = folder_state(Path(database.url))
+    copy = Path(shutil.copy(path, tmp_path / "another name.laz"))
+    for files in ([path], [copy], [path, copy]):
+        again = add_scan(database, files)
+        assert not again.created
+        assert again.scan.scan_id == first.scan.scan_id
+    assert folder_state(Path(database.url)) == state
+    other = add_scan(database, [path], AddOptions(height_unit="ft"))
+    assert other.created
+    assert other.scan.scan_id != first.scan.scan_id
+
+
+def test_files_of_one_survey_become_one_scan(database: Database, tmp_path: Path) -> None:
+    xyz = grid_points(4000)
+    west = xyz[:, 0] < np.median(xyz[:, 0])
+    files = [
+        write_scan(tmp_path / "west.laz", xyz[west], red=np.full(west.sum(), 200)),
+        write_scan(tmp_path / "east.laz", xyz[~west], point_format=6),
+    ]
+    result = add_scan(database, files, labels=ScanLabels(name="both", licence="CC0", source="test"))
+    assert result.scan.points == 4000
+    assert (result.scan.name, result.scan.licence, result.scan.row["source"]) == ("both", "CC0", "test")
+    assert [f["points"] for f in result.scan.row["files"]] == [int(west.sum()), int((~west).sum())]
+    assert add_scan(database, files[::-1]).scan.scan_id == result.scan.scan_id
+    red = stored(database)["red"]
+    assert np.isnan(red).sum() == (~west).sum()  # one file has no colours: null, not black
+    assert set(red[~np.isnan(red)]) == {200.0}
+    cloud = load_cloud(database, scan_frame(result.scan))
+    assert cloud.rgb is not None
+    assert (cloud.rgb == 128).all(axis=1).sum() == (~west).sum()
+    datums = [files[0], write_scan(tmp_path / "navd.laz", xyz[~west], crs="EPSG:32632+5773")]
+    with pytest.raises(ScanError, match="two scans"):
+        add_scan(database, datums)
+
+
+def test_blocks_do_not_show_in_the_result(tmp_path: Path) -> None:
+    xyz = grid_points(12_000, 4, spacing=0.4)
+    xyz[5000, 2] += 9.0
+    path = write_scan(tmp_path / "a.laz", xyz, intensity=np.arange(len(xyz)) % 500)
+    whole = Database(str(tmp_path / "whole.db"))
+    pieces = Database(str(tmp_path / "pieces.db"))
+    one = add_scan(whole, [path]).scan
+    many = add_scan(pieces, [path], AddOptions(block_points=700, chunk_points=1000)).scan
+    assert one.scan_id == many.scan_id
+    a, b = stored(whole), stored(pieces)
+    for name in ("easting", "northing", "height", "intensity", "classification", "tile"):
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
+    # Blocks of 16 m and less cut the coarsest cells' neighbourhood, but no cell.
+    assert (a["level"] != b["level"]).mean() < 1e-3
+    assert one.row["points_checksum"] == many.row["points_checksum"]
+
+
+def test_a_job_that_was_stopped_goes_on(database: Database, tmp_path: Path) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points(6000))
+    options = AddOptions(block_points=800)
+    seen: list[Progress] = []
+
+    def stop_in_the_middle(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.step == "clean" and progress.done > 3000:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        add_scan(database, [path], options, on_progress=stop_in_the_middle)
+    assert list_scans(database) == []
+    work = Path(database.url) / "_work"
+    done = {p: p.stat().st_mtime_ns for p in work.rglob("*.npy")}
+    assert done
+    seen.clear()
+    left: dict[Path, int] = {}
+
+    def look(progress: Progress) -> None:
+        seen.append(progress)
+        if progress.step == "clean" and progress.done == progress.total:
+            left.update({p: p.stat().st_mtime_ns for p in work.rglob("*.npy")})
+
+    result = add_scan(database, [path], options, on_progress=look)
+    assert result.created
+    assert {p: left[p] for p in done} == done  # not done again
+    assert len(left) > len(done)
+    assert "read" not in {p.step for p in seen}
+    assert not work.exists()
+    assert verify(database).ok
+    fresh = Database(str(tmp_path / "fresh.db"))
+    assert add_scan(fresh, [path], options).scan.row["points_checksum"] == result.scan.row["points_checksum"]
+
+
+def test_one_process_at_a_time(database: Database, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    with (
+        work_folder(database, work, "job", 10),
+        pytest.raises(ConflictError, match="another process"),
+        work_folder(database, work, "job", 10),
+    ):
+        pass
+    with pytest.raises(ScanError, match="GB free"), work_folder(database, work, "big", 10**15):
+        pass
+    assert folder_state(work) == []
+
+
+def corrupt(data: bytes, at: int, value: bytes) -> bytes:
+    return data[:at] + value + data[at + len(value) :]
+
+
+BROKEN: dict[str, tuple[Callable[[bytes], bytes], str]] = {
+    "empty": (lambda data: b"", "empty file"),
+    "text": (lambda data: b"x,y,z\n1,2,3\n" * 40, "begins with 'LASF'"),
+    "header only in part": (lambda data: data[:100], "header of at least 227 bytes"),
+    "half": (lambda data: data[: len(data) // 2], "truncated"),
+    "last bytes gone": (lambda data: data[:-40], "truncated"),
+    "version 2.7": (lambda data: corrupt(data, 24, b"\x02\x07"), "truncated or broken|1.2 to 1.4"),
+    "scale zero": (lambda data: corrupt(data, 131, b"\x00" * 8), "positive scales"),
+    "offset NaN": (lambda data: corrupt(data, 155, np.float64(np.nan).tobytes()), "finite offsets"),
+    "a million records": (lambda data: corrupt(data, 100, b"\x40\x42\x0f\x00"), "1000000 records"),
+    "a million extended records": (
+        lambda data: corrupt(data, 243, b"\x40\x42\x0f\x00"), "1000000 extended records"
+    ),
+    "no points": (lambda data: corrupt(corrupt(data, 247, b"\x00" * 8), 107, b"\x00" * 4), "empty"),
+    "more points than there are": (
+        lambda data: corrupt(data, 247, np.uint64(10**9).tobytes()), "truncated|expected"
+    ),
+    "scale of galaxies": (
+        lambda data: corrupt(data, 131, np.float64(1e12).tobytes()), "broken|outside|none of"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize("what", BROKEN)
+def test_broken_files_are_named_and_leave_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, suffix: str
+) -> None:
+    good = write_scan(tmp_path / f"good{suffix}", grid_points(), point_format=6)
+    bad = tmp_path / f"bad{suffix}"
+    spoil, message = BROKEN[what]
+    bad.write_bytes(spoil(good.read_bytes()))
+    folder = tmp_path / "scans.db"
+    with pytest.raises((ScanError, GeodesyError), match=message) as caught:
+        add_scan(Database(str(folder)), [good, bad])
+    assert str(bad) in str(caught.value)
+    assert not folder.exists()
+    assert main(["lidar", "add", str(folder), str(bad), "--quiet"]) == 2
+    assert str(bad) in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_missing_files_and_missing_systems(database: Database, tmp_path: Path) -> None:
+    with pytest.raises(ScanFileError, match="check the path"):
+        add_scan(database, [tmp_path / "nothing.laz"])
+    with pytest.raises(ScanError, match="at least one"):
+        add_scan(database, [])
+    nameless = write_scan(tmp_path / "nameless.laz", grid_points(), crs=None)
+    with pytest.raises(GeodesyError, match=r"nameless\.laz: .*found none; .*--crs"):
+        add_scan(database, [nameless])
+    unnamed = write_scan(tmp_path / "unnamed.laz", grid_points(), crs='LOCAL_CS["unnamed",UNIT["metre",1]]')
+    with pytest.raises(GeodesyError, match="--crs"):
+        add_scan(database, [unnamed])
+    assert not Path(database.url).exists()
+    result = add_scan(database, [nameless], AddOptions(crs="EPSG:32632", height_datum="egm2008"))
+    assert (result.scan.epsg, result.scan.height_datum) == (32632, "egm2008")
+
+
+def test_bytes_changed_at_random_never_end_in_a_defect(tmp_path: Path) -> None:
+    good = write_scan(tmp_path / "good.laz", grid_points(400), point_format=7).read_bytes()
+    rng = np.random.default_rng(0)
+    refused = 0
+    for trial in range(40):
+        data = bytearray(good)
+        for place in rng.integers(4, len(good) if trial % 2 else 500, rng.integers(1, 6)):
+            data[place] = rng.integers(256)
+        path = tmp_path / f"{trial}.laz"
+        path.write_bytes(bytes(data))
+        database = Database(str(tmp_path / f"{trial}.db"))
+        try:
+            add_scan(database, [path])
+        except FeatureDbError:
+            refused += 1
+            assert not Path(database.url).exists()
+    assert refused > 8
+
+
+def test_header_boxes_that_lie_are_not_believed(database: Database, tmp_path: Path) -> None:
+    path = write_scan(tmp_path / "a.las", grid_points(), point_format=6)
+    data = bytearray(path.read_bytes())
+    data[179:227] = np.array([1e7, 1e7, 1e7, 1e7, 0.0, 0.0]).tobytes()
+    path.write_bytes(bytes(data))
+    assert add_scan(database, [path]).scan.epsg == 32632
+
+
+def test_parts_of_scans_are_loaded(database: Database, tmp_path: Path) -> None:
+    xyz = grid_points(30_000, 7, spacing=0.5)
+    scan = add_scan(database, [write_scan(tmp_path / "a.laz", xyz)]).scan
+    frame = LocalFrame.from_utm(WEST + 40.0, SOUTH + 30.0, 100.0, 32632)
+    enu = frame.enu_from_utm(xyz, 32632)
+    box = (-10.0, -5.0, 15.0, 20.0)
+    inside = ((enu[:, :2] >= box[:2]) & (enu[:, :2] <= box[2:])).all(axis=1)
+    cloud = load_cloud(database.url, frame, box)
+    assert inside.sum() <= len(cloud) <= 1.05 * inside.sum()
+    distance, _ = cKDTree(cloud.xyz).query(enu[inside])
+    assert distance.max() < 2e-3  # the file's millimetre
+    nodes = cloud.nodes
+    assert (np.diff(nodes.level) >= 0).all()
+    for k in range(len(nodes)):
+        run = cloud.xyz[nodes.start[k] : nodes.start[k] + nodes.count[k]]
+        np.testing.assert_array_equal(nodes.box_min[k], run.min(axis=0))
+        np.testing.assert_array_equal(nodes.box_max[k], run.max(axis=0))
+    capped = load_cloud(database, frame, options=LoadOptions(largest_points=5000))
+    assert len(capped) == np.cumsum(scan.level_points)[np.cumsum(scan.level_points) <= 5000][-1]
+    with pytest.raises(ScanError, match="smaller area"):
+        load_cloud(database, frame, options=LoadOptions(largest_points=10))
+    elsewhere = LocalFrame.from_utm(WEST + 9000.0, SOUTH, 100.0, 32632)
+    assert len(load_cloud(database, elsewhere, (0.0, 0.0, 50.0, 50.0))) == 0
+
+
+def test_scans_of_neighbouring_zones_meet_in_one_frame(database: Database, tmp_path: Path) -> None:
+    xyz = grid_points(3000)
+    path = write_scan(tmp_path / "a.laz", xyz)
+    add_scan(database, [path])
+    add_scan(database, [path], AddOptions(epsg=32631))
+    frame = LocalFrame.from_utm(WEST, SOUTH, 100.0, 32632)
+    both = load_cloud(database, frame)
+    one = load_cloud(database, frame, scan_ids=[list_scans(database)[0].scan_id])
+    assert len(both) == 2 * len(one)
+    distance, _ = cKDTree(one.xyz).query(both.xyz)
+    assert distance.max() < 2e-3
+
+
+def test_what_cannot_be_loaded_together(database: Database, tmp_path: Path) -> None:
+    Database.create(database.url)
+    frame = LocalFrame.from_utm(WEST, SOUTH, 100.0, 32632)
+    with pytest.raises(ScanNotFoundError, match="lidar add"):
+        load_cloud(database, frame)
+    assert list_scans(database) == []
+    path = write_scan(tmp_path / "a.laz", grid_points())
+    add_scan(database, [path])
+    add_scan(database, [path], AddOptions(height_datum="egm96"))
+    with pytest.raises(ScanError, match="egm96, unknown"):
+        load_cloud(database, frame)
+    with pytest.raises(ScanNotFoundError, match="no scan 77"):
+        load_cloud(database, frame, scan_ids=["77"])
+
+
+def test_retire_and_add_again(database: Database, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points())
+    scan = add_scan(database, [path]).scan
+    assert main(["retire", database.url, scan.scan_id, "--reason", "wrong datum"]) == 0
+    assert scan.scan_id in capsys.readouterr().out
+    assert list_scans(database) == []
+    gone = find_scan(database, scan.scan_id)
+    assert (gone.status, gone.status_reason) == ("retired", "wrong datum")
+    assert not retire_scan(database, scan.scan_id, "again")
+    with pytest.raises(ScanNotFoundError):
+        retire_scan(database, "0" * 16, "no such")
+    with pytest.raises(ScanNotFoundError):
+        load_cloud(database, scan_frame(scan))
+    again = add_scan(database, [path])
+    assert again.created
+    assert again.scan.write_id != scan.write_id
+    now = VacuumOptions(history_h=0.0, orphan_grace_h=0.0, file_grace_h=0.0)
+    assert vacuum(database, now).write_ids == (scan.write_id,)
+    assert len(stored(database)["easting"]) == again.scan.points
+    assert verify(database).ok
+
+
+def test_compaction_keeps_scans_and_vacuum_frees_retired_ones(database: Database, tmp_path: Path) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points(5000))
+    scan = add_scan(database, [path], AddOptions(block_points=900)).scan
+    other = add_scan(database, [path], AddOptions(height_unit="us-ft")).scan
+    before = load_cloud(database, scan_frame(scan), scan_ids=[scan.scan_id])
+    compact(database)
+    assert verify(database).ok
+    after = load_cloud(database, scan_frame(scan), scan_ids=[scan.scan_id])
+    np.testing.assert_array_equal(sorted_rows(after.xyz), sorted_rows(before.xyz))
+    retire_scan(database, other.scan_id, "test")
+    kept = VacuumOptions(history_h=24.0, orphan_grace_h=0.0, file_grace_h=0.0)
+    assert vacuum(database, kept).write_ids == ()
+    assert vacuum(database, VacuumOptions(history_h=0.0, orphan_grace_h=0.0)).write_ids == (other.write_id,)
+    assert verify(database).ok
+
+
+def test_damage_is_found(database: Database, tmp_path: Path) -> None:
+    scan = add_scan(database, [write_scan(tmp_path / "a.laz", grid_points())]).scan
+    assert verify(database).ok
+    table = DeltaTable(f"{database.url}/lidar_points")
+    table.update(updates={"height": "height + 0.001"}, predicate="level = 1")
+    assert [p.what for p in verify(database).problems] == [
+        "its points are not those that were committed: checksums differ"
+    ]
+    DeltaTable(f"{database.url}/lidar_points").delete("level = 0")
+    assert f"scan {scan.scan_id}" in {p.where for p in verify(database).problems}
+
+
+def test_sql_sees_scans(database: Database, tmp_path: Path) -> None:
+    Database.create(database.url)
+    with SqlSession(database.snapshot(), database) as session:
+        assert list(session.query("select count(*) from lidar_points").rows) == [(0,)]
+    scan = add_scan(database, [write_scan(tmp_path / "a.laz", grid_points())]).scan
+    with SqlSession(database.snapshot(), database) as session:
+        rows = list(session.query("select scan_id, name, points, epsg from lidar").rows)
+        assert rows == [(scan.scan_id, "a.laz", 3000, 32632)]
+        by_level = session.query(
+            "select level, count(*) from lidar_points where scan_id = "
+            f"'{scan.scan_id}' group by level order by level"
+        )
+        assert [count for _, count in by_level.rows] == list(scan.level_points)
+
+
+def test_command_line(database: Database, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write_scan(tmp_path / "stadium.laz", grid_points(), classification=np.full(3000, 2))
+    picture = tmp_path / "plan.png"
+    assert main(["lidar", "add", database.url, str(path), "--picture", str(picture), "--licence", "CC0"]) == 0
+    out = capsys.readouterr().out
+    for part in (
+        "added",
+        "3,000 points",
+        "EPSG:32632",
+        "metre of 1 m",
+        "2 ground 3,000",
+        "datum       unknown",
+    ):
+        assert part in out
+    assert picture.read_bytes()[:4] == b"\x89PNG"
+    assert main(["lidar", "add", database.url, str(path)]) == 0
+    assert "was there already" in capsys.readouterr().out
+    assert main(["lidar", "list", database.url]) == 0
+    assert "stadium.laz" in capsys.readouterr().out
+    assert main(["lidar", "list", database.url, "--json"]) == 0
+    assert '"licence": "CC0"' in capsys.readouterr().out
+    assert main(["verify", database.url]) == 0
+    assert "1 scans" in capsys.readouterr().out
+
+
+def test_ortho_colours_what_is_seen_from_above(database: Database, tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    ground = grid_points(10_000, 3, spacing=0.5)
+    roof = ground[(np.abs(ground[:, :2] - [WEST + 25, SOUTH + 25]) < 5).all(axis=1)] + [0.0, 0.0, 6.0]
+    path = write_scan(tmp_path / "a.laz", np.concatenate([ground, roof]))
+    image = np.zeros((3, 60, 60), np.uint8)
+    image[0] = 200
+    tif = tmp_path / "ortho.tif"
+    with rasterio.open(
+        tif, "w", driver="GTiff", width=60, height=60, count=3, dtype="uint8", crs="EPSG:32632",
+        transform=rasterio.Affine(1.0, 0.0, WEST - 5, 0.0, -1.0, SOUTH + 55),
+    ) as file:  # fmt: skip
+        file.write(image)
+    plain = add_scan(database, [path]).scan
+    scans = [
+        add_scan(
+            Database(str(tmp_path / f"{n}.db")),
+            [path],
+            AddOptions(block_points=n),
+            ortho=OrthoChoice(path=tif),
+        )
+        for n in (1_000_000, 2500)
+    ]
+    assert scans[0].scan.scan_id == scans[1].scan.scan_id != plain.scan_id
+    assert scans[0].scan.colour == "ortho"
+    for result, name in zip(scans, ("1000000", "2500"), strict=True):
+        found = stored(Database(str(tmp_path / f"{name}.db")))
+        assert result.scan.points == len(ground) + len(roof)
+        colour = found["red"] == 200
+        high = found["height"] > 104.0
+        inside = (found["easting"] < WEST + 48) & (found["northing"] < SOUTH + 48)
+        below = (
+            (np.abs(found["easting"] - WEST - 25) < 3) & (np.abs(found["northing"] - SOUTH - 25) < 3) & ~high
+        )
+        assert colour[high].mean() > 0.99
+        assert colour[below].mean() < 0.01  # the lawn under the roof keeps its own: none
+        assert colour[inside & ~below & ~high].mean() > 0.9
