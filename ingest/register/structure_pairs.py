@@ -49,7 +49,8 @@ class RegisteredImage:
     Attributes:
         image_id: of the map's image.
         registration: accepted, in the local frame of the cloud.
-        camera: the lens with which it was registered, None for the map's own.
+        camera: the lens with which it was registered, where the registration does not name it itself;
+            None for the map's own.
     """
 
     image_id: int
@@ -111,7 +112,7 @@ def _pairs_of_frame(
     pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
     assert pose is not None
     assert covariance is not None  # accepted
-    camera = registered.camera or feature_map.cameras[image.camera_id]
+    camera = registered.registration.camera or registered.camera or feature_map.cameras[image.camera_id]
     width = min(options.render_width_px, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
     rendering = render(cloud, small, pose, RenderOptions(attributes=False))
