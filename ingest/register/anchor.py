@@ -87,13 +87,14 @@ class PlaceRound:
 
     Attributes:
         frames: as they were registered for it.
-        structure_s, adjust_s: wall time of the two steps.
+        structure_s, adjust_s: wall time of the two steps. structure_cpu_s: processor time of the first.
         focal_px: of the map's cameras after it.
         figures: of both steps, JSON-able.
     """
 
     frames: tuple[TriedFrame, ...]
     structure_s: float
+    structure_cpu_s: float
     adjust_s: float
     focal_px: tuple[float, ...]
     figures: dict[str, Any]
@@ -321,9 +322,9 @@ def _place(
     for number in range(options.lens_rounds):
         lens = (placed or feature_map).cameras
         registered = [_registered(frame, lens) for frame in frames]
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         structure = project_structure(feature_map, registered, cloud, options.structure)
-        structure_s = time.perf_counter() - start
+        structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
         if not structure.accepted:
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
@@ -337,6 +338,7 @@ def _place(
             PlaceRound(
                 frames=tuple(frames),
                 structure_s=structure_s,
+                structure_cpu_s=structure_cpu_s,
                 adjust_s=adjust_s,
                 focal_px=tuple(camera.focal_px for camera in placed.cameras),
                 figures={
