@@ -56,7 +56,7 @@ class AnchorReport:
         return self.result is not None and self.result.feature_map is not None
 
     def times_s(self) -> dict[str, float]:
-        """Seconds of the paper's building blocks, for one frame and for the map; wall time unless they say CPU.
+        """Seconds of the paper's building blocks, for one frame and for the map; wall time unless named CPU.
 
         On a busy machine the processor time tells what an idle one would take, or less with two cores.
         """
