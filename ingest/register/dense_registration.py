@@ -34,16 +34,21 @@ def register_by_pictures(
     """
     found = register_dense(photo_gray, camera, prior, cloud, source, search or DenseOptions())
     confirm = confirm or ConfirmOptions()
-    judged = []
-    for pose in found[:_FINALISTS]:
-        refined = refine_by_intensity(photo_gray, camera, pose.cam_from_local, cloud, source)
-        # Where what stands up leans otherwise than a camera would see it, the whole picture's measure may lead
-        # away: the pieces decide between the two.
-        candidates = [pose, replace(pose, cam_from_local=refined.cam_from_local)][: 1 + refined.moved]
-        judged += [
-            (c, confirm_pose(photo_gray, camera, c.cam_from_local, cloud, source, confirm))
-            for c in candidates
-        ]
-    if not judged:
+    if not found:
         return None, None
-    return max(judged, key=lambda item: (item[1].agreeing, item[0].score))
+
+    def judge(pose: DensePose) -> tuple[DensePose, Confirmation]:
+        return pose, confirm_pose(photo_gray, camera, pose.cam_from_local, cloud, source, confirm)
+
+    best = max((judge(pose) for pose in found[:_FINALISTS]), key=_standing)
+    refined = refine_by_intensity(photo_gray, camera, best[0].cam_from_local, cloud, source)
+    # Where what stands up leans as no camera sees it, the whole picture's measure may lead away: the pieces
+    # decide between the two.
+    if refined.moved:
+        best = max(best, judge(replace(best[0], cam_from_local=refined.cam_from_local)), key=_standing)
+    return best
+
+
+def _standing(judged: tuple[DensePose, Confirmation]) -> tuple[bool, int, float]:
+    pose, confirmation = judged
+    return confirmation.confirmed, confirmation.agreeing, pose.score

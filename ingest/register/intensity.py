@@ -244,7 +244,7 @@ def _soft_bins(picture: FloatImage) -> FloatImage:
 
 
 def _shared_histogram(bins: NDArray[np.int64], fractional: NDArray[np.float32]) -> FloatArray:
-    """Joint histogram in which each sample is shared between the two bins nearest to it: smooth in the pose."""
+    """Joint histogram; each sample is shared between the two bins nearest to it: smooth in the pose."""
     lower = fractional.astype(np.int64)
     upper_part = (fractional - lower).astype(np.float64)
     index = bins * _BINS + lower
