@@ -106,14 +106,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     args.out.mkdir(parents=True, exist_ok=True)
     for kind in args.kinds:
         _database(args.out, args.seed, kind)
+    counts: dict[Case, int] = {
+        "prior": args.photos,
+        "other town": args.negatives,
+        "far prior": args.negatives,
+    }
     tasks = [
         Task(folder=args.out, seed=args.seed, kind=kind, case=case, index=i, photos=args.photos)
         for kind in args.kinds
-        for case, count in (
-            ("prior", args.photos),
-            ("other town", args.negatives),
-            ("far prior", args.negatives),
-        )
+        for case, count in counts.items()
         for i in range(count)
     ]
     rows = []

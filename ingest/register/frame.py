@@ -14,7 +14,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
 from ingest.register.confirmation import Confirmation
-from ingest.register.frame_dense import confirmed, dense_fitted, dense_hypotheses
+from ingest.register.frame_dense import confirmed, dense_fitted, dense_hypotheses, intensity_refined
 from ingest.register.frame_options import FrameOptions
 from ingest.register.frame_registration import (
     FramePrior,
@@ -32,7 +32,7 @@ from ingest.register.frame_search import (
     search,
     star_groups,
 )
-from ingest.register.frame_uncertainty import frame_covariance
+from ingest.register.frame_uncertainty import focal_sigma_rel, frame_covariance
 from ingest.register.frame_verdict import FrameEvidence, cells_with_inliers, prior_sigmas, verdict
 from ingest.register.frame_views import FrameViews, first_look
 
@@ -62,6 +62,8 @@ def register_frame(
     options = options or FrameOptions()
     clock = _Clock()
     gray = _gray(image, camera)
+    if options.estimate_focal and camera.model != "SIMPLE_RADIAL":
+        camera = Camera.from_focal(camera.width, camera.height, camera.focal_px)
     with clock.stage("look"):
         look = first_look(cloud, camera, prior)
     if look is None or look.cover < options.verdict.min_cover:
@@ -134,7 +136,18 @@ def _polished(views: FrameViews, found: FrameHypothesis, clock: "_Clock") -> _Ju
         fitted = _guided(views, found) if by_features else dense_fitted(views, found, views.options.dense_fit)
     found = fitted or found
     with clock.stage("confirm"):
-        return _Judged(found=found, confirmation=confirmed(views, found))
+        judged = _Judged(found=found, confirmation=confirmed(views, found))
+    if not views.options.refine or not judged.confirmation.confirmed:
+        return judged
+    with clock.stage("refine"):
+        return _refined(views, judged)
+
+
+def _refined(views: FrameViews, judged: _Judged) -> _Judged:
+    """By intensities, where the pieces of the photo agree with the refined pose better than with the fitted one."""
+    refined = intensity_refined(views, judged.found)
+    again = _Judged(found=refined, confirmation=confirmed(views, refined))
+    return again if again.confirmation.score > judged.confirmation.score else judged
 
 
 def _guided(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:
@@ -187,6 +200,7 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: _Judged, clock: "_Clo
         reason=None,
         message="",
         source=found.source,
+        camera=found.pose.camera,
         points_local=found.inliers.points,
         pixels=found.inliers.pixels,
         evidence=figures,
@@ -235,6 +249,9 @@ def _evidence(
         rival_share=found.rival_share,
         prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
         position_sigma_share=share,
+        focal_sigma_rel=focal_sigma_rel(
+            found.inliers.pixels, found.inliers.points, found.pose, views.options.correlated_inliers
+        ),
     )
 
 

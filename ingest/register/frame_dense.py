@@ -11,15 +11,17 @@ from ingest.register.frame_matching import joined
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.frame_search import FrameHypothesis, independent
 from ingest.register.frame_views import FrameViews
+from ingest.register.intensity import refine_by_intensity
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, refine_pose
 
 _MIN_PLACES = 12  # twice what six parameters need
+_FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
 _MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
 
 
 def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
-    """The two best poses that dense templates find around the prior; no matches behind them yet."""
+    """The best few poses that dense templates find around the prior; no matches behind them yet."""
     found = register_dense(views.gray, views.camera, prior, views.cloud, source)
     return [
         FrameHypothesis(
@@ -38,7 +40,7 @@ def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource)
             log_nfa=0.0,
             rival_share=0.0,
         )
-        for pose in found[:2]
+        for pose in found[:_FINALISTS]
     ]
 
 
@@ -79,3 +81,10 @@ def dense_side_px(views: FrameViews, spacing_px: float) -> int:
 def confirmed(views: FrameViews, found: FrameHypothesis) -> Confirmation:
     """What the pictures say of a pose."""
     return confirm_pose(views.gray, found.pose.camera, found.pose.cam_from_local, views.cloud, found.source)
+
+
+def intensity_refined(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:
+    """The pose moved to where the pictures agree best by mutual information and gradient correlation."""
+    pose = found.pose
+    refined = refine_by_intensity(views.gray, pose.camera, pose.cam_from_local, views.cloud, found.source)
+    return replace(found, pose=replace(pose, cam_from_local=refined.cam_from_local))

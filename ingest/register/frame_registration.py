@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 
 FrameReason = Literal[
@@ -55,6 +56,8 @@ class FrameRegistration:
         source: what was rendered for the accepted pose.
         points_local: (n, 3) scan points of the inlier correspondences, local frame, metres.
         pixels: (n, 2) where the photo shows them, full-size pixels.
+        camera: intrinsics that belong to the pose: the ones given, or with the focal length estimated; None when
+            refused.
         evidence: figures behind the verdict, JSON-able.
         seconds: time by stage, in order.
     """
@@ -66,6 +69,7 @@ class FrameRegistration:
     source: RenderSource | None
     points_local: FloatArray
     pixels: FloatArray
+    camera: Camera | None = None
     evidence: dict[str, Any] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 

@@ -6,6 +6,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, pose_uncertainty
+from reloc.self_calibration import covariance_from_information, joint_jacobians
 
 
 def frame_covariance(
@@ -46,3 +47,21 @@ def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatAr
     turn[:3, :3] = turn[3:, 3:] = -cam_from_local.rotation
     result = turn @ covariance @ turn.T
     return np.asarray((result + result.T) / 2.0, dtype=np.float64)
+
+
+def focal_sigma_rel(
+    pixels: FloatArray, points: FloatArray, pose: PoseHypothesis, correlated_inliers: float
+) -> float:
+    """Standard deviation of an estimated focal length as a share of it; 0 where the lens was given.
+
+    From the inliers with the residuals' own variance, so many of them counted as one, and what was known of the lens beforehand: over flat
+    ground it stays at that.
+    """
+    if pose.lens_information is None or len(points) < 6:
+        return 0.0
+    _, jacobian = joint_jacobians(pose.camera, pose.cam_from_local, points)
+    residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
+    variance = correlated_inliers * max(float(np.mean(residual**2)), 1e-4)
+    information = np.einsum("nij,nik->jk", jacobian, jacobian) / variance
+    information[6:, 6:] += np.diag(pose.lens_information)
+    return float(np.sqrt(covariance_from_information(information)[6, 6]) / pose.camera.focal_px)

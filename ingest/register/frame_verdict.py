@@ -23,6 +23,9 @@ class VerdictOptions:
         min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
         min_log_nfa_alone: features with that much evidence among their unguided matches need no confirmation
             where the pictures have fewer than `min_confirmation_pieces` pieces to compare.
+        min_confirmation_log_nfa: evidence of the pictures that a pose without so many features needs. It is the
+            best of very many that were tried, and towns resemble each other: photos of another town reach 8,
+            right poses begin at 25.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
         max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
             axes together. Generous: people and devices understate their errors.
@@ -37,6 +40,7 @@ class VerdictOptions:
     min_cells: int = 6
     min_log_nfa_alone: float = 60.0
     min_confirmation_pieces: int = 25
+    min_confirmation_log_nfa: float = 15.0
     rival_share: float = 0.5
     max_prior_sigmas: float = 6.0
     max_position_sigma_share: float = 0.05
@@ -82,6 +86,12 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     silent = e.confirmation_pieces < o.min_confirmation_pieces and e.log_nfa >= o.min_log_nfa_alone
     if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
+    if e.log_nfa < o.min_log_nfa_alone and e.confirmation_log_nfa < o.min_confirmation_log_nfa:
+        return (
+            "NOT_CONFIRMED",
+            f"the pictures agree too little at a pose that few features speak for: evidence of "
+            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{o.min_confirmation_log_nfa:g} needed",
+        )
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
             "NO_CONSISTENT_POSE",

@@ -1,0 +1,115 @@
+"""The verdict on a registered frame: every gate fires, and on its own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from ingest.register.frame_registration import FramePrior
+from ingest.register.frame_uncertainty import left_perturbation
+from ingest.register.frame_verdict import (
+    FrameEvidence,
+    VerdictOptions,
+    cells_with_inliers,
+    prior_sigmas,
+    verdict,
+)
+
+GOOD = FrameEvidence(
+    inliers=200,
+    candidates=1500,
+    log_nfa=30.0,
+    confirmed=True,
+    confirmation_pieces=150,
+    confirmation_log_nfa=45.0,
+    confirmation_message="",
+    cells=60,
+    agreement=0.7,
+    rival_share=0.1,
+    prior_sigmas=2.0,
+    position_sigma_share=0.002,
+)
+
+
+def test_good_evidence_is_believed() -> None:
+    assert verdict(GOOD, VerdictOptions()) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"inliers": 12}, "TOO_FEW_MATCHES"),
+        ({"confirmed": False, "confirmation_message": "no"}, "NOT_CONFIRMED"),
+        ({"confirmation_log_nfa": 8.4}, "NOT_CONFIRMED"),
+        ({"cells": 4}, "NO_CONSISTENT_POSE"),
+        ({"agreement": 0.1}, "NO_CONSISTENT_POSE"),
+        ({"rival_share": 0.6}, "AMBIGUOUS"),
+        ({"position_sigma_share": 0.2}, "NO_CONSISTENT_POSE"),
+        ({"focal_sigma_rel": 0.05}, "NO_CONSISTENT_POSE"),
+        ({"prior_sigmas": 9.0}, "CONTRADICTS_PRIOR"),
+    ],
+)
+def test_each_gate_fires(change: dict[str, float], reason: str) -> None:
+    refusal = verdict(replace(GOOD, **change), VerdictOptions())  # type: ignore[arg-type]
+    assert refusal is not None and refusal[0] == reason and refusal[1]
+
+
+def test_decisive_features_bear_silent_pictures_but_no_contradiction() -> None:
+    silent = replace(GOOD, log_nfa=900.0, confirmed=False, confirmation_pieces=10, confirmation_log_nfa=0.0)
+    assert verdict(silent, VerdictOptions()) is None
+    contradicted = replace(silent, confirmation_pieces=150)
+    assert verdict(contradicted, VerdictOptions()) is not None
+    assert verdict(replace(silent, log_nfa=20.0), VerdictOptions()) is not None
+
+
+def prior(heading: float) -> FramePrior:
+    return FramePrior(
+        cam_from_local=Rigid3(rotation=np.diag([1.0, -1.0, -1.0]), translation=np.zeros(3)),
+        sigma_horizontal_m=5.0,
+        sigma_vertical_m=10.0,
+        sigma_heading_deg=heading,
+        sigma_tilt_deg=2.0,
+    )
+
+
+def posed(center: list[float], turn_local_deg: list[float]) -> Rigid3:
+    rotation = np.diag([1.0, -1.0, -1.0]) @ so3_exp(np.radians(turn_local_deg))
+    return Rigid3(rotation=rotation, translation=-rotation @ np.array(center))
+
+
+def test_distance_from_the_prior_by_axis() -> None:
+    assert prior_sigmas(prior(4.0), posed([10.0, 0.0, 0.0], [0.0, 0.0, 0.0])) == pytest.approx(2.0)
+    assert prior_sigmas(prior(4.0), posed([0.0, 0.0, 30.0], [0.0, 0.0, 0.0])) == pytest.approx(3.0)
+    assert prior_sigmas(prior(4.0), posed([0.0, 0.0, 0.0], [0.0, 0.0, 12.0])) == pytest.approx(3.0)
+    assert prior_sigmas(prior(4.0), posed([0.0, 0.0, 0.0], [6.0, 0.0, 0.0])) == pytest.approx(3.0)
+
+
+def test_unknown_heading_counts_nothing() -> None:
+    assert prior_sigmas(prior(180.0), posed([0.0, 0.0, 0.0], [0.0, 0.0, 170.0])) == pytest.approx(
+        0.0, abs=1e-6
+    )
+    assert prior_sigmas(prior(180.0), posed([0.0, 0.0, 0.0], [6.0, 0.0, 0.0])) == pytest.approx(3.0)
+
+
+def test_cells_are_counted_where_the_scan_is_seen() -> None:
+    camera = Camera.from_focal(1000, 1000, 900.0)
+    valid = np.zeros((100, 100), bool)
+    valid[:, :50] = True
+    pixels = np.array([[x + 50.0, y + 50.0] for x in range(0, 300, 100) for y in range(0, 1000, 100)])
+    assert cells_with_inliers(pixels, valid, camera) == (30, pytest.approx(0.6))
+
+
+def test_covariance_changes_axes_as_finite_differences_say() -> None:
+    pose = posed([4.0, -2.0, 9.0], [20.0, -10.0, 35.0])
+    step = np.array(
+        [1e-5, -2e-5, 3e-5, 2e-4, 1e-4, -3e-4]
+    )  # turn about local axes, displacement of the centre
+    rotation = (so3_exp(step[:3]) @ pose.rotation.T).T
+    moved = Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:]))
+    left = (moved @ pose.inverse()).log()
+    # The centre's displacement and the turn are moved to the camera's origin, about which the pose turns.
+    covariance = left_perturbation(np.outer(step, step), pose)
+    np.testing.assert_allclose(covariance, np.outer(left, left), rtol=1e-3, atol=1e-13)
