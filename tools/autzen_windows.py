@@ -1,6 +1,7 @@
 """Windows of an ortho image registered to an airborne scan as nadir telephoto photos, from intensity alone.
 
     python -m tools.autzen_windows STADIUM.laz STADIUM_ORTHO.tif [--photos FOLDER ...] [--json OUT] [--seed 0]
+    python -m tools.autzen_windows --given OUT ... --figure docs/figures/autzen_windows.png
 
 The scan is added to a database as any other; its colours are thrown away, for they come from that ortho
 image. Each window of 400 x 400 pixels becomes the photo of a camera 1000 m above the ground, whose prior is
@@ -37,6 +38,8 @@ from typing import Any
 import cv2
 import numpy as np
 import rasterio
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
@@ -49,6 +52,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
+from ingest.register.confirmation import ConfirmOptions
 from ingest.register.dense_registration import register_by_pictures
 from ingest.register.frame_registration import FramePrior
 
@@ -102,6 +106,9 @@ class Outcome:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     cv2.setNumThreads(1)
+    if args.given:
+        rows = [row for path in args.given for row in json.loads(path.read_text())["rows"]]
+        return _report([Outcome(**row) for row in rows], args.figure)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
         added = add_scan(database, [args.scan])
@@ -120,7 +127,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(_line(outcome), flush=True)
     if args.json:
         args.json.write_text(json.dumps({"offset_m": offset.tolist(), "rows": [asdict(o) for o in outcomes]}))
-    return _summary(outcomes)
+    return _report(outcomes, args.figure)
 
 
 def _place(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> Place:
@@ -333,6 +340,32 @@ def _line(o: Outcome) -> str:
     )
 
 
+def _report(outcomes: Sequence[Outcome], figure: Path | None) -> int:
+    if figure is not None:
+        _draw(outcomes, figure)
+    return _summary(outcomes)
+
+
+def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
+    """Share of agreeing pieces against the error on the ground, with the line between accepted and refused."""
+    chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
+    FigureCanvasAgg(chart)
+    axes = chart.subplots()
+    looks = {"window": ("o", "#2e7d32"), "mirrored": ("x", "#c62828"), "elsewhere": ("+", "#ad1457")}
+    for kind in _KINDS:
+        marker, colour = looks.get(kind, ("^", "#6a1b9a"))
+        some = np.array([(o.error_m, o.share) for o in outcomes if o.kind == kind and o.error_m is not None])
+        if len(some):
+            axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
+    axes.axhline(ConfirmOptions().min_agreeing, color="#1b2733", lw=0.8, ls="--")
+    axes.set(
+        xscale="log", xlabel="error on the ground, m", ylabel="share of pieces that agree", ylim=(0, None)
+    )
+    axes.legend(fontsize=8)
+    axes.grid(color="#e6ebef", lw=0.6)
+    chart.savefig(path)
+
+
 def _summary(outcomes: Sequence[Outcome]) -> int:
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
@@ -359,8 +392,10 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("scan", type=Path)
-    parser.add_argument("ortho", type=Path)
+    parser.add_argument("scan", type=Path, nargs="?")
+    parser.add_argument("ortho", type=Path, nargs="?")
+    parser.add_argument("--given", type=Path, nargs="*", help="reports of earlier runs, instead of a run")
+    parser.add_argument("--figure", type=Path)
     parser.add_argument(
         "--photos", type=Path, nargs="*", default=[], help="folders with photos of other places"
     )
@@ -368,7 +403,10 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--kinds", nargs="*", default=list(_KINDS), choices=_KINDS)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path)
-    return parser.parse_args(argv)
+    args = parser.parse_args(argv)
+    if not args.given and args.ortho is None:
+        parser.error("give a scan and an ortho image, or --given")
+    return args
 
 
 if __name__ == "__main__":
