@@ -1,13 +1,14 @@
 """Proposed frames on disk, between the command that proposes them and the one that confirms them."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from featuredb.errors import IngestError, RegistrationError
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.frame_registration import FrameRegistration
 from ingest.workspace import read_json, write_json
@@ -79,12 +80,13 @@ def load_proposals(folder: Path, map_id: str, write_id: str, scan_id: str) -> Sa
 
 
 def _plain(registration: FrameRegistration) -> dict[str, Any]:
-    pose, covariance = registration.cam_from_local, registration.covariance
+    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
     assert pose is not None
     assert covariance is not None
     return {
         "cam_from_local": pose.matrix().tolist(),
         "covariance": covariance.tolist(),
+        "camera": None if camera is None else asdict(camera),
         "source": registration.source,
         "points_local": registration.points_local.tolist(),
         "pixels": registration.pixels.tolist(),
@@ -94,11 +96,20 @@ def _plain(registration: FrameRegistration) -> dict[str, Any]:
 
 
 def _registration(entry: dict[str, Any]) -> FrameRegistration:
+    camera = entry["camera"]
     return FrameRegistration(
         cam_from_local=Rigid3.from_matrix(entry["cam_from_local"]),
         covariance=np.array(entry["covariance"]),
         reason=None,
         message="",
+        camera=None
+        if camera is None
+        else Camera(
+            model=camera["model"],
+            width=camera["width"],
+            height=camera["height"],
+            params=tuple(camera["params"]),
+        ),
         source=entry["source"],
         points_local=np.array(entry["points_local"]).reshape(-1, 3),
         pixels=np.array(entry["pixels"]).reshape(-1, 2),

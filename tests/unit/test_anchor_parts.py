@@ -217,6 +217,7 @@ def registration() -> FrameRegistration:
         covariance=np.eye(6) * 1e-4,
         reason=None,
         message="",
+        camera=CAMERA,
         source="rgb",
         points_local=np.arange(12.0).reshape(4, 3),
         pixels=np.arange(8.0).reshape(4, 2),
@@ -233,6 +234,7 @@ def test_proposals_read_back_exactly_and_only_for_the_same_state(tmp_path: Path)
     np.testing.assert_array_equal(found.points_local, registration().points_local)
     assert found.cam_from_local is not None
     np.testing.assert_array_equal(found.cam_from_local.matrix(), down(1, 2).matrix())
+    assert found.camera == CAMERA
     assert (found.source, found.evidence, found.seconds) == ("rgb", {"inliers": 4}, {"look": 0.25})
     for other in (("n", "w", "s"), ("m", "v", "s"), ("m", "w", "t")):
         with pytest.raises(RegistrationError, match="run the command without --confirm again"):
