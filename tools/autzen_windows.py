@@ -347,7 +347,7 @@ def _report(outcomes: Sequence[Outcome], figure: Path | None) -> int:
 
 
 def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
-    """Share of agreeing pieces against the error on the ground, with the line between accepted and refused."""
+    """Share of agreeing pieces against the error on the ground, with the line of the verdict."""
     chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
     FigureCanvasAgg(chart)
     axes = chart.subplots()

@@ -8,6 +8,7 @@ six free parameters give. The evidence is the binomial tail. It does not ask how
 """
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,10 +45,10 @@ class ConfirmOptions:
             is not.
         min_agreeing: smallest share of pieces that agree. Wrong poses, fitted to the same pictures, have up
             to 0.13, right ones from 0.3 (tools/autzen_windows.py).
-        min_low_agreeing, max_layer_ratio: a pose is refused when less than this share of the lower half of
-            the pieces, by height, agrees while in the upper half more than that many times as many do: then
-                what
-            stands on the ground was matched, which an ortho image shows displaced, and not the ground.
+        min_low_agreeing, max_layer_ratio, min_layer_m: a pose is refused when less than that share of the
+            lower half of the pieces agrees, by height, while of the upper half that many times as many do, and
+            the halves lie that far apart: then what stands on the ground was matched, which an ortho image
+            shows displaced, and not the ground.
         min_log_nfa: smallest evidence, -log10 of the probability that chance puts as many so near, less six
             free parameters' worth.
         min_cells: of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width.
@@ -64,6 +65,7 @@ class ConfirmOptions:
     min_agreeing: float = 0.25
     min_low_agreeing: float = 0.25
     max_layer_ratio: float = 1.5
+    min_layer_m: float = 2.0
     min_log_nfa: float = 3.0
     min_cells: int = 4
     gradients: GradientOptions = field(default_factory=GradientOptions)
@@ -146,9 +148,7 @@ def confirm_pose(
     pixels = (maps.origin + places)[near] / (view.camera.width, view.camera.height)
     cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
     score, is_maximum = _around(maps, cam_from_local)
-    height = maps.points_local[:, 2]
-    low = height <= np.median(height)
-    layers = (float(near[low].mean()), float(near[~low].mean()) if (~low).any() else 1.0)
+    layers = _layers(maps.points_local[:, 2], near)
     message = _objection(agreeing / n, log_nfa, cells, layers, options)
     return Confirmation(
         confirmed=not message,
@@ -159,8 +159,8 @@ def confirm_pose(
         score=score,
         local_maximum=is_maximum,
         message=message,
-        low_share=layers[0],
-        high_share=layers[1],
+        low_share=layers.low,
+        high_share=layers.high,
     )
 
 
@@ -194,9 +194,23 @@ def _mean_score(maps: ScoreMaps, pose: Rigid3) -> float:
     return float(scores.sum() / max(int(inside.sum()), 1))
 
 
-def _objection(
-    share: float, log_nfa: float, cells: int, layers: tuple[float, float], options: ConfirmOptions
-) -> str:
+class _Layers(NamedTuple):
+    """Shares of agreeing pieces in the lower and the upper half by height, and how far apart these lie."""
+
+    low: float
+    high: float
+    apart_m: float
+
+
+def _layers(height: FloatArray, near: NDArray[np.bool_]) -> _Layers:
+    low = height <= np.median(height)
+    if low.all():
+        return _Layers(float(near.mean()), float(near.mean()), 0.0)
+    apart = float(np.median(height[~low]) - np.median(height[low]))
+    return _Layers(float(near[low].mean()), float(near[~low].mean()), apart)
+
+
+def _objection(share: float, log_nfa: float, cells: int, layers: _Layers, options: ConfirmOptions) -> str:
     if share < options.min_agreeing:
         return (
             f"{share:.0%} of the pieces lie where the pose puts them, {options.min_agreeing:.0%} are needed"
@@ -205,6 +219,9 @@ def _objection(
         return f"evidence of 10^-{log_nfa:.1f} against chance, 10^-{options.min_log_nfa:g} is needed"
     if cells < options.min_cells:
         return f"agreement in {cells} of 16 parts of the picture, {options.min_cells} are needed"
-    if layers[0] < options.min_low_agreeing and layers[1] > options.max_layer_ratio * layers[0]:
-        return f"{layers[0]:.0%} of the lower pieces agree and {layers[1]:.0%} of the upper ones"
+    ground_differs = (
+        layers.low < options.min_low_agreeing and layers.high > options.max_layer_ratio * layers.low
+    )
+    if ground_differs and layers.apart_m > options.min_layer_m:
+        return f"{layers.low:.0%} of the lower pieces agree and {layers.high:.0%} of the upper ones"
     return ""
