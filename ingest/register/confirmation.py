@@ -46,9 +46,9 @@ class ConfirmOptions:
         min_agreeing: smallest share of pieces that agree. Wrong poses, fitted to the same pictures, have up
             to 0.13, right ones from 0.3 (tools/autzen_windows.py).
         min_low_agreeing, max_layer_ratio, min_layer_m: a pose is refused when less than that share of the
-            lower half of the pieces agrees, by height, while of the upper half that many times as many do, and
-            the halves lie that far apart: then what stands on the ground was matched, which an ortho image
-            shows displaced, and not the ground.
+            lower half of the pieces, by height, agrees while of the upper half that many times as many do,
+            and the halves lie that far apart: then what stands on the ground was matched, which an ortho
+            image shows displaced, and not the ground.
         min_log_nfa: smallest evidence, -log10 of the probability that chance puts as many so near, less six
             free parameters' worth.
         min_cells: of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width.
