@@ -1,8 +1,8 @@
 """UTM to a local frame for millions of points: polynomials that stand in for PROJ where they are as good.
 
 Over some kilometres the way from UTM to a topocentric frame is a smooth function that polynomials of degree
-two or three follow to fractions of a millimetre, forty times faster. They are fitted to exact values and
-checked on others; where they are not good enough the exact way is taken.
+two or three follow to fractions of a millimetre, seven times faster than PROJ. They are fitted to exact
+values and checked on others; where they are not good enough the exact way is taken.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 
 # Float32 in a frame of a kilometre resolves 0.06 mm.
 _ERROR_M = 1e-4
-_CHUNK_ROWS = 100_000
+_CHUNK_ROWS = 20_000  # 20 terms of them fit into the processor's cache
 _GRID = 5  # fitted at 5 x 5 x 3 places, checked between them
 _MIN_ROWS = 1000  # below it the exact way is faster
 
@@ -31,14 +31,14 @@ def near_enu_from_utm(frame: LocalFrame, utm: FloatArray, epsg: int) -> FloatArr
         powers = _powers(degree)
         fitted, checked = _grid(_GRID), _grid(_GRID - 1)
         coefficients = np.linalg.lstsq(
-            _terms(fitted, powers), frame.enu_from_utm(center + fitted * half, epsg), rcond=None
+            _terms(fitted, powers).T, frame.enu_from_utm(center + fitted * half, epsg), rcond=None
         )[0]
-        error = _terms(checked, powers) @ coefficients - frame.enu_from_utm(center + checked * half, epsg)
+        error = _terms(checked, powers).T @ coefficients - frame.enu_from_utm(center + checked * half, epsg)
         if np.abs(error).max() <= _ERROR_M:
             enu = np.empty((len(utm), 3))
             for start in range(0, len(utm), _CHUNK_ROWS):
                 rows = slice(start, start + _CHUNK_ROWS)
-                enu[rows] = _terms((utm[rows] - center) / half, powers) @ coefficients
+                enu[rows] = (coefficients.T @ _terms((utm[rows] - center) / half, powers)).T
             return enu
     return frame.enu_from_utm(utm, epsg)
 
@@ -54,10 +54,12 @@ def _powers(degree: int) -> list[tuple[int, int, int]]:
 
 
 def _terms(x: FloatArray, powers: list[tuple[int, int, int]]) -> FloatArray:
-    """(n, terms) products of powers of the columns of x (n, 3)."""
-    highest = max(max(p) for p in powers)
-    of_axis = [[np.ones(len(x))] for _ in range(3)]
-    for axis in range(3):
-        for _ in range(highest):
-            of_axis[axis].append(of_axis[axis][-1] * x[:, axis])
-    return np.stack([of_axis[0][i] * of_axis[1][j] * of_axis[2][k] for i, j, k in powers], axis=1)
+    """(terms, n) products of powers of the columns of x (n, 3)."""
+    columns = np.ascontiguousarray(x.T)
+    terms = np.empty((len(powers), len(x)))
+    for row, exponents in zip(terms, powers, strict=True):
+        row[:] = 1.0
+        for column, exponent in zip(columns, exponents, strict=True):
+            for _ in range(exponent):
+                row *= column
+    return terms

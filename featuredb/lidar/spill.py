@@ -1,5 +1,4 @@
-"""First pass over a scan: its points in UTM, sorted into temporary files by tile, and what one pass can
-count.
+"""First pass over a scan: its points in UTM, sorted by tile into temporary files, and counted.
 
 Tiles with too many points for the memory are split into quarters until each piece, a `Block`, is small
 enough. Edges of blocks are edges of the store's tiles halved again and again, and so never cut a voxel of the

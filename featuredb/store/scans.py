@@ -2,8 +2,7 @@
 
 Points are written first, under a fresh `write_id`, tile by tile; the row in `lidar` that names it is written
 last, by compare-and-swap. A database without these tables has no scans; the first one makes them. Scans have
-versions of
-their own: a rollback of maps leaves them alone.
+versions of their own: a rollback of maps leaves them alone.
 """
 
 import hashlib

@@ -1,6 +1,9 @@
 """Scans of every kind go into a database and come back; broken ones leave nothing."""
 
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -243,6 +246,41 @@ def test_a_job_that_was_stopped_goes_on(database: Database, tmp_path: Path) -> N
     assert verify(database).ok
     fresh = Database(str(tmp_path / "fresh.db"))
     assert add_scan(fresh, [path], options).scan.row["points_checksum"] == result.scan.row["points_checksum"]
+
+
+KILLED_JOB = """
+import os, signal, sys
+from pathlib import Path
+from featuredb.lidar.add import add_scan
+from featuredb.lidar.options import AddOptions
+from featuredb.store import Database
+
+def on_progress(progress):
+    if progress.step == sys.argv[3] and progress.done > 3000:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+options = AddOptions(block_points=800)
+add_scan(Database(sys.argv[1]), [Path(sys.argv[2])], options, on_progress=on_progress)
+"""
+
+
+@pytest.mark.parametrize("step", ["read", "clean", "write"])
+def test_a_process_that_was_killed_leaves_what_the_next_one_needs(
+    database: Database, tmp_path: Path, step: str
+) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points(6000))
+    killed = subprocess.run(
+        [sys.executable, "-c", KILLED_JOB, database.url, str(path), step], timeout=300, check=False
+    )
+    assert killed.returncode == -signal.SIGKILL
+    assert list_scans(database) == []
+    result = add_scan(database, [path], AddOptions(block_points=800))
+    assert result.created
+    assert result.scan.points == 6000
+    report = verify(database)
+    assert report.ok
+    assert len(load_cloud(database, scan_frame(result.scan))) == 6000
+    assert not (Path(database.url) / "_work").exists()
 
 
 def test_one_process_at_a_time(database: Database, tmp_path: Path) -> None:
