@@ -52,8 +52,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
-from ingest.register.confirmation import ConfirmOptions
-from ingest.register.dense_registration import register_by_pictures
+from ingest.register.dense_registration import PICTURES_ALONE, register_by_pictures
 from ingest.register.frame_registration import FramePrior
 
 Floats = NDArray[np.float64]
@@ -357,7 +356,7 @@ def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
         some = np.array([(o.error_m, o.share) for o in outcomes if o.kind == kind and o.error_m is not None])
         if len(some):
             axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
-    axes.axhline(ConfirmOptions().min_agreeing, color="#1b2733", lw=0.8, ls="--")
+    axes.axhline(PICTURES_ALONE.min_agreeing, color="#1b2733", lw=0.8, ls="--")
     axes.set(
         xscale="log", xlabel="error on the ground, m", ylabel="share of pieces that agree", ylim=(0, None)
     )

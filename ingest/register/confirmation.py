@@ -41,10 +41,8 @@ class ConfirmOptions:
         near_px: a piece agrees with the pose when its best place is this near.
         min_pieces: fewer pieces with structure cannot confirm anything.
         piece_share, min_piece_px, max_piece_px: side of a piece, as a share of the view's longer side,
-            between these. Larger ones agree more often where the pose is right, and no more often where it
-            is not.
-        min_agreeing: smallest share of pieces that agree. Wrong poses, fitted to the same pictures, have up
-            to 0.13, right ones from 0.3 (tools/autzen_windows.py).
+            between these.
+        min_agreeing: smallest share of pieces that agree.
         min_low_agreeing, max_layer_ratio, min_layer_m: a pose is refused when less than that share of the
             lower half of the pieces, by height, agrees while of the upper half that many times as many do,
             and the halves lie that far apart: then what stands on the ground was matched, which an ortho
@@ -60,13 +58,13 @@ class ConfirmOptions:
     near_px: float = 3.0
     min_pieces: int = 25
     piece_share: float = 0.21
-    min_piece_px: int = 24
-    max_piece_px: int = 56
-    min_agreeing: float = 0.25
-    min_low_agreeing: float = 0.25
+    min_piece_px: int = 40
+    max_piece_px: int = 40
+    min_agreeing: float = 0.2
+    min_low_agreeing: float = 0.0
     max_layer_ratio: float = 1.5
     min_layer_m: float = 2.0
-    min_log_nfa: float = 3.0
+    min_log_nfa: float = 6.0
     min_cells: int = 4
     gradients: GradientOptions = field(default_factory=GradientOptions)
 

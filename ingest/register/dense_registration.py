@@ -16,6 +16,14 @@ _FINALISTS = (
     3  # the summed scores of the first few are often nearly equal; pieces on their own tell them apart
 )
 
+# Where nothing but the pictures' own agreement is asked, over views of a few hundred pixels. Larger pieces
+# agree more often where the pose is right and no more often where it is wrong: of airborne intensity under
+# windows of an ortho image, up to 0.13 of them under wrong poses, from 0.3 under right ones
+# (tools/autzen_windows.py).
+PICTURES_ALONE = ConfirmOptions(
+    min_piece_px=24, max_piece_px=56, min_agreeing=0.25, min_low_agreeing=0.25, min_log_nfa=3.0
+)
+
 
 def register_by_pictures(
     photo_gray: NDArray[np.uint8],
@@ -33,7 +41,7 @@ def register_by_pictures(
         search for.
     """
     found = register_dense(photo_gray, camera, prior, cloud, source, search or DenseOptions())
-    confirm = confirm or ConfirmOptions()
+    confirm = confirm or PICTURES_ALONE
     if not found:
         return None, None
 
