@@ -14,8 +14,8 @@ Each feature of the picture takes its nearest neighbour among the render's. It i
 point that the render shows there falls within --tolerance-px of the feature. A feature has a true
 correspondence when any of the render's falls so. Recall is right matches over true correspondences,
 precision right over all matches kept, as the ratio of distances to the first and second neighbour is
-varied; counts are summed over the pairs of a source. Writes descriptors.csv and descriptors.png, prints a
-table.
+varied; counts are summed over the pairs of a source. Writes descriptors.csv and descriptors.png, in which
+sources of earlier runs stay, and prints a table.
 
 Detectors are set to low contrast thresholds, and the strongest --features of each picture are kept. FREAK,
 BEBLID, TEBLID, DAISY and VGG describe SIFT's keypoints. SURF is patented and not in the wheels of OpenCV.
@@ -260,7 +260,8 @@ def autzen_pairs(args: argparse.Namespace, rng: np.random.Generator) -> Iterator
     camera = Camera.from_focal(size, size, height_m / scale, model="SIMPLE_PINHOLE")
     rows = range(50, gray.shape[0] - size - 50, size // 2)
     columns = range(50, gray.shape[1] - size - 50, size // 2)
-    for y, x in [(y, x) for y in rows for x in columns][: 2 * args.pairs]:
+    places = [(y, x) for y in rows for x in columns]
+    for y, x in places[:: max(1, len(places) // (5 * args.pairs))]:  # windows are small
         place = np.array(transform * (x + size / 2, y + size / 2))
         east, north = (place - middle[:2]) * _FOOT_M
         pose = look_pose((east, north, height_m), 0.0, -90.0)
@@ -347,6 +348,17 @@ def study(pairs: Iterator[Pair], kinds: list[Method]) -> tuple[Counts, dict[tupl
                 counts[pair.source, method.name][i] += (right[kept].sum(), kept.sum(), true)
         print(f"# pair {k + 1}: {pair.source}", flush=True)
     return counts, seconds
+
+
+def read_csv(path: Path) -> Counts:
+    """Counts of an earlier run; none where there is no file."""
+    counts: Counts = defaultdict(lambda: np.zeros((len(RATIOS), 3), np.int64))
+    if path.is_file():
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                values = [int(row[name]) for name in ("right", "matches", "true")]
+                counts[row["source"], row["feature"]][RATIOS.index(float(row["ratio"]))] = values
+    return counts
 
 
 def write_csv(path: Path, counts: Counts) -> None:
@@ -447,9 +459,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 yield from make(args, np.random.default_rng(args.seed))
 
     counts, seconds = study(pairs(), methods(args.features))
-    write_csv(args.out / "descriptors.csv", counts)
-    draw(args.out / "descriptors.png", counts)
     print_table(counts, seconds)
+    both = read_csv(args.out / "descriptors.csv") | counts
+    write_csv(args.out / "descriptors.csv", both)
+    draw(args.out / "descriptors.png", both)
     print(surf_note())
     return 0
 
