@@ -8,7 +8,7 @@ correspondences) and the scan's surface under all points of the map determine po
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
 from ingest.precision import linearise
 from ingest.register.block import Block, block_of_map, map_of_block
-from ingest.register.scan_block import Control, Planes, Sigmas, solve
+from ingest.register.scan_block import Control, Planes, Sigmas, lens_covariance, solve
 from ingest.register.similarity import similarities
 from ingest.register.structure import StructurePlacement, move_in_map_frame
 from ingest.register.structure_pairs import RegisteredImage
@@ -80,7 +80,8 @@ class LidarAdjustment:
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame, None when refused.
-        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
+        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity) and of what its
+            lens leaves open, or None.
         before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
         seconds: of the whole.
@@ -146,8 +147,7 @@ def adjust_to_scan(
         reason=None,
         message="adjusted to the scan",
         block=block,
-        # What moves the whole map is known no worse than before: the similarity's own covariance stands.
-        covariance=structure.covariance,
+        covariance=_placement_covariance(block, control, surface, structure, start, options),
         before_m=before,
         after_m=after,
         figures=figures,
@@ -221,6 +221,39 @@ def _iterate(start: Block, control: Control, surface: Surface, options: AdjustLi
         if settled:
             break
     return block
+
+
+def _placement_covariance(
+    block: Block,
+    control: Control,
+    surface: Surface,
+    structure: StructurePlacement,
+    start: Block,
+    options: AdjustLidarOptions,
+) -> FloatArray:
+    """(7, 7): the similarity's, and what the lens leaves open for whoever is localised through it.
+
+    A principal point that is wrong by a pixel moves a camera that looks down by a pixel on the ground, a
+    focal length that is wrong by a thousandth lifts it by a thousandth of the distance. Points do not move
+    so far: for them the covariance is on the safe side. Residuals count with their spread as it is, and as
+    neighbours err alike, by as much less as the pairs of structure projection do.
+    """
+    assert structure.covariance is not None  # accepted
+    planes = _planes(surface, block.xyz, options.reach_m)
+    sigmas = _sigmas(block, control, planes, replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3))
+    lenses = lens_covariance(block, control, planes, start.cameras, sigmas)
+    distances = np.linalg.norm(block.xyz[block.point_of] - block.centers()[block.photo_of], axis=1)
+    distance = float(np.median(distances))
+    variances = []
+    for camera, lens in zip(block.cameras, lenses, strict=True):
+        template = camera.to_pycolmap()
+        focal, center = template.focal_length_idxs(), template.principal_point_idxs()
+        relative = np.diag(lens) * (distance / camera.focal_px) ** 2
+        variances.append([relative[center].max(), relative[center].max(), relative[focal].max()])
+    covariance = np.array(structure.covariance)
+    dilution = float(structure.figures["neighbours_factor"])
+    covariance[4:, 4:] += dilution * np.diag(np.max(variances, axis=0))
+    return covariance
 
 
 def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> Planes:

@@ -260,8 +260,34 @@ def _lens_prior(
     return np.array(residual), np.array(weight)
 
 
-def _step(terms: _Terms, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Increments of the shared parameters and of the points (n, 3)."""
+def lens_covariance(
+    block: Block, control: Control, planes: Planes, start: tuple[Camera, ...], sigmas: Sigmas
+) -> list[FloatArray]:
+    """Covariance (p, p) of each camera's parameters, all else estimated too, for independent residuals."""
+    terms = _terms(block, control, planes, block.xyz, start, sigmas)
+    system = _reduce(terms, 1e-12)
+    covariance = system.scale[:, None] * np.linalg.inv(system.scaled) * system.scale
+    result, first = [], 6 * len(block.cam_from_block)
+    for camera in block.cameras:
+        end = first + len(camera.params)
+        result.append(np.asarray(covariance[first:end, first:end]))
+        first = end
+    return result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Reduced:
+    """The normal equations of the shared parameters, points eliminated, scaled to a unit diagonal."""
+
+    scaled: FloatArray
+    scale: FloatArray
+    gradient: FloatArray
+    gradient_points: FloatArray
+    inverse: FloatArray
+    across: sparse.csr_matrix
+
+
+def _reduce(terms: _Terms, damping: float) -> _Reduced:
     n = terms.by_point.shape[1] // 3
     normal_points = (terms.by_point.T @ terms.by_point).tocsr()
     blocks = _diagonal_blocks(normal_points, n)
@@ -274,15 +300,25 @@ def _step(terms: _Terms, damping: float) -> tuple[FloatArray, FloatArray]:
     shared = (terms.shared.T @ terms.shared).toarray()
     shared[np.diag_indices(len(shared))] *= 1.0 + damping
     gradient_points = terms.by_point.T @ terms.residual
-    gradient = terms.shared.T @ terms.residual - carried.T @ gradient_points
-    reduced = shared - (across.T @ carried).toarray()
-    # Scaled to a unit diagonal: lens coefficients and metres differ by orders of magnitude.
+    # Lens coefficients and metres differ by orders of magnitude.
     scale = 1.0 / np.sqrt(np.maximum(np.diag(shared), 1e-12))
-    solution = scale * np.linalg.solve(
-        reduced * scale[:, None] * scale + 1e-12 * np.eye(len(scale)), scale * gradient
+    reduced = shared - (across.T @ carried).toarray()
+    return _Reduced(
+        scaled=reduced * scale[:, None] * scale + 1e-12 * np.eye(len(scale)),
+        scale=scale,
+        gradient=terms.shared.T @ terms.residual - carried.T @ gradient_points,
+        gradient_points=gradient_points,
+        inverse=inverse,
+        across=across,
     )
-    points = np.einsum("nij,nj->ni", inverse, (gradient_points - across @ solution).reshape(-1, 3))
-    return solution, points
+
+
+def _step(terms: _Terms, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Increments of the shared parameters and of the points (n, 3)."""
+    system = _reduce(terms, damping)
+    solution = system.scale * np.linalg.solve(system.scaled, system.scale * system.gradient)
+    left = (system.gradient_points - system.across @ solution).reshape(-1, 3)
+    return solution, np.einsum("nij,nj->ni", system.inverse, left)
 
 
 def _diagonal_blocks(matrix: sparse.csr_matrix, n: int) -> FloatArray:

@@ -292,3 +292,19 @@ def test_the_placement_s_similarity_is_next_to_the_truth(world: ScannedMap) -> N
     _, adjustment = _adjusted(world, (0, 4, 8))
     after = adjusted_map(world.feature_map, adjustment, world.cloud)
     assert np.abs(Sim3.log(after.placement.local_from_sfm)[:4]).max() < 0.01
+
+
+def test_the_covariance_covers_the_cameras(wrong_lens: ScannedMap) -> None:
+    """What the lens leaves open is in the placement's covariance: cameras are off by no more than it says."""
+    structure, adjustment = _adjusted(wrong_lens, (4,))
+    assert structure.covariance is not None
+    assert adjustment.covariance is not None
+    after = adjusted_map(wrong_lens.feature_map, adjustment, wrong_lens.cloud)
+    sigma = np.sqrt(np.diag(after.placement.covariance)[4:])
+    off = np.array(
+        [i.cam_from_local.center - p.center for i, p in zip(after.images, wrong_lens.true_poses, strict=True)]
+    )
+    assert (np.abs(off.mean(axis=0)) < 3 * sigma).all()
+    # More than the similarity alone knew, and still decimetres.
+    assert (sigma > np.sqrt(np.diag(structure.covariance)[4:])).all()
+    assert sigma.max() < 1.0
