@@ -1,0 +1,167 @@
+"""Real photos registered to a real scan, one by one, from their EXIF alone and from priors that are wrong.
+
+    uv run python tools/frame_real_photos.py SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
+        [--photos NAME ...] [--refine]
+
+Two registrations of each photo:
+
+- `exif`: position and pitch from EXIF and XMP, heading unknown (drones turn the gimbal's by 180 degrees);
+- `wrong`: the pose found so, made wrong by 15 m and 10 degrees in random directions.
+
+Both have to end at one pose; the table prints how far apart they are, in metres and degrees, with inliers,
+wall and CPU seconds and the time by stage. Exit code 0 if all were accepted, agree within 0.3 m and 0.25 degrees,
+and none of the second kind took more than --max-s of CPU time divided by two cores.
+"""
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.features.exif import read_exif
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from featuredb.render.cloud import PointCloud
+from featuredb.render.levels import build_cloud
+from ingest.register.frame import register_frame
+from ingest.register.frame_options import FrameOptions
+from ingest.register.frame_registration import FramePrior, FrameRegistration
+
+_SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    cloud = read_cloud(args.scan, args.epsg)
+    options = FrameOptions(threads=2, refine=args.refine)
+    names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
+    passed = True
+    for number, name in enumerate(names):
+        data = (args.folder / name).read_bytes()
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise SystemExit(f"{name}: not an image that can be read")
+        image = np.asarray(image, dtype=np.uint8)
+        camera = lens(args.lens, image.shape[1], image.shape[0])
+        first, _ = _timed(name, "exif", image, camera, exif_prior(data, cloud), cloud, options, None)
+        passed &= first.accepted
+        if first.cam_from_local is None:
+            continue
+        wrong = wrong_prior(first.cam_from_local, np.random.default_rng(number))
+        second, cpu_s = _timed(name, "wrong", image, camera, wrong, cloud, options, first.cam_from_local)
+        passed &= second.cam_from_local is not None and cpu_s <= 2.0 * args.max_s
+        if second.cam_from_local is not None:
+            off_m, off_deg = _apart(second.cam_from_local, first.cam_from_local)
+            passed &= off_m <= 0.3 and off_deg <= 0.25
+    return 0 if passed else 1
+
+
+def _timed(
+    name: str,
+    case: str,
+    image: NDArray[np.uint8],
+    camera: Camera,
+    prior: FramePrior,
+    cloud: PointCloud,
+    options: FrameOptions,
+    reference: Rigid3 | None,
+) -> tuple[FrameRegistration, float]:
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = register_frame(image, camera, prior, cloud, options)
+    wall_s, cpu_s = time.perf_counter() - wall, time.process_time() - cpu
+    off = ""
+    if found.cam_from_local is not None and reference is not None:
+        off = "{:.3f} m {:.3f} deg".format(*_apart(found.cam_from_local, reference))
+    stages = " ".join(f"{stage} {seconds:.1f}" for stage, seconds in found.seconds.items())
+    sys.stdout.write(
+        f"{name:<14} {case:<6} {'accepted' if found.accepted else found.reason:<18} inliers {len(found.pixels):>5} "
+        f"apart {off or '-':<20} wall {wall_s:5.1f} s, CPU {cpu_s:5.1f} s ({stages}) {found.message}\n"
+    )
+    sys.stdout.flush()
+    return found, cpu_s
+
+
+def read_cloud(path: Path, epsg: int) -> PointCloud:
+    """A coloured scan in UTM metres, whole, with 8-bit colours in 16-bit fields or full ones."""
+    scan = laspy.read(path)
+    utm = np.stack([scan.x, scan.y, scan.z], axis=1)
+    middle = (utm.min(axis=0) + utm.max(axis=0)) / 2.0
+    frame = LocalFrame.from_utm(middle[0], middle[1], 0.0, epsg)
+    rgb = np.stack([scan.red, scan.green, scan.blue], axis=1)
+    rgb = rgb >> 8 if rgb.max() > 255 else rgb
+    return build_cloud(frame, "unknown", frame.enu_from_utm(utm, epsg), rgb=rgb.astype(np.uint8))
+
+
+def lens(text: str, width: int, height: int) -> Camera:
+    """A camera of a model and its parameters, MODEL:p1,p2,..."""
+    model, _, params = text.partition(":")
+    return Camera(model=model, width=width, height=height, params=tuple(float(p) for p in params.split(",")))
+
+
+def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
+    """Position from GPS, pitch from XMP or straight down, no heading."""
+    exif = read_exif(data)
+    if exif.latitude_deg is None or exif.longitude_deg is None or exif.altitude_m is None:
+        raise SystemExit("a photo without GPS cannot be registered from EXIF alone")
+    center = cloud.frame.enu_from_geodetic([exif.latitude_deg, exif.longitude_deg, 0.0])
+    center[2] = exif.altitude_m
+    pitch = -90.0 if exif.gimbal_pitch_deg is None else exif.gimbal_pitch_deg
+    return FramePrior(
+        cam_from_local=_posed(_looking_north(np.radians(pitch)), center),
+        sigma_horizontal_m=5.0,
+        sigma_vertical_m=12.0,  # heights of drones are metres to tens of metres off
+        sigma_heading_deg=180.0,
+        sigma_tilt_deg=5.0,
+    )
+
+
+def wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
+    """15 m and 10 degrees off."""
+    shift, axis = rng.normal(size=3), rng.normal(size=3)
+    rotation = truth.rotation @ so3_exp(np.radians(10.0) * axis / np.linalg.norm(axis))
+    return FramePrior(
+        cam_from_local=_posed(rotation, truth.center + 15.0 * shift / np.linalg.norm(shift)),
+        sigma_horizontal_m=_SIGMA_M,
+        sigma_vertical_m=_SIGMA_M,
+        sigma_heading_deg=_SIGMA_DEG,
+        sigma_tilt_deg=_SIGMA_DEG,
+    )
+
+
+def _looking_north(pitch_rad: float) -> FloatArray:
+    forward = np.array([0.0, np.cos(pitch_rad), np.sin(pitch_rad)])
+    right = np.array([1.0, 0.0, 0.0])
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _posed(rotation: FloatArray, center: FloatArray) -> Rigid3:
+    return Rigid3(rotation=rotation, translation=-rotation @ center)
+
+
+def _apart(a: Rigid3, b: Rigid3) -> tuple[float, float]:
+    return float(np.linalg.norm(a.center - b.center)), a.angle_to_deg(b)
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("scan", type=Path)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
+    parser.add_argument("--epsg", type=int, default=32615, help="UTM zone of the scan")
+    parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
+    parser.add_argument("--refine", action="store_true", help="with intensity refinement")
+    parser.add_argument("--max-s", type=float, default=10.0, help="seconds on two cores")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
