@@ -1,7 +1,7 @@
 """A map of rolling ground with exact truth, and a scan of the same ground: no photos, no reconstruction.
 
-The map is built at the truth and then moved by a known similarity, as a poor placement would, so that the move
-that puts it back is known exactly.
+The map is built at the truth and then moved by a known similarity, as a poor placement would, so that the
+move that puts it back is known exactly.
 """
 
 from dataclasses import dataclass
@@ -52,7 +52,7 @@ class ScannedMap:
         lens: Camera | None = None,
         seed: int = 0,
     ) -> RegisteredImage:
-        """The frame at its true pose, perturbed on the left by `error` (6,), with correspondences on request."""
+        """The frame at its true pose, perturbed on the left by `error` (6,)."""
         pose = self.true_poses[image]
         rng = np.random.default_rng(seed)
         points = ground_points(rng, 4 * correspondences + 1)

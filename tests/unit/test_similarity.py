@@ -31,7 +31,7 @@ def _pairs(
     frame_sigma: float = 0.0,
     cell_sigma: float = 0.0,
 ) -> Pairs:
-    """Pairs of _TRUE with independent errors, errors shared by a frame (a shift), and by cells of 20 pairs."""
+    """Pairs of _TRUE; errors of their own, shared by a frame (a shift), and shared by 20 neighbours."""
     target = np.column_stack([rng.uniform(-40, 40, (count, 2)), rng.normal(0, 3, count)])
     frame_of = np.arange(count) % frames
     cell_of = np.arange(count) // 20
