@@ -17,13 +17,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
-from ingest.register.adjust_lidar import AdjustLidarOptions, adjust_to_scan, adjusted_map
+from ingest.register.adjust_lidar import AdjustLidarOptions, LidarAdjustment, adjust_to_scan, adjusted_map
 from ingest.register.anchor_frames import FramesOptions, TriedFrame, TriedFrames, register_again, try_frames
 from ingest.register.frame_registration import FramePrior
 from ingest.register.frames_agree import AgreementOptions, FrameAgreement, LoneFrame, frames_that_agree
 from ingest.register.map_move import MapMove, MapResidual, map_move, map_residuals, viewing_distance_m
 from ingest.register.proposals import PhotoReader
-from ingest.register.structure import StructureOptions, placed_map, project_structure
+from ingest.register.structure import StructureOptions, StructurePlacement, placed_map, project_structure
 from ingest.register.structure_pairs import RegisteredImage
 
 _LOG = logging.getLogger(__name__)
@@ -46,9 +46,12 @@ class AnchorOptions:
     Attributes:
         frames: which frames, and how each is registered.
         agreement: of frames with each other.
-        structure, adjust: of the placing. Tracks and correspondences are trusted to a pixel in 2000, as the
-            pairs of structure projection are: what a lens model leaves is the same in all photos of a map,
-            so that thousands of tracks agree on it, and would outvote the scan.
+        structure, adjust: of the placing.
+        fuller_lens_gain: share by which tangential terms must lower the median error of the frames'
+            correspondences with the scan, so that the map's lens gets them. Photos alone trade them against
+            tilt over flat ground (decision 0004); the scan knows the tilt. Thousands of correspondences gain
+            less than a percent by four parameters that are not there.
+        fuller_lens_frames: with fewer frames the lens stays as it is.
         min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
             verdict is good, but two that were found independently and agree cannot both be wrong.
         max_placement_sigmas: how far the map may move in the plane and turn, in standard deviations of its
@@ -68,7 +71,9 @@ class AnchorOptions:
     frames: FramesOptions = field(default_factory=FramesOptions)
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
-    adjust: AdjustLidarOptions = field(default_factory=lambda: AdjustLidarOptions(min_sigma_rel=0.0005))
+    adjust: AdjustLidarOptions = field(default_factory=AdjustLidarOptions)
+    fuller_lens_gain: float = 0.05
+    fuller_lens_frames: int = 2
     min_agreeing: int = 2
     max_placement_sigmas: float = 6.0
     min_move_m: float = 2.0
@@ -319,6 +324,7 @@ def _place(
     """
     placed: FeatureMap | None = None
     rounds: list[PlaceRound] = []
+    base = feature_map
     for number in range(options.lens_rounds):
         lens = (placed or feature_map).cameras
         registered = [_registered(frame, lens) for frame in frames]
@@ -328,11 +334,11 @@ def _place(
         if not structure.accepted:
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
-        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, options.adjust)
+        base, adjustment = _adjusted(base, structure, registered, cloud, options, choose=number == 0)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
-            placed = adjusted_map(feature_map, adjustment, cloud)
-        else:
+            placed = adjusted_map(base, adjustment, cloud)
+        elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
         rounds.append(
             PlaceRound(
@@ -369,6 +375,47 @@ def _place(
             break
         frames = kept
     return placed, rounds, ""
+
+
+def _adjusted(
+    base: FeatureMap,
+    structure: StructurePlacement,
+    registered: Sequence[RegisteredImage],
+    cloud: PointCloud,
+    options: AnchorOptions,
+    *,
+    choose: bool,
+) -> tuple[FeatureMap, LidarAdjustment]:
+    """The adjustment, and the map that it belongs to: with `choose` one with a fuller lens, if that pays."""
+    plain = adjust_to_scan(base, structure, registered, cloud, options.adjust)
+    richer = with_fuller_lens(base)
+    if not choose or richer is base or len(registered) < options.fuller_lens_frames:
+        return base, plain
+    fuller = adjust_to_scan(richer, structure, registered, cloud, options.adjust)
+    if not fuller.accepted:
+        return base, plain
+    if plain.accepted:
+        before, after = (a.figures["after"]["control_median_px"] for a in (plain, fuller))
+        if after > (1.0 - options.fuller_lens_gain) * before:
+            return base, plain
+    return richer, fuller
+
+
+def with_fuller_lens(feature_map: FeatureMap) -> FeatureMap:
+    """The same map whose radial cameras have tangential terms and two focal lengths, as yet without effect.
+
+    The map itself where no camera is radial.
+    """
+    cameras = tuple(_fuller(camera) for camera in feature_map.cameras)
+    return feature_map if cameras == feature_map.cameras else replace(feature_map, cameras=cameras)
+
+
+def _fuller(camera: Camera) -> Camera:
+    if camera.model not in ("SIMPLE_RADIAL", "RADIAL"):
+        return camera
+    f, cx, cy, *radial = camera.params
+    k1, k2 = (*radial, 0.0)[:2]
+    return replace(camera, model="OPENCV", params=(f, f, cx, cy, k1, k2, 0.0, 0.0))
 
 
 def _judged(
