@@ -2,19 +2,20 @@
 
     uv run python tools/frame_evaluation.py --out DIR [--photos 20] [--seed 1] [--workers 1]
 
-A town is scanned from the air and photographed for an ortho image on other days (both are added to a database in
-DIR by the product's own way). Photos that a visiting drone takes are registered to the scan with its intensity
-only, and to the scan textured by the ortho image:
+A town is scanned from the air and photographed for an ortho image on other days; both are added to a database
+in DIR by the product's own way. Photos that a visiting drone takes are registered to the scan with its
+intensity only, and to the scan textured by the ortho image:
 
 - `prior`: priors wrong by exactly 15 m in a random direction and by 10 degrees about a random axis;
 - `other town`: photos of another town with such priors: nothing may be accepted;
 - `far prior`: photos of the town with priors wrong by 80 m that claim to be good to 9 m: nothing wrong may be
   accepted.
 
-Prints the shares registered within the limits, wrong ones accepted, normalised errors, and times by stage; writes
-frames.csv and evidence.png, the distributions behind the verdict's thresholds. Exit code 0 if at least 90 % of the
-frames are within 0.15 m and 0.15 degrees on the textured scan, 60 % within 0.30 m and 0.30 degrees on intensity
-alone, and no wrong one was accepted.
+Prints the shares registered within the limits, wrong ones accepted, normalised errors, and times; writes
+frames.csv (times by stage too) and evidence.png, the distributions behind the verdict's thresholds. Exit
+code 0 if at least 90 % of the frames
+are within 0.15 m and 0.15 degrees on the textured scan, 60 % within 0.30 m and
+0.30 degrees on intensity alone, and no wrong one was accepted.
 """
 
 import argparse
@@ -146,10 +147,12 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
         wrong = [r for r in mine if r.accepted and r.wrong]
         passed &= share >= wanted and not wrong
         lines.append(
-            f"{kind}: {len(good)} of {len(ours)} within {limit_m} m and {limit_deg} degrees ({share:.0%}, "
-            f"{wanted:.0%} wanted), {len(accepted)} accepted; median error "
-            f"{_median([r.error_m for r in accepted]):.3f} m, {_median([r.error_deg for r in accepted]):.3f} degrees; "
-            f"mean squared normalised error {np.mean([r.normalised for r in accepted] or [np.nan]):.2f} (6 wanted)"
+            f"{kind}: {len(good)} of {len(ours)} within {limit_m} m and {limit_deg} degrees "
+            f"({share:.0%}, {wanted:.0%} wanted), {len(accepted)} accepted; median error "
+            f"{_median([r.error_m for r in accepted]):.3f} m, "
+            f"{_median([r.error_deg for r in accepted]):.3f} degrees; "
+            f"mean squared normalised error "
+            f"{np.mean([r.normalised for r in accepted] or [np.nan]):.2f} (6 wanted)"
         )
         for case in ("other town", "far prior"):
             these = [r for r in mine if r.case == case]
@@ -223,12 +226,12 @@ def _row(task: Task, shot: Shot, found: FrameRegistration, wall_s: float, cpu_s:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """Evidence of right and wrong poses: what the pictures say against what the features say."""
-    import matplotlib
+    import matplotlib as mpl
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    mpl.use("Agg")
+    from matplotlib import pyplot as plt
 
-    figure, axes = pyplot.subplots(1, 2, figsize=(11, 4.5))
+    figure, axes = plt.subplots(1, 2, figsize=(11, 4.5))
     for wrong, colour, label in ((False, "tab:green", "right"), (True, "tab:red", "wrong")):
         these = [r for r in rows if r.wrong == wrong]
         axes[0].scatter(
@@ -255,8 +258,9 @@ def _done(tasks: Sequence[Task], workers: int) -> "list[Row] | map[Row]":
 
 def _line(row: Row) -> str:
     return (
-        f"{row.kind:<10} {row.case:<10} {row.photo[-8:-4]} {'accepted' if row.accepted else row.reason:<20} "
-        f"{row.error_m:8.3f} m {row.error_deg:7.3f} deg  nfa {row.log_nfa:7.1f} pieces {row.confirmation:5.1f} "
+        f"{row.kind:<10} {row.case:<10} {row.photo[-8:-4]} "
+        f"{'accepted' if row.accepted else row.reason:<20} {row.error_m:8.3f} m {row.error_deg:7.3f} deg  "
+        f"nfa {row.log_nfa:7.1f} pieces {row.confirmation:5.1f} "
         f"prior {row.prior_sigmas:4.1f} chi2 {row.normalised:6.1f} {row.matched_by:<8} {row.cpu_s:5.1f} s"
     )
 

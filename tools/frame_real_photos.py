@@ -9,8 +9,8 @@ Two registrations of each photo:
 - `wrong`: the pose found so, made wrong by 15 m and 10 degrees in random directions.
 
 Both have to end at one pose; the table prints how far apart they are, in metres and degrees, with inliers,
-wall and CPU seconds and the time by stage. Exit code 0 if all were accepted, agree within 0.3 m and 0.25 degrees,
-and none of the second kind took more than --max-s of CPU time divided by two cores.
+wall and CPU seconds and the time by stage. Exit code 0 if all were accepted, agree within 0.3 m and 0.25
+degrees, and none of the second kind took more than --max-s of CPU time divided by two cores.
 """
 
 import argparse
@@ -83,8 +83,9 @@ def _timed(
         off = "{:.3f} m {:.3f} deg".format(*_apart(found.cam_from_local, reference))
     stages = " ".join(f"{stage} {seconds:.1f}" for stage, seconds in found.seconds.items())
     sys.stdout.write(
-        f"{name:<14} {case:<6} {'accepted' if found.accepted else found.reason:<18} inliers {len(found.pixels):>5} "
-        f"apart {off or '-':<20} wall {wall_s:5.1f} s, CPU {cpu_s:5.1f} s ({stages}) {found.message}\n"
+        f"{name:<14} {case:<6} {'accepted' if found.accepted else found.reason:<18} "
+        f"inliers {len(found.pixels):>5} apart {off or '-':<20} "
+        f"wall {wall_s:5.1f} s, CPU {cpu_s:5.1f} s ({stages}) {found.message}\n"
     )
     sys.stdout.flush()
     return found, cpu_s

@@ -90,7 +90,7 @@ class _Judged:
 
 
 def _best(views: FrameViews, prior: FramePrior, clock: "_Clock") -> _Judged | None:
-    """The first pose that is beyond doubt, or the one that the pictures confirm most of all that were found."""
+    """The first pose that is beyond doubt, or of all found the one that the pictures confirm most."""
     options = views.options
     judged: list[_Judged] = []
     for start in _starts(views, prior, clock):
@@ -106,7 +106,7 @@ def _best(views: FrameViews, prior: FramePrior, clock: "_Clock") -> _Judged | No
 
 
 def _starts(views: FrameViews, prior: FramePrior, clock: "_Clock") -> Iterator[FrameHypothesis]:
-    """Poses to begin with, made as they are asked for: source by source, features first, then dense templates."""
+    """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
     options = views.options
     with clock.stage("render star"):
         star = star_groups(views, prior)
@@ -130,7 +130,7 @@ def _starts(views: FrameViews, prior: FramePrior, clock: "_Clock") -> Iterator[F
 
 
 def _polished(views: FrameViews, found: FrameHypothesis, clock: "_Clock") -> _Judged:
-    """Fitted by guided features where colours are rendered, else by dense pieces; and shown to the pictures."""
+    """Fitted by guided features where colours are rendered, else by pieces; and shown to the pictures."""
     by_features = found.source == "rgb" and found.kind != "dense"
     with clock.stage("fit"):
         fitted = _guided(views, found) if by_features else dense_fitted(views, found, views.options.dense_fit)
@@ -144,7 +144,7 @@ def _polished(views: FrameViews, found: FrameHypothesis, clock: "_Clock") -> _Ju
 
 
 def _refined(views: FrameViews, judged: _Judged) -> _Judged:
-    """By intensities, where the pieces of the photo agree with the refined pose better than with the fitted one."""
+    """By intensities, where the photo's pieces agree better with the refined pose than the fitted one."""
     refined = intensity_refined(views, judged.found)
     again = _Judged(found=refined, confirmation=confirmed(views, refined))
     return again if again.confirmation.score > judged.confirmation.score else judged
@@ -274,8 +274,8 @@ def _refused(
 def _gray(image: NDArray[np.uint8], camera: Camera) -> NDArray[np.uint8]:
     if image.dtype != np.uint8 or image.shape[:2] != (camera.height, camera.width):
         raise ImageError(
-            f"register_frame: expected uint8 pixels of the camera's size {camera.width}x{camera.height}, found "
-            f"{image.dtype} {image.shape}"
+            f"register_frame: expected uint8 pixels of the camera's size {camera.width}x{camera.height}, "
+            f"found {image.dtype} {image.shape}"
         )
     if image.ndim == 2:
         return image

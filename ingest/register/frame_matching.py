@@ -76,8 +76,8 @@ def guided_matches(
     if len(features) == 0 or len(seen) == 0:
         return joined([])
     k = min(24, len(seen))
-    distance, near = cKDTree(projected[seen]).query(features.xy, k=k, distance_upper_bound=radius_px)
-    distance, near = distance.reshape(len(features), k), near.reshape(len(features), k)
+    found = cKDTree(projected[seen]).query(features.xy, k=k, distance_upper_bound=radius_px)
+    distance, near = (np.asarray(part).reshape(len(features), k) for part in found)
     missing = ~np.isfinite(distance)
     row = seen[np.where(missing, 0, near)]
     squared = np.empty(row.shape, np.float32)

@@ -20,26 +20,27 @@ class FrameOptions:
             come first: where a scan has them they match best by far, and a decisive result ends the search.
         estimate_focal: the focal length is estimated with the pose; refused where it cannot be told from
             the distance, as over flat ground.
-        refine: whether a confirmed pose is refined by mutual information and gradient correlation, and that kept
-            where the photo's pieces agree better. Off: the fit to dense pieces is more accurate by half
+        refine: whether a confirmed pose is refined by mutual information and gradient correlation, and that
+            kept where the photo's pieces agree better. Off: the fit to dense pieces is more accurate by half
             (docs/registration.md).
         search_side_px, final_side_px: longer side of the renders of the first round and of those from the
             pose found, at most.
         min_side_px: and at least; smaller pictures show too little.
         spacing_px: renders are no finer than this many pixels between scan points: splats show nothing more.
         search_features, final_features: per render. photo_features: of the photo.
-        max_ratio: of descriptor distances, best to next place. Loose: the true matches are among the bad ones.
+        max_ratio: of descriptor distances, best to next place. Loose: true ones are among the bad.
         same_place: pool points nearer than this share of their distance from the camera are one place.
         guided_radius_rel: first radius around a predicted place in which a match is looked for, share of the
             longer side; the second is a third of it.
         min_log_nfa: a pose with less evidence among the features' matches is not looked into.
         decisive_log_nfa: one with so much, if the pictures confirm it, ends the search.
-        sure_confirmation_log_nfa: and so does one that the pictures confirm so strongly. Right poses have 35 and more, wrong ones next to nothing.
+        sure_confirmation_log_nfa: and so does one that the pictures confirm so strongly. Three of
+            four right poses do; wrong ones reached 8.
         tolerance_rel: inlier tolerance as a share of the longer side (4 pixels at 1600), where points are
             denser than pixels; max_tolerance_rel: where they are sparser, it grows up to this.
-        correlated_inliers: so many inliers count as one measurement. shared_point_share: standard deviation of
-            what all inliers share, as a share of the scan's spacing. Both from the normalised errors that
-            tools/frame_evaluation.py prints.
+        correlated_inliers: so many inliers count as one measurement. shared_point_share: standard
+            deviation of what all inliers share, as a share of the scan's spacing. Both from the
+            normalised errors that tools/frame_evaluation.py prints.
         threads: for renders and features; 0 takes as many as the process may use, up to four.
         seed: of RANSAC.
     """

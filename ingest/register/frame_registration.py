@@ -56,8 +56,8 @@ class FrameRegistration:
         source: what was rendered for the accepted pose.
         points_local: (n, 3) scan points of the inlier correspondences, local frame, metres.
         pixels: (n, 2) where the photo shows them, full-size pixels.
-        camera: intrinsics that belong to the pose: the ones given, or with the focal length estimated; None when
-            refused.
+        camera: intrinsics that belong to the pose: the ones given, or with the focal length estimated; None
+            when refused.
         evidence: figures behind the verdict, JSON-able.
         seconds: time by stage, in order.
     """

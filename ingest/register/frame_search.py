@@ -18,12 +18,12 @@ from ingest.register.pool import Pool
 from ingest.register.star import fan_headings_deg, star_poses, turned_about_vertical
 from reloc.acceptance import independent_inliers, log_nfa
 from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
 
 MatchKind = Literal["upright", "oriented", "dense"]
 
 _NADIR_COSINE = 0.87  # within 30 degrees of straight down a heading is a rotation of the image
-# One structure's keypoints at several scales lie this close together, share of the longer side (3 px at 1600).
+# One structure's keypoints at several scales lie this close, share of the longer side (3 px at 1600).
 _SAME_STRUCTURE_REL = 0.002
 
 
@@ -34,8 +34,8 @@ class FrameHypothesis:
     Attributes:
         pose: with the lens. source: what was rendered.
         matches: all that it was found among. inliers: those of them that agree and are independent.
-        candidates: matches before any selection by geometry; log_nfa: evidence that the pose is no chance among
-            these, so that nothing that was selected by the pose testifies for it.
+        candidates: matches before any selection by geometry; log_nfa: evidence that the pose is no chance
+            among these, so that nothing that was selected by the pose testifies for it.
         kind: what was matched first.
         rival_share: support of the best pose elsewhere, as a share of this one's.
     """
@@ -64,7 +64,7 @@ class RenderGroup:
 
 
 def star_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
-    """Renders of the star around the prior: for features with orientation, and upright ones near its heading."""
+    """Renders of the star around the prior: for features with orientation, and upright ones."""
     options = views.options
     poses = star_poses(prior, views.look.depth_m, views.camera, options.star)
     turn = 180.0 if _any_heading(prior, options) else options.consistency.max_turn_deg
@@ -215,7 +215,7 @@ def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
     return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
 
 
-def _lens(options: FrameOptions) -> str:
+def _lens(options: FrameOptions) -> CameraSource:
     return "exif" if options.estimate_focal else "request"
 
 

@@ -54,8 +54,8 @@ def focal_sigma_rel(
 ) -> float:
     """Standard deviation of an estimated focal length as a share of it; 0 where the lens was given.
 
-    From the inliers with the residuals' own variance, so many of them counted as one, and what was known of the lens beforehand: over flat
-    ground it stays at that.
+    From the inliers with the residuals' own variance, so many of them counted as one, and what was known
+    of the lens beforehand: over flat ground it stays at that.
     """
     if pose.lens_information is None or len(points) < 6:
         return 0.0

@@ -19,13 +19,14 @@ class VerdictOptions:
     Attributes:
         min_cover: smallest share of a render that shows the scan.
         min_inliers: fewer independent inliers are never believed.
-        min_agreement: smallest share of the parts of the photo where the scan should be seen that hold inliers.
+        min_agreement: smallest share of the parts of the photo where the scan should be seen that hold
+            inliers.
         min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
         min_log_nfa_alone: features with that much evidence among their unguided matches need no confirmation
             where the pictures have fewer than `min_confirmation_pieces` pieces to compare.
-        min_confirmation_log_nfa: evidence of the pictures that a pose without so many features needs. It is the
-            best of very many that were tried, and towns resemble each other: photos of another town reach 8,
-            right poses begin at 25.
+        min_confirmation_log_nfa: evidence of the pictures that a pose without so many features needs. It is
+            the best of very many that were tried, and towns resemble each other: photos of another town
+            reached 8.4; of right poses on intensity alone the weakest had 10, the next 20.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
         max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
             axes together. Generous: people and devices understate their errors.
@@ -54,7 +55,8 @@ class FrameEvidence:
     Attributes:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them, see VerdictOptions.
-        confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message: see ingest.register.confirmation.
+        confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message:
+            see ingest.register.confirmation.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
@@ -82,7 +84,8 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     e, o = evidence, options
     if e.inliers < o.min_inliers:
         return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {o.min_inliers} needed"
-    # Pictures that show too little of the scan to be asked contradict nothing; decisive features need no help.
+    # Pictures that show too little of the scan to be asked contradict nothing;
+    # decisive features need no help.
     silent = e.confirmation_pieces < o.min_confirmation_pieces and e.log_nfa >= o.min_log_nfa_alone
     if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
@@ -95,22 +98,22 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
             "NO_CONSISTENT_POSE",
-            f"inliers lie in {e.cells} of a hundred parts of the photo, {100 * e.agreement:.0f} % of those where "
-            f"the scan should be seen; {o.min_cells} and {100 * o.min_agreement:.0f} % needed",
+            f"inliers lie in {e.cells} of a hundred parts of the photo, {100 * e.agreement:.0f} % of those "
+            f"where the scan should be seen; {o.min_cells} and {100 * o.min_agreement:.0f} % needed",
         )
     if e.rival_share >= o.rival_share:
         return "AMBIGUOUS", f"a pose elsewhere has {100 * e.rival_share:.0f} % of this one's inliers"
     if e.position_sigma_share > o.max_position_sigma_share or e.focal_sigma_rel > o.max_focal_sigma_rel:
         return (
             "NO_CONSISTENT_POSE",
-            f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % of "
-            f"the distance, focal length to {100 * e.focal_sigma_rel:.1f} %; over flat ground a focal length "
-            "cannot be told from a distance: give a calibrated camera",
+            f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % "
+            f"of the distance, focal length to {100 * e.focal_sigma_rel:.1f} %; over flat ground a focal "
+            "length cannot be told from a distance: give a calibrated camera",
         )
     if e.prior_sigmas > o.max_prior_sigmas:
         return (
             "CONTRADICTS_PRIOR",
-            f"the pose lies {e.prior_sigmas:.1f} standard deviations from the prior, {o.max_prior_sigmas:.0f} "
+            f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {o.max_prior_sigmas:.0f} "
             "allowed; if the prior's deviations are too small, give larger ones",
         )
     return None
@@ -139,7 +142,7 @@ def _tilt_deg(prior: Rigid3, pose: Rigid3) -> FloatArray:
 
 
 def cells_with_inliers(pixels: FloatArray, valid: NDArray[np.bool_], camera: Camera) -> tuple[int, float]:
-    """How many parts of a 10x10 grid over the photo hold inliers, and their share of those that show the scan.
+    """How many parts of a 10x10 grid over the photo hold inliers, and their share of those with the scan.
 
     Args:
         pixels: (k, 2) full-size pixels. valid: (h, w) of a render from the pose.

@@ -61,7 +61,7 @@ def star_poses(prior: FramePrior, depth_m: float, camera: Camera, options: StarO
 
 
 def fan_headings_deg(sigma_heading_deg: float, options: StarOptions) -> list[float]:
-    """Turns about the vertical that upright features need, 0 first; the full circle where nothing is known."""
+    """Turns about the vertical that upright features need, 0 first; the full circle if nothing is known."""
     step = 2.0 * options.upright_reach_deg
     if sigma_heading_deg >= options.full_circle_sigma_deg:
         return [i * step for i in range(round(360.0 / step))]

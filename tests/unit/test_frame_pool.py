@@ -57,7 +57,8 @@ def test_pool_leaves_out_the_border_of_what_is_seen(upright: bool) -> None:
     depth[:, :100] = np.nan
     pool = pool_features([rendering(depth), rendering(depth)], "rgb", upright, PoolOptions())
     pixels = CAMERA.project(POSE.act(pool.points))
-    assert len(pool) > 100 and len(pool.descriptors) == len(pool)
+    assert len(pool) > 100
+    assert len(pool.descriptors) == len(pool)
     assert pixels[:, 0].min() > 101.0
 
 

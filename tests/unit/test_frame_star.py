@@ -36,7 +36,8 @@ def test_seven_views_sideways_and_along_the_axis() -> None:
     np.testing.assert_allclose(moved[0], 0.0, atol=1e-9)
     for axis in range(3):
         along = moved[np.abs(moved[:, axis]) > 1e-6]
-        assert len(along) == 2 and along[0, axis] * along[1, axis] < 0
+        assert len(along) == 2
+        assert along[0, axis] * along[1, axis] < 0
         np.testing.assert_allclose(np.delete(along, axis, axis=1), 0.0, atol=1e-9)
 
 
@@ -54,19 +55,22 @@ def test_views_keep_the_rotation_and_zoom_within_bounds() -> None:
     poses = star_poses(p, 60.0, CAMERA, StarOptions())
     assert all(pose.angle_to_deg(p.cam_from_local) < 1e-9 for pose in poses)
     depth = 60.0 - np.array([p.cam_from_local.act(pose.center)[2] for pose in poses])
-    assert depth.min() == pytest.approx(60.0 / 1.4) and depth.max() == pytest.approx(60.0 * 1.4)
+    assert depth.min() == pytest.approx(60.0 / 1.4)
+    assert depth.max() == pytest.approx(60.0 * 1.4)
 
 
 def test_fan_covers_the_circle_when_nothing_is_known() -> None:
     angles = np.sort(np.mod(fan_headings_deg(180.0, StarOptions()), 360.0))
     gaps = np.diff([*angles, angles[0] + 360.0])
-    assert len(angles) == 12 and gaps.max() <= 2.0 * StarOptions().upright_reach_deg + 1e-9
+    assert len(angles) == 12
+    assert gaps.max() <= 2.0 * StarOptions().upright_reach_deg + 1e-9
 
 
 @pytest.mark.parametrize(("sigma", "count"), [(5.0, 1), (7.5, 1), (10.0, 3), (30.0, 5)])
 def test_fan_covers_two_sigmas(sigma: float, count: int) -> None:
     angles = fan_headings_deg(sigma, StarOptions())
-    assert angles[0] == 0.0 and len(angles) == count
+    assert angles[0] == 0.0
+    assert len(angles) == count
     assert max(angles) + StarOptions().upright_reach_deg >= 2.0 * sigma
 
 
