@@ -62,10 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def read_poses(path: Path) -> tuple[LocalFrame, dict[str, Rigid3]]:
     """The frame and the poses that tools/scan_poses.py wrote."""
     document = json.loads(path.read_text(encoding="utf-8"))
-    given = document["frame"]
-    frame = LocalFrame(
-        latitude_deg=given["latitude_deg"], longitude_deg=given["longitude_deg"], height_m=given["height_m"]
-    )
+    easting, northing, height = document["origin"]
+    frame = LocalFrame.from_utm(easting, northing, height, int(document["crs"].removeprefix("EPSG:")))
     poses = {
         name: Rigid3(
             rotation=np.array(entry["cam_from_local_rotation"]),
