@@ -1,4 +1,4 @@
-"""A real drone photo registered to a real scan, from EXIF alone and from a prior wrong by 15 m and 10 degrees."""
+"""A real drone photo registered to a real scan, from EXIF alone and from a wrong prior."""
 
 from pathlib import Path
 
