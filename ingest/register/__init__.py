@@ -1,1 +1,1 @@
-"""Placing a reconstruction on Earth: by the photos' GPS."""
+"""Placing a map on Earth: by the photos' GPS, by ground control points, by a LiDAR scan."""
