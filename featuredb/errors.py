@@ -66,7 +66,7 @@ class ControlFileError(FeatureDbError):
 
 
 class RegistrationError(FeatureDbError):
-    """A map cannot be registered as asked: its photos are missing, no scan covers it, a file of picks is broken."""
+    """A map cannot be registered as asked: photos are missing, no scan covers it, broken picks."""
 
 
 class ServiceError(FeatureDbError):

@@ -293,7 +293,7 @@ def _reduce(terms: _Terms, damping: float) -> _Reduced:
     blocks = _diagonal_blocks(normal_points, n)
     diagonal = np.einsum("nii->ni", blocks)
     diagonal += damping * diagonal + 1e-9 * (diagonal.max() + 1.0)
-    inverse = np.linalg.inv(blocks)
+    inverse: FloatArray = np.asarray(np.linalg.inv(blocks), dtype=np.float64)
     across = (terms.by_point.T @ terms.shared).tocsr()
     inverse_matrix = sparse.bsr_matrix((inverse, np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))
     carried = (inverse_matrix @ across).tocsr()
