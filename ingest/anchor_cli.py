@@ -105,7 +105,7 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
 def summary(done: "Anchoring", args: argparse.Namespace) -> str:
     """What happened, for the terminal; the report has the rest."""
     from featuredb.cli.common import format_table
-    from ingest.register.anchor_report import FRAME_HEADER, frame_rows
+    from ingest.register.anchor.report import FRAME_HEADER, frame_rows
 
     report, result = done.report, done.report.result
     lines = list(report.notes)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ingest.pipeline import IngestOptions
-    from ingest.register.gcp_model import Survey
+    from ingest.register.control.model import Survey
     from ingest.report import IngestReport
 
 _STAGES = ("scan", "extract", "match", "reconstruct", "build")
@@ -143,7 +143,7 @@ def run_photos(args: argparse.Namespace) -> int:
 
 def summary(report: "IngestReport") -> str:
     """A few lines for the terminal; the report has the rest."""
-    from ingest.register.gcp_evidence import residual_table
+    from ingest.register.control.evidence import residual_table
 
     lines = [
         f"{report.count('registered')} of {len(report.photos)} files registered, "
@@ -202,8 +202,8 @@ def _survey(args: argparse.Namespace) -> "Survey | None":
     if args.gcp is None:
         return None
     from ingest.cli_register import control_options
-    from ingest.register.gcp_file import read_control_file
-    from ingest.register.gcp_model import Survey
+    from ingest.register.control.control_file import read_control_file
+    from ingest.register.control.model import Survey
 
     return Survey(file=read_control_file(args.gcp, args.gcp_crs), options=control_options(args))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ingest.register.gcp import GcpOptions
+    from ingest.register.control.placement import GcpOptions
 
 
 def register(subparsers: Any) -> None:
@@ -64,8 +64,8 @@ def add_control_arguments(parser: Any) -> None:
 
 def control_options(args: argparse.Namespace) -> "GcpOptions":
     """Options of a placement by control points."""
-    from ingest.register.gcp import GcpOptions
-    from ingest.register.level import LevelOptions
+    from ingest.register.control.level import LevelOptions
+    from ingest.register.control.placement import GcpOptions
 
     level = LevelOptions()
     if args.ground_height is not None:
@@ -76,10 +76,10 @@ def control_options(args: argparse.Namespace) -> "GcpOptions":
 def run_register(args: argparse.Namespace) -> int:
     """Place, print the residuals, commit; 0 if the map has its new place, 1 if it was refused."""
     from featuredb.cli.common import open_database
-    from ingest.register.gcp_evidence import gcp_evidence, residual_table
-    from ingest.register.gcp_file import read_control_file
-    from ingest.register.gcp_map import register_by_gcp
-    from ingest.register.gcp_report import write_control_report
+    from ingest.register.control.control_file import read_control_file
+    from ingest.register.control.evidence import gcp_evidence, residual_table
+    from ingest.register.control.registered_map import register_by_gcp
+    from ingest.register.control.report import write_control_report
 
     file = read_control_file(args.gcp, args.gcp_crs)
     database = open_database(args)

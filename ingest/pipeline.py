@@ -20,7 +20,7 @@ from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes
 from ingest.photo import Photo
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, make_maps
-from ingest.register.gcp_model import Survey
+from ingest.register.control.model import Survey
 from ingest.report import IngestReport, MapOutcome
 from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder
 from ingest.stage_clock import StageClock

@@ -24,7 +24,7 @@ from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
 from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions
 from ingest.photo import Photo
-from ingest.register.gcp_model import ControlledPlacement, Survey, place_by_survey
+from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.sfm import SfmOptions, SfmTask, reconstruct
 from ingest.stage_clock import StageClock

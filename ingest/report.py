@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.gcp_model import ControlledPlacement
+from ingest.register.control.model import ControlledPlacement
 from ingest.workspace import atomic_file, write_json
 
 FileStatus = Literal["registered", "not_registered", "skipped"]

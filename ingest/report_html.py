@@ -4,7 +4,7 @@ import math
 from html import escape
 
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
-from ingest.register.gcp_report import control_html
+from ingest.register.control.report import control_html
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.report_plots import histograms_png, plan_png
 

@@ -52,7 +52,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
-from ingest.register.dense_registration import PICTURES_ALONE, register_by_pictures
+from ingest.register.frame.dense_registration import PICTURES_ALONE, register_by_pictures
 from ingest.register.frame_registration import FramePrior
 
 Floats = NDArray[np.float64]

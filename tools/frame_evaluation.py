@@ -49,8 +49,8 @@ from featuredb.simworld.sensor import SensorOptions
 from featuredb.simworld.shot import Shot
 from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
 from featuredb.store import Database
-from ingest.register.frame import register_frame
-from ingest.register.frame_options import FrameOptions
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 Kind = Literal["textured", "intensity"]

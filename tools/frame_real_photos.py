@@ -32,8 +32,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from ingest.register.frame import register_frame
-from ingest.register.frame_options import FrameOptions
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)

@@ -3,7 +3,7 @@
     python tools/ground_slopes.py SCAN... [--window 60]
 
 Prints the root mean square slope about one axis, in degrees: what placement by control points without heights
-assumes of the ground under a block (`ingest.register.level.LevelOptions`).
+assumes of the ground under a block (`ingest.register.control.level.LevelOptions`).
 """
 
 import argparse

@@ -5,8 +5,8 @@
 A town is photographed and scanned from the air; its photos become a map that is placed by their (noisy) GPS.
 Frames are drawn at random and registered: by default their pose is estimated from scan points at noisy
 pixels, through the map's own lens, as registration would (--pixel-noise, --correspondences); with --register
-they are registered by ingest.register.frame from a prior that is wrong by metres. Then the map is placed on
-the scan by structure projection and, with --adjust, adjusted to it. A point's error is its distance from
+they are registered by ingest/register/frame from a prior that is wrong by metres. Then the map is placed
+on the scan by structure projection and, with --adjust, adjusted to it. A point's error is its distance from
 where the rays of its observations, from the true cameras, meet the town.
 
 Printed: the error of the map's points with descriptors: mean, median, 90 %, and what the best similarity
@@ -42,11 +42,11 @@ from featuredb.simworld.world import World, WorldOptions, open_world, town_of, w
 from featuredb.store import Database
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.precision import linearise
-from ingest.register.adjust_lidar import adjust_to_scan, adjusted_map
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from ingest.register.similarity import similarities
-from ingest.register.structure import placed_map, project_structure
-from ingest.register.structure_pairs import RegisteredImage
+from ingest.register.structure.adjustment import adjust_to_scan, adjusted_map
+from ingest.register.structure.pairs import RegisteredImage
+from ingest.register.structure.projection import placed_map, project_structure
+from ingest.register.structure.similarity import similarities
 
 _NOISE_CLASSES = (7, 18)
 _STEP_REL = 0.02  # neighbouring depths that differ by more lie on both sides of an edge: no truth there
@@ -241,7 +241,7 @@ def by_register_frame(
     setting: Setting, image: MapImage, generator: np.random.Generator
 ) -> FrameRegistration | None:
     """The frame registered from a prior that is wrong by 5 m and 3 degrees."""
-    from ingest.register.frame import register_frame
+    from ingest.register.frame.register import register_frame
 
     true = setting.truth.images[f"drone/{image.name}"]
     picture = render_view(setting.scene, true.camera, true.cam_from_local, moment=int(image.image_id))

@@ -11,16 +11,16 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.precision import linearise
-from ingest.register.adjust_lidar import (
+from ingest.register.control.block import Block, block_of_map, map_of_block
+from ingest.register.structure.adjustment import (
     AdjustLidarOptions,
     LidarAdjustment,
     adjust_to_scan,
     adjusted_map,
 )
-from ingest.register.block import Block, block_of_map, map_of_block
-from ingest.register.scan_block import Control, Planes, Sigmas, solve
-from ingest.register.structure import StructurePlacement, placed_map, project_structure
-from ingest.register.structure_pairs import RegisteredImage
+from ingest.register.structure.pairs import RegisteredImage
+from ingest.register.structure.projection import StructurePlacement, placed_map, project_structure
+from ingest.register.structure.scan_block import Control, Planes, Sigmas, solve
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")

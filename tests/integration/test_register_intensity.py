@@ -14,11 +14,11 @@ from featuredb.geometry.rotation import rotation_angle, so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
-from ingest.register.confirmation import confirm_pose
-from ingest.register.dense_registration import register_by_pictures
-from ingest.register.dense_templates import dense_matches
+from ingest.register.frame.confirmation import confirm_pose
+from ingest.register.frame.dense_registration import register_by_pictures
+from ingest.register.frame.dense_templates import dense_matches
+from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame_registration import FramePrior
-from ingest.register.intensity import refine_by_intensity
 
 CAMERA = Camera(
     model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 163.0, 118.0, -0.06)

@@ -10,9 +10,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.block import Block
-from ingest.register.control import Control, meet
-from ingest.register.gcp_file import ControlFile, Mark, parse_control_file
+from ingest.register.control.block import Block
+from ingest.register.control.control_file import ControlFile, Mark, parse_control_file
+from ingest.register.control.marks import Control, meet
 from tests.support.planar_map import view
 from tests.support.scenes import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, pixels_inside
 

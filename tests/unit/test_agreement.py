@@ -6,7 +6,7 @@ from scipy.stats import entropy, pearsonr
 from scipy.stats.contingency import crosstab
 
 from featuredb.errors import InvalidValueError
-from ingest.register.agreement import gradient_correlation, mutual_information, oriented_agreement
+from ingest.register.frame.agreement import gradient_correlation, mutual_information, oriented_agreement
 
 
 def _pictures(seed: int, shape: tuple[int, int] = (37, 53)) -> tuple[np.ndarray, np.ndarray]:

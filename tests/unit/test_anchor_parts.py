@@ -13,14 +13,14 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from ingest.register.anchor import with_fuller_lens
-from ingest.register.anchor_page import FramePicture, flick_page
+from ingest.register.anchor.anchor_map import with_fuller_lens
+from ingest.register.anchor.page import FramePicture, flick_page
+from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
+from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
+from ingest.register.anchor.proposals import ProposalOptions, propose_frames, small_camera
+from ingest.register.anchor.start import cam_from_grid
 from ingest.register.frame_registration import FramePrior, FrameRegistration
-from ingest.register.map_move import map_move, map_residuals, viewing_distance_m
-from ingest.register.pictures import edges_of, overlay_rgb, scan_view
-from ingest.register.proposal_file import SavedProposals, load_proposals, save_proposals
-from ingest.register.proposals import ProposalOptions, propose_frames, small_camera
-from ingest.register.start import cam_from_grid
+from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
 from tests.support.maps import random_map
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(700.0, 400.0, 300.0, 0.0))

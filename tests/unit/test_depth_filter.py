@@ -8,7 +8,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.rendering import Rendering
-from ingest.register.depth_filter import DepthFilterOptions, reliable_depth, surface_at
+from ingest.register.structure.depth_filter import DepthFilterOptions, reliable_depth, surface_at
 from tests.support.scanned_map import plain_cloud
 
 _CAMERA = Camera(model="PINHOLE", width=120, height=90, params=(100.0, 100.0, 60.0, 45.0))

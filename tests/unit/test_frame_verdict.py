@@ -8,15 +8,15 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from ingest.register.frame_registration import FramePrior
-from ingest.register.frame_uncertainty import left_perturbation
-from ingest.register.frame_verdict import (
+from ingest.register.frame.uncertainty import left_perturbation
+from ingest.register.frame.verdict import (
     FrameEvidence,
     VerdictOptions,
     cells_with_inliers,
     prior_sigmas,
     verdict,
 )
+from ingest.register.frame_registration import FramePrior
 
 GOOD = FrameEvidence(
     inliers=200,

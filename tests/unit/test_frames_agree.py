@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.frames_agree import AgreementOptions, LoneFrame, frames_that_agree
+from ingest.register.anchor.agreement import AgreementOptions, LoneFrame, frames_that_agree
 
 OPTIONS = AgreementOptions()
 

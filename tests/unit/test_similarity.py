@@ -10,7 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from ingest.register.gps import similarity_closed_form
-from ingest.register.similarity import (
+from ingest.register.structure.similarity import (
     Pairs,
     SimilarityOptions,
     ransac_similarity,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.surface_fit import (
+from ingest.register.structure.surface_fit import (
     Surface,
     SurfaceOptions,
     guarded_gicp,

@@ -1,0 +1,273 @@
+"""The first half of anchoring: frames of a map, ranked and registered to a scan one by one."""
+
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.render.cloud import PointCloud
+from ingest.executor import Progress, no_progress
+from ingest.register.anchor.proposals import (
+    FrameProposal,
+    FrameScore,
+    PhotoReader,
+    ProposalOptions,
+    propose_frames,
+)
+from ingest.register.anchor.start import HeightShift, StartOptions, height_shift, prior_from_map
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.register import register_frame
+from ingest.register.frame_registration import FramePrior, FrameRegistration
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramesOptions:
+    """Which frames are registered, and how.
+
+    Attributes:
+        frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
+        max_tries: frames tried for it, at most. Where six of ten register, as with intensities alone, six
+            tries leave fewer than two registered once in 25 maps; a wrong scan costs all of them.
+    """
+
+    frames: int = 3
+    max_tries: int = 6
+    start: StartOptions = field(default_factory=StartOptions)
+    proposals: ProposalOptions = field(default_factory=ProposalOptions)
+    frame: FrameOptions = field(default_factory=FrameOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TriedFrame:
+    """A frame that was tried.
+
+    Attributes:
+        proposal: with the prior that it started from.
+        registration: accepted or refused.
+        seconds: wall time of all of it; cpu_s: processor time.
+    """
+
+    proposal: FrameProposal
+    registration: FrameRegistration
+    seconds: float
+    cpu_s: float
+
+    @property
+    def image(self) -> MapImage:
+        return self.proposal.image
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TriedFrames:
+    """What came of the first half.
+
+    Attributes:
+        shift: heights of the scan less those of the map; None where they hardly lie above each other.
+        ranking: all frames that see the scan, most promising first.
+        tried: the frames that were tried, in order.
+        unreadable: why photos could not be opened, by image name.
+    """
+
+    shift: HeightShift | None
+    ranking: tuple[FrameProposal, ...]
+    tried: tuple[TriedFrame, ...]
+    unreadable: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> list[TriedFrame]:
+        return [frame for frame in self.tried if frame.registration.accepted]
+
+    @classmethod
+    def of_registrations(
+        cls, feature_map: FeatureMap, registrations: Mapping[int, FrameRegistration]
+    ) -> "TriedFrames":
+        """Frames that were registered earlier, as they were; their ranks and priors are no longer known."""
+        images = {image.image_id: image for image in feature_map.images}
+        tried = tuple(
+            TriedFrame(
+                proposal=_unranked(images[image_id], _prior_at(registration)),
+                registration=registration,
+                seconds=sum(registration.seconds.values()),
+                cpu_s=float("nan"),
+            )
+            for image_id, registration in registrations.items()
+        )
+        return cls(shift=None, ranking=(), tried=tried)
+
+
+def try_frames(
+    feature_map: FeatureMap,
+    cloud: PointCloud,
+    read_gray: PhotoReader,
+    options: FramesOptions,
+    *,
+    starts: Mapping[int, FramePrior] | None = None,
+    readable: Sequence[int] | None = None,
+    progress: Progress = no_progress,
+) -> TriedFrames:
+    """Rank the map's frames and register the best until enough are accepted.
+
+    Each starts from its own prior and knows nothing of the others, so that their agreement is evidence.
+
+    Args:
+        cloud: the scan around the map, in the map's local frame.
+        read_gray: grey pixels (h, w) of an image of the map.
+        starts: priors by a person, by image id; these frames are tried first.
+        readable: ids of images whose photos are there; None for all.
+    """
+    starts = starts or {}
+    shift = height_shift(feature_map, cloud, options.start)
+    ids = {i.image_id for i in feature_map.images} if readable is None else set(readable)
+    priors = {
+        image.image_id: starts.get(image.image_id, prior_from_map(feature_map, image, shift, options.start))
+        for image in feature_map.images
+        if image.image_id in ids
+    }
+    reader = _Reader(read_gray)
+    ranking = propose_frames(feature_map, cloud, priors, reader.for_ranking, options.proposals)
+    wanted = [_started(feature_map, i, starts[i], ranking) for i in starts]
+    wanted += [p for p in ranking if p.image.image_id not in starts]
+    tried: list[TriedFrame] = []
+    for proposal in wanted[: max(options.max_tries, len(starts))]:
+        if sum(frame.registration.accepted for frame in tried) >= options.frames:
+            break
+        frame = _try(feature_map, cloud, proposal, reader, options.frame)
+        if frame is not None:
+            tried.append(frame)
+        progress("register", sum(f.registration.accepted for f in tried), options.frames)
+    return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
+
+
+def _started(
+    feature_map: FeatureMap, image_id: int, prior: FramePrior, ranking: Sequence[FrameProposal]
+) -> FrameProposal:
+    """The proposal of a frame that a person chose, whether it sees much of the scan or not."""
+    ranked = [p for p in ranking if p.image.image_id == image_id]
+    if ranked:
+        return ranked[0]
+    return _unranked(next(i for i in feature_map.images if i.image_id == image_id), prior)
+
+
+def _unranked(image: MapImage, prior: FramePrior) -> FrameProposal:
+    nan = float("nan")
+    score = FrameScore(
+        score=nan, coverage=nan, downward=nan, points=0, spread=nan, texture=nan, sharpness=nan
+    )
+    return FrameProposal(image=image, score=score, prior=prior)
+
+
+def _prior_at(registration: FrameRegistration) -> FramePrior:
+    """A prior around a pose that was found already."""
+    assert registration.cam_from_local is not None
+    return FramePrior(
+        cam_from_local=registration.cam_from_local,
+        sigma_horizontal_m=1.0,
+        sigma_vertical_m=1.0,
+        sigma_heading_deg=1.0,
+        sigma_tilt_deg=1.0,
+    )
+
+
+def _try(
+    feature_map: FeatureMap,
+    cloud: PointCloud,
+    proposal: FrameProposal,
+    reader: "_Reader",
+    options: FrameOptions,
+) -> TriedFrame | None:
+    gray = reader.full(proposal.image)
+    if gray is None:
+        return None
+    camera = camera_of_photo(feature_map.cameras[proposal.image.camera_id], gray)
+    start, cpu = time.perf_counter(), time.process_time()
+    registration = register_frame(gray, camera, proposal.prior, cloud, options)
+    seconds = time.perf_counter() - start
+    _LOG.info(
+        "%s: %s in %.1f s",
+        proposal.image.name,
+        registration.reason or f"registered by {registration.source}",
+        seconds,
+    )
+    return TriedFrame(
+        proposal=proposal,
+        registration=registration,
+        seconds=seconds,
+        cpu_s=time.process_time() - cpu,
+    )
+
+
+def register_again(
+    feature_map: FeatureMap,
+    cloud: PointCloud,
+    frames: Sequence[TriedFrame],
+    read_gray: PhotoReader,
+    prior_sigma: tuple[float, float],
+    options: FrameOptions,
+) -> list[TriedFrame]:
+    """Register frames anew from where a placed map has them, with its lens.
+
+    Args:
+        prior_sigma: metres and degrees, along and about all axes.
+    """
+    again = []
+    reader = _Reader(read_gray)
+    poses = {image.image_id: image for image in feature_map.images}
+    for frame in frames:
+        image = poses[frame.image.image_id]
+        prior = FramePrior(
+            cam_from_local=image.cam_from_local,
+            sigma_horizontal_m=prior_sigma[0],
+            sigma_vertical_m=prior_sigma[0],
+            sigma_heading_deg=prior_sigma[1],
+            sigma_tilt_deg=prior_sigma[1],
+        )
+        proposal = replace(frame.proposal, image=image, prior=prior)
+        tried = _try(feature_map, cloud, proposal, reader, options)
+        if tried is not None:
+            again.append(tried)
+    return again
+
+
+def camera_of_photo(camera: Camera, gray: NDArray[np.uint8]) -> Camera:
+    """The map's camera at the size of the pixels.
+
+    Raises:
+        ImageError: another aspect: not the pixels that the map was made of.
+    """
+    height, width = gray.shape[:2]
+    if (width, height) == (camera.width, camera.height):
+        return camera
+    raise ImageError(
+        f"expected a photo of {camera.width}x{camera.height} pixels as the map's camera has, "
+        f"found {width}x{height}",
+        "wrong_size",
+    )
+
+
+class _Reader:
+    """Reads photos and remembers which could not be read."""
+
+    def __init__(self, read_gray: PhotoReader) -> None:
+        self._read: Callable[[MapImage], NDArray[np.uint8]] = read_gray
+        self.unreadable: dict[str, str] = {}
+
+    def full(self, image: MapImage) -> NDArray[np.uint8] | None:
+        try:
+            return self._read(image)
+        except ImageError as error:
+            self.unreadable[image.name] = str(error)
+            _LOG.warning("photo %s cannot be read: %s", image.name, error)
+            return None
+
+    def for_ranking(self, image: MapImage) -> NDArray[np.uint8]:
+        """A picture without texture for what cannot be read, which then comes last."""
+        gray = self.full(image)
+        return np.zeros((8, 8), np.uint8) if gray is None else gray

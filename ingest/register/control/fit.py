@@ -1,0 +1,333 @@
+"""A similarity from marked control points, robust against wrong marks and wrong coordinates.
+
+Each point has several hypotheses of where it lies in the block: the intersection of every set of its marks
+that agree, and for every single mark the place where its ray meets the ground that the block's own points
+show. A wrong mark spoils some of a point's hypotheses but not all, a wrong coordinate all of them. Least
+trimmed squares (Rousseeuw, 1984) over samples of hypotheses finds the similarity that most points agree on.
+
+Where heights are unknown only horizontal distances count; tilt and height come from elsewhere (`Vertical`).
+"""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.register.control.block import Block
+from ingest.register.control.marks import Control
+from ingest.register.control.rays import intersect, mark_errors, on_ground
+from ingest.register.gps import similarity_closed_form
+
+_MOST_PAIRS = 45  # of one point's marks: all of ten
+_SIGMA_OF_MEDIAN = {
+    2: 1.0 / 1.1774,
+    3: 1.0 / 1.5382,
+}  # median length of a normal vector in the plane, in space
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Vertical:
+    """What is known of tilt and height besides the control points.
+
+    Attributes:
+        up_block: (3,) unit vector, the vertical in the block's frame.
+        tilt_covariance: (2, 2) square radians, of the east and north components of what it becomes.
+        anchor_block: (3,) a place in the block's frame.
+        anchor_up_m: its height in the local frame; sigma_up_m: standard deviation.
+        source: where all this is from, for people.
+    """
+
+    up_block: FloatArray
+    tilt_covariance: FloatArray
+    anchor_block: FloatArray
+    anchor_up_m: float
+    sigma_up_m: float
+    source: str
+
+    def residual(self, local_from_block: Sim3) -> FloatArray:
+        """(3,) whitened: tilt east, tilt north, height."""
+        up = local_from_block.rotation @ self.up_block
+        height = local_from_block.act(self.anchor_block)[2] - self.anchor_up_m
+        return np.append(self._whiten() @ up[:2], height / self.sigma_up_m)
+
+    def jacobian(self, local_from_block: Sim3) -> FloatArray:
+        """(3, 7) of `residual` by the left perturbation."""
+        x, y, z = local_from_block.rotation @ self.up_block
+        by_rotation = np.array([[0.0, z, -y], [-z, 0.0, x]])
+        rows = np.zeros((3, 7))
+        rows[:2, 1:4] = self._whiten() @ by_rotation
+        rows[2] = point_jacobian(local_from_block.act(self.anchor_block))[2] / self.sigma_up_m
+        return rows
+
+    def _whiten(self) -> FloatArray:
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.tilt_covariance)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hypothesis:
+    """A place (3,) of a point in the block, and the rows of the marks that say so."""
+
+    point: int
+    xyz: FloatArray
+    marks: tuple[int, ...]
+    by_rays: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlFit:
+    """The similarity that most points agree on.
+
+    Attributes:
+        local_from_block: the similarity.
+        residuals_m: (n, 3) surveyed minus found; up NaN where unknown.
+        inliers: (n,) points that take part.
+        chosen: of each point.
+        sigma_m: robust standard deviation of a coordinate.
+    """
+
+    local_from_block: Sim3
+    residuals_m: FloatArray
+    inliers: NDArray[np.bool_]
+    chosen: tuple[Hypothesis, ...]
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitOptions:
+    """Robust fit.
+
+    Attributes:
+        max_mark_error_px: marks further from the common intersection disagree. A person marks to one to
+            three pixels, a block may be bent by a few; wrong targets are tens to hundreds off.
+        min_ray_angle_deg: rays closer to parallel than that give no place.
+        outlier_sigmas: points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane.
+        min_sigma_m: survey and marks are not better than that, so smaller residuals never make outliers.
+        max_samples: of hypotheses.
+        seed: of the samples.
+    """
+
+    max_mark_error_px: float = 12.0
+    min_ray_angle_deg: float = 1.0
+    outlier_sigmas: float = 3.5
+    min_sigma_m: float = 0.02
+    max_samples: int = 1500
+    seed: int = 0
+
+
+def hypotheses(block: Block, control: Control, options: FitOptions) -> list[Hypothesis]:
+    """Every place that the marks of a point, or some of them, point to."""
+    found: list[Hypothesis] = []
+    for point in range(len(control.names)):
+        rows = control.marks_of(point)
+        seen: set[tuple[int, ...]] = set()
+        for pair in itertools.islice(itertools.combinations(rows, 2), _MOST_PAIRS):
+            consensus = _consensus(block, control, rows, pair, options)
+            if consensus is not None and consensus[1] not in seen:
+                seen.add(consensus[1])
+                found.append(Hypothesis(point=point, xyz=consensus[0], marks=consensus[1], by_rays=True))
+        for row in rows:
+            ground = on_ground(block, int(control.photo_of[row]), control.xy[row])
+            if ground is not None:
+                found.append(Hypothesis(point=point, xyz=ground, marks=(int(row),), by_rays=False))
+    return found
+
+
+def _consensus(
+    block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int], options: FitOptions
+) -> tuple[FloatArray, tuple[int, ...]] | None:
+    """The intersection of all marks that agree with a pair; None where the pair does not agree itself."""
+    chosen = np.array(pair)
+    xyz = None
+    for _ in range(3):
+        xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], options.min_ray_angle_deg)
+        if xyz is None:
+            return None
+        errors = mark_errors(block, control.photo_of[rows], control.xy[rows], xyz)
+        again = rows[errors <= options.max_mark_error_px]
+        if not set(pair) <= set(again.tolist()):
+            return None
+        if np.array_equal(again, chosen):
+            break
+        chosen = again
+    return None if xyz is None else (xyz, tuple(int(r) for r in chosen))
+
+
+def fit_similarity(
+    found: Sequence[Hypothesis], surveyed: FloatArray, vertical: Vertical | None, options: FitOptions
+) -> ControlFit | None:
+    """The similarity that most points agree on, or None where no sample gives one.
+
+    Args:
+        surveyed: (n, 3) local frame, up NaN where unknown.
+        vertical: None where the surveyed heights say which way is up.
+    """
+    xyz = np.array([h.xyz for h in found])
+    point = np.array([h.point for h in found])
+    start = _least_trimmed(xyz, point, surveyed, vertical, options)
+    if start is None:
+        return None
+    sim = start
+    for _ in range(10):  # settles in two or three rounds
+        residuals = _residuals(sim, xyz, surveyed[point])
+        lengths = np.linalg.norm(residuals, axis=1)
+        sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical, options)
+        chosen = _choose(found, lengths, len(surveyed), options.outlier_sigmas * sigma)
+        inliers = lengths[chosen] <= options.outlier_sigmas * sigma
+        refined = _refine(sim, xyz[chosen][inliers], surveyed[inliers], vertical, sigma)
+        moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
+        sim = refined
+        if moved < 1e-6:
+            break
+    rest = surveyed - sim.act(xyz[chosen])
+    return ControlFit(
+        local_from_block=sim,
+        residuals_m=rest,
+        inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= options.outlier_sigmas * sigma,
+        chosen=tuple(found[int(i)] for i in chosen),
+        sigma_m=sigma,
+    )
+
+
+def _residuals(sim: Sim3, xyz: FloatArray, surveyed: FloatArray) -> FloatArray:
+    """Surveyed minus placed, zero where a height is unknown."""
+    return np.nan_to_num(surveyed - sim.act(xyz))
+
+
+def _per_point(lengths: FloatArray, point: NDArray[np.int64], count: int) -> FloatArray:
+    """Smallest length of each point's hypotheses (count,)."""
+    best = np.full(count, np.inf)
+    np.minimum.at(best, point, lengths)
+    return best
+
+
+def _least_trimmed(
+    xyz: FloatArray,
+    point: NDArray[np.int64],
+    surveyed: FloatArray,
+    vertical: Vertical | None,
+    options: FitOptions,
+) -> Sim3 | None:
+    """Of similarities through few hypotheses, the one whose better half of points fits best."""
+    size = 3 if vertical is None else 2
+    usable = np.flatnonzero(np.isfinite(surveyed[point, 2])) if vertical is None else np.arange(len(xyz))
+    count = len(np.unique(point))
+    kept = (count + size + 1) // 2
+    best: tuple[float, Sim3] | None = None
+    for rows in _samples(usable, point, size, options):
+        sim = (
+            similarity_closed_form(xyz[rows], surveyed[point[rows]])
+            if vertical is None
+            else _levelled(xyz[rows], surveyed[point[rows]], vertical)
+        )
+        if sim is None:
+            continue
+        lengths = np.linalg.norm(_residuals(sim, xyz, surveyed[point]), axis=1)
+        cost = float((np.sort(_per_point(lengths, point, len(surveyed)))[:kept] ** 2).sum())
+        if best is None or cost < best[0]:
+            best = (cost, sim)
+    return None if best is None else best[1]
+
+
+def _samples(
+    usable: NDArray[np.int64], point: NDArray[np.int64], size: int, options: FitOptions
+) -> list[NDArray[np.int64]]:
+    """Sets of hypotheses of different points: all of them, or random ones where there are too many."""
+    generator = np.random.default_rng(options.seed)
+    total = 1
+    for k in range(size):
+        total = total * (len(usable) - k) // (k + 1)
+    if total <= options.max_samples:
+        every = (np.array(c) for c in itertools.combinations(usable, size))
+        return [rows for rows in every if len(set(point[rows])) == size]
+    names = np.unique(point[usable])
+    if len(names) < size:
+        return []
+    samples = []
+    for _ in range(options.max_samples):
+        chosen = generator.choice(names, size, replace=False)
+        samples.append(np.array([generator.choice(usable[point[usable] == p]) for p in chosen]))
+    return samples
+
+
+def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3 | None:
+    """The similarity of two points that keeps the vertical: a turn, a scale and a shift in the plane."""
+    level = rotation_to_up(vertical.up_block)
+    source, target = (xyz @ level.T)[:, :2] @ [1, 1j], surveyed[:, :2] @ [1, 1j]
+    if abs(source[1] - source[0]) < 1e-12 or abs(target[1] - target[0]) < 1e-6:
+        return None
+    turn = (target[1] - target[0]) / (source[1] - source[0])
+    angle = np.angle(turn)
+    about_up = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    rotation = about_up @ level
+    scale = float(abs(turn))
+    shift = target.mean() - turn * source.mean()
+    up = vertical.anchor_up_m - scale * (rotation @ vertical.anchor_block)[2]
+    return Sim3(scale=scale, rotation=rotation, translation=np.array([shift.real, shift.imag, up]))
+
+
+def rotation_to_up(up: FloatArray) -> FloatArray:
+    """A rotation (3, 3) that carries the unit vector `up` to (0, 0, 1)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
+    east = np.cross(helper, up)
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(up, east), up])
+
+
+def _sigma(
+    lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None, options: FitOptions
+) -> float:
+    """Robust standard deviation of one coordinate, with the degrees of freedom of the fit."""
+    axes = 3 if np.isfinite(surveyed[:, 2]).all() else 2
+    equations = int(np.isfinite(surveyed).sum())
+    parameters = 7 if vertical is None else 4
+    freedom = max(equations - parameters, 1)
+    spread = float(np.median(lengths)) * _SIGMA_OF_MEDIAN[axes] * (equations / freedom) ** 0.5
+    return float(max(spread, options.min_sigma_m))
+
+
+def _choose(
+    found: Sequence[Hypothesis], lengths: FloatArray, count: int, limit_m: float
+) -> NDArray[np.int64]:
+    """For each point the hypothesis of most marks within the limit, the nearest if none is."""
+    chosen = np.zeros(count, dtype=np.int64)
+    for point in range(count):
+        rows = [i for i, h in enumerate(found) if h.point == point]
+        near = [i for i in rows if lengths[i] <= limit_m]
+        chosen[point] = min(
+            near or rows,
+            key=lambda i: (
+                (-len(found[i].marks), not found[i].by_rays, lengths[i]) if near else (0, 0, lengths[i])
+            ),
+        )
+    return chosen
+
+
+def _refine(
+    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float
+) -> Sim3:
+    """Least squares on the tangent, with what is known of the vertical."""
+    for _ in range(20):
+        normal, gradient = normal_equations(sim, xyz, surveyed, vertical, sigma_m)
+        step = np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
+        sim = Sim3.exp(step) @ sim
+        if np.abs(step).max() < 1e-10:
+            break
+    return sim
+
+
+def normal_equations(
+    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float
+) -> tuple[FloatArray, FloatArray]:
+    """Normal matrix (7, 7) and right-hand side (7,) of the left perturbation."""
+    placed = sim.act(xyz)
+    known = np.isfinite(surveyed).ravel()
+    jacobian = point_jacobian(placed).reshape(-1, 7)[known] / sigma_m
+    residual = (surveyed - placed).ravel()[known] / sigma_m
+    if vertical is not None:
+        jacobian = np.vstack([jacobian, vertical.jacobian(sim)])
+        residual = np.concatenate([residual, -vertical.residual(sim)])
+    return jacobian.T @ jacobian, jacobian.T @ residual

@@ -1,0 +1,132 @@
+"""Control points that meet a block: which marks lie in which of its photos, and what cannot be used."""
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from ingest.register.control.block import Block
+from ingest.register.control.control_file import ControlFile, Mark
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Control:
+    """Marks of control points in the photos of a block.
+
+    Attributes:
+        names: of the n points that have at least one mark in the block.
+        surveyed: (n, 3) east, north, up in metres in the local frame; up is NaN where unknown.
+        marks: m marks, as the file has them.
+        point_of, photo_of: (m,) index of the point and of the block's photo.
+        xy: (m, 2) full-size pixels.
+        unused: marks that cannot take part, by reason for people.
+        unmarked: names of points without any mark in the block.
+    """
+
+    names: tuple[str, ...]
+    surveyed: FloatArray
+    marks: tuple[Mark, ...]
+    point_of: NDArray[np.int64]
+    photo_of: NDArray[np.int64]
+    xy: FloatArray
+    unused: tuple[tuple[Mark, str], ...]
+    unmarked: tuple[str, ...]
+
+    def marks_of(self, point: int) -> NDArray[np.int64]:
+        """Rows of the marks of a point."""
+        return np.flatnonzero(self.point_of == point)
+
+
+def control_frame(file: ControlFile) -> LocalFrame:
+    """A local frame at the median of the control points, rounded; height 0 where none is known."""
+    latitude, longitude = np.median(file.lat_lon_h[:, :2], axis=0)
+    heights = file.lat_lon_h[:, 2]
+    known = heights[np.isfinite(heights)]
+    return LocalFrame(
+        latitude_deg=round(float(latitude), 5),
+        longitude_deg=round(float(longitude), 5),
+        height_m=round(float(np.median(known))) if len(known) else 0.0,
+    )
+
+
+def meet(
+    file: ControlFile, block: Block, frame: LocalFrame, other_photos: Mapping[str, str] | None = None
+) -> Control:
+    """Find the block's photos for the marks.
+
+    Args:
+        frame: of the surveyed positions that come out.
+        other_photos: photos that are known but not in the block, by name, with the reason.
+    """
+    found, unused = _photos(file.marks, block, other_photos or {})
+    chosen = [(mark, photo) for mark, photo in found if _inside(mark, block, photo)]
+    unused += [
+        (mark, _outside_words(mark, block, photo)) for mark, photo in found if not _inside(mark, block, photo)
+    ]
+    marked = {mark.point for mark, _ in chosen}
+    kept = [i for i, name in enumerate(file.names) if name in marked]
+    index = {file.names[i]: row for row, i in enumerate(kept)}
+    return Control(
+        names=tuple(file.names[i] for i in kept),
+        surveyed=_local(frame, file.lat_lon_h[kept]),
+        marks=tuple(mark for mark, _ in chosen),
+        point_of=np.array([index[mark.point] for mark, _ in chosen], dtype=np.int64),
+        photo_of=np.array([photo for _, photo in chosen], dtype=np.int64),
+        xy=np.array([(mark.x, mark.y) for mark, _ in chosen], dtype=np.float64).reshape(-1, 2),
+        unused=tuple(sorted(unused, key=lambda pair: pair[0].line)),
+        unmarked=tuple(name for name in file.names if name not in marked),
+    )
+
+
+def _local(frame: LocalFrame, lat_lon_h: FloatArray) -> FloatArray:
+    """Local east, north, up; a point without height is taken at the frame's own, its up is NaN."""
+    unknown = np.isnan(lat_lon_h[:, 2])
+    filled = np.where(unknown[:, None] & np.array([False, False, True]), frame.height_m, lat_lon_h)
+    enu = np.array(frame.enu_from_geodetic(filled))
+    enu[unknown, 2] = np.nan
+    return enu
+
+
+def _photos(
+    marks: Sequence[Mark], block: Block, others: Mapping[str, str]
+) -> tuple[list[tuple[Mark, int]], list[tuple[Mark, str]]]:
+    """The block's photo of each mark: by its name, else by its file name alone where only one has it."""
+    by_name = {name.lower(): row for row, name in enumerate(block.names)}
+    by_file = defaultdict(list)
+    for row, name in enumerate(block.names):
+        by_file[_file_name(name)].append(row)
+    reasons = {_file_name(name): reason for name, reason in others.items()}
+    found, unused = [], []
+    for mark in marks:
+        rows = by_file[_file_name(mark.photo)]
+        if mark.photo.lower() in by_name:
+            found.append((mark, by_name[mark.photo.lower()]))
+        elif len(rows) == 1:
+            found.append((mark, rows[0]))
+        elif rows:
+            unused.append((mark, f"{len(rows)} photos are called {mark.photo}; name it with its folder"))
+        else:
+            reason = reasons.get(_file_name(mark.photo))
+            unused.append((mark, reason or f"no photo {mark.photo} in the map"))
+    return found, unused
+
+
+def _file_name(name: str) -> str:
+    return name.rsplit("/", 1)[-1].lower()
+
+
+def _inside(mark: Mark, block: Block, photo: int) -> bool:
+    camera = block.camera(photo)
+    return mark.x <= camera.width and mark.y <= camera.height
+
+
+def _outside_words(mark: Mark, block: Block, photo: int) -> str:
+    camera = block.camera(photo)
+    return (
+        f"pixel {mark.x:g} {mark.y:g} is outside {mark.photo} of {camera.width}x{camera.height}; marks must "
+        "be made on the photos as they are stored, not on larger or turned copies"
+    )

@@ -1,0 +1,363 @@
+"""Placement by ground control points: the whole way from marks to an adjusted block with its uncertainty.
+
+1. Marks are intersected and the similarity is found that most points agree on (`control_fit`).
+2. The block is adjusted with the points as control (`control_adjust`).
+3. Marks and points that contradict all others are tested, named and left out (`control_test`), and the block
+   is adjusted again.
+
+Surveyed heights may be unknown. Then position, heading and scale come from the points; tilt and height come
+from where the block was before (GPS), and where there is no such place from the assumption that the ground
+under the photos is level on the whole. The covariance says how little that is.
+"""
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from ingest.register.control.adjust import Adjusted, AdjustOptions, adjust
+from ingest.register.control.block import Block
+from ingest.register.control.fit import (
+    ControlFit,
+    FitOptions,
+    Hypothesis,
+    Vertical,
+    fit_similarity,
+    hypotheses,
+)
+from ingest.register.control.level import LevelOptions, level_ground
+from ingest.register.control.marks import Control
+from ingest.register.control.normal_system import common_change
+from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
+from ingest.register.control.snooping import Outcome, TestOptions, improve, initial_weights
+
+GcpReason = Literal[
+    "TOO_FEW",
+    "DEGENERATE_LINE",
+    "RESIDUALS",
+    "SCALE",
+    "UPSIDE_DOWN",
+    "CONTRADICTS_GPS",
+]
+
+
+_STEEP = 0.5  # sine of 30 degrees: half the photos look up more steeply than photos of a place ever do
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GcpOptions:
+    """How a block is placed by control points and when that is refused.
+
+    Attributes:
+        min_points: three are the least with which one can be found to be wrong.
+        min_share: of the points that must agree; with fewer, the file and the photos do not belong together.
+        max_sigma_over_extent: of the surveyed coordinates' standard deviation over the extent of the points;
+            beyond, they agree no better than points drawn at random would.
+        max_scale_sigma: relative standard deviation of the scale; beyond, a map is no measure.
+        min_line_ratio: extent of the points across their line over that along it; below, heights of the
+            points do not say which way is up.
+        max_gps_offset_m: of the placed photos from their own GPS, beyond three of its sigmas. EXIF is off
+            by metres, rarely by tens; more means another zone, system or unit.
+        sigma_m: standard deviation of the surveyed coordinates, horizontal and vertical; None finds it
+            from the residuals.
+    """
+
+    min_points: int = 3
+    min_share: float = 0.5
+    max_sigma_over_extent: float = 0.1
+    max_scale_sigma: float = 0.1
+    min_line_ratio: float = 0.02
+    max_gps_offset_m: float = 150.0
+    sigma_m: tuple[float, float] | None = None
+    fit: FitOptions = field(default_factory=FitOptions)
+    test: TestOptions = field(default_factory=TestOptions)
+    adjust: AdjustOptions = field(default_factory=AdjustOptions)
+    level: LevelOptions = field(default_factory=LevelOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GcpPlacement:
+    """Outcome of a placement: accepted when `reason` is None.
+
+    Attributes:
+        reason: gate that refused it, or None; `message` says it for people.
+        local_from_block: the similarity nearest to what became of the block, None where there is none.
+        covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
+        block: adjusted, in metres in the local frame, or None.
+        points: every control point with its residual; marks: every mark.
+        residual_rms_m: of the surveyed coordinates that were used, root mean square length.
+        notes: what was assumed, for people.
+        figures: what the decision rests on, JSON-able.
+    """
+
+    reason: GcpReason | None
+    message: str
+    local_from_block: Sim3 | None
+    covariance: FloatArray | None
+    block: Block | None
+    points: tuple[PointResidual, ...]
+    marks: tuple[MarkResidual, ...]
+    notes: tuple[str, ...]
+    figures: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> bool:
+        return self.reason is None
+
+    @property
+    def residual_rms_m(self) -> float:
+        squared = [float(np.nansum(p.residual_m**2)) for p in self.points if p.used]
+        return float(np.sqrt(np.mean(squared))) if squared else float("nan")
+
+
+def place_by_gcp(
+    block: Block,
+    control: Control,
+    options: GcpOptions,
+    *,
+    vertical: Vertical | None = None,
+    gps_local: FloatArray | None = None,
+    gps_sigma_m: float = 0.0,
+) -> GcpPlacement:
+    """Place and adjust a block by control points.
+
+    Args:
+        block: in a frame of its own, of any scale.
+        control: its marks, and the surveyed positions in the local frame.
+        vertical: what is known of tilt and height from elsewhere, used where the points do not tell.
+        gps_local: (k, 3) the photos' own positions in the local frame, NaN where there are none; they
+            only guard against gross errors of the file.
+    """
+    found = hypotheses(block, control, options.fit)
+    usable = sorted({h.point for h in found})
+    if len(usable) < options.min_points:
+        return _refused(
+            "TOO_FEW",
+            f"{len(usable)} control points can be located in the photos, at least {options.min_points} are "
+            "needed; mark each point in two photos or more",
+            {"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
+        )
+    notes: list[str] = []
+    needed = _vertical_is_needed(control, usable, options)
+    if needed and vertical is None:
+        vertical = level_ground(block, np.median([h.xyz for h in found], axis=0), options.level)
+        notes.append(vertical.source)
+    elif needed and vertical is not None:
+        notes.append(f"tilt and height are kept from {vertical.source}")
+    fit = _fit(found, usable, control, vertical if needed else None, options)
+    refused = _gate_fit(fit, control, usable, options)
+    if refused is not None or fit is None:
+        return refused or _refused("DEGENERATE_LINE", "the control points coincide", {})
+    return _adjusted_placement(
+        block, control, fit, vertical if needed else None, options, notes, gps_local, gps_sigma_m
+    )
+
+
+def _vertical_is_needed(control: Control, usable: list[int], options: GcpOptions) -> bool:
+    """Whether the known heights leave tilt or height open: fewer than three, or three on a line."""
+    rows = [i for i in usable if np.isfinite(control.surveyed[i, 2])]
+    if len(rows) < 3:
+        return True
+    spread = np.linalg.svd(control.surveyed[rows] - control.surveyed[rows].mean(axis=0))[1]
+    return bool(spread[1] < options.min_line_ratio * spread[0])
+
+
+def _fit(
+    found: list[Hypothesis],
+    usable: list[int],
+    control: Control,
+    vertical: Vertical | None,
+    options: GcpOptions,
+) -> ControlFit | None:
+    """The robust fit over the usable points, its rows being those of `usable`."""
+    row = {point: k for k, point in enumerate(usable)}
+    renumbered = [replace(h, point=row[h.point]) for h in found]
+    return fit_similarity(renumbered, control.surveyed[usable], vertical, options.fit)
+
+
+def _gate_fit(
+    fit: ControlFit | None, control: Control, usable: list[int], options: GcpOptions
+) -> GcpPlacement | None:
+    surveyed = control.surveyed[usable, :2]
+    extent = float(np.linalg.norm(np.ptp(surveyed, axis=0)))
+    figures: dict[str, Any] = {"usable_points": len(usable), "extent_m": extent}
+    if fit is None or extent <= 0:
+        return _refused(
+            "DEGENERATE_LINE",
+            "the control points, or their places in the photos, coincide or lie along a line",
+            figures,
+        )
+    share = float(fit.inliers.mean())
+    figures |= {"agreeing_share": share, "fit_sigma_m": fit.sigma_m}
+    if (
+        share < options.min_share
+        or fit.inliers.sum() < options.min_points
+        or fit.sigma_m > options.max_sigma_over_extent * extent
+    ):
+        return _refused(
+            "RESIDUALS",
+            f"the control points do not fit the photos: {int(fit.inliers.sum())} of {len(usable)} agree, to "
+            f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
+            "units, and that the marks are of these photos",
+            figures,
+        )
+    return None
+
+
+def _adjusted_placement(
+    block: Block,
+    control: Control,
+    fit: ControlFit,
+    vertical: Vertical | None,
+    options: GcpOptions,
+    notes: list[str],
+    gps_local: FloatArray | None,
+    gps_sigma_m: float,
+) -> GcpPlacement:
+    placed = block.moved(fit.local_from_block)
+    local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
+    weights, xyz = initial_weights(placed, control, fit, options.sigma_m, options.test)
+    outcome = improve(
+        placed,
+        control,
+        xyz,
+        weights,
+        lambda b, x, w, last: adjust(b, control, x, w, local_vertical, options.adjust, last),
+        options.sigma_m is not None,
+        options.test,
+    )
+    adjusted = outcome.adjusted
+    points, marks = residuals_of(adjusted, control, outcome)
+    covariance = _covariance(adjusted, free_height_m, outcome.freedom)
+    placement = GcpPlacement(
+        reason=None,
+        message="placed by control points",
+        local_from_block=common_change(
+            adjusted.similarity, placed.cam_from_block, adjusted.block.cam_from_block
+        )
+        @ fit.local_from_block,
+        covariance=covariance,
+        block=adjusted.block,
+        points=points,
+        marks=marks,
+        notes=tuple(notes),
+        figures=_figures(fit, outcome, adjusted, covariance, local_vertical, options),
+    )
+    return _gate(placement, gps_local, gps_sigma_m, options)
+
+
+def _in_place(
+    vertical: Vertical | None, local_from_block: Sim3, control: Control
+) -> tuple[Vertical | None, float]:
+    """What is known of the vertical, for the placed block, and the sigma of a height that is free.
+
+    Where no point has a height, nothing but `vertical` says it: the adjustment then keeps it, and its
+    uncertainty is added afterwards, which spares the equations a kilometre beside a millimetre.
+    """
+    if vertical is None:
+        return None, 0.0
+    free = not np.isfinite(control.surveyed[:, 2]).any()
+    return (
+        replace(
+            vertical,
+            up_block=local_from_block.rotation @ vertical.up_block,
+            anchor_block=local_from_block.act(vertical.anchor_block),
+            sigma_up_m=0.01 if free else vertical.sigma_up_m,
+        ),
+        vertical.sigma_up_m if free else 0.0,
+    )
+
+
+def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> FloatArray:
+    """(7, 7); a sigma estimated from few residuals is itself uncertain: Student's t instead of the normal."""
+    covariance = adjusted.placement_covariance()
+    covariance = covariance * (freedom / (freedom - 2.0) if freedom > 4 else 2.0)
+    covariance[6, 6] += free_height_m**2
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def _figures(
+    fit: ControlFit,
+    outcome: Outcome,
+    adjusted: Adjusted,
+    covariance: FloatArray,
+    vertical: Vertical | None,
+    options: GcpOptions,
+) -> dict[str, Any]:
+    figures: dict[str, Any] = {
+        "points_used": int(outcome.weights.points.sum()),
+        "marks_used": int(outcome.weights.marks.sum()),
+        "rounds": outcome.rounds,
+        "degrees_of_freedom": outcome.freedom,
+        "control_sigma_m": outcome.weights.control_m.tolist(),
+        "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
+        "mark_sigma_px": outcome.weights.mark_px,
+        "keypoint_sigma_px": adjusted.keypoint_px,
+        "fit_sigma_m": fit.sigma_m,
+        "scale_sigma": float(np.sqrt(covariance[0, 0])),
+        "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
+        "heights": "surveyed" if vertical is None else "unknown or too few",
+        "options": asdict(options),
+    }
+    if vertical is not None:
+        residual = vertical.residual(Sim3.identity())
+        figures["vertical"] = {"source": vertical.source, "tilt_at_fit_sigmas": residual[:2].tolist()}
+    return figures
+
+
+def _gate(
+    placement: GcpPlacement, gps_local: FloatArray | None, gps_sigma_m: float, options: GcpOptions
+) -> GcpPlacement:
+    """The gates that look at the finished placement."""
+    figures = dict(placement.figures)
+    assert placement.block is not None
+    if figures["points_used"] < options.min_points:
+        return replace(
+            placement,
+            reason="RESIDUALS",
+            message=f"only {figures['points_used']} control points are left after those that contradict the "
+            f"others; at least {options.min_points} are needed",
+        )
+    if figures["scale_sigma"] > options.max_scale_sigma:
+        return replace(
+            placement,
+            reason="SCALE",
+            message=f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} "
+            "is needed: the control points are too close together for their accuracy",
+        )
+    looks_up = float(np.median([pose.rotation[2, 2] for pose in placement.block.cam_from_block]))
+    if looks_up > _STEEP:
+        return replace(
+            placement,
+            reason="UPSIDE_DOWN",
+            message="the control points put the cameras under the ground, looking up; x and y of the survey "
+            "are probably exchanged, or heights have the wrong sign",
+        )
+    if gps_local is not None and np.isfinite(gps_local[:, 0]).any():
+        offset = np.nanmedian(gps_local[:, :2] - placement.block.centers()[:, :2], axis=0)
+        figures["gps_offset_m"] = offset.tolist()
+        if np.linalg.norm(offset) > options.max_gps_offset_m + 3.0 * gps_sigma_m:
+            return replace(
+                placement,
+                reason="CONTRADICTS_GPS",
+                message=f"the control points put the photos {np.linalg.norm(offset):,.0f} m from their GPS; "
+                "check the file's reference system, its zone and its units",
+                figures=figures,
+            )
+    return replace(placement, figures=figures)
+
+
+def _refused(reason: GcpReason, message: str, figures: dict[str, Any]) -> GcpPlacement:
+    return GcpPlacement(
+        reason=reason,
+        message=message,
+        local_from_block=None,
+        covariance=None,
+        block=None,
+        points=(),
+        marks=(),
+        notes=(),
+        figures=figures,
+    )

@@ -1,0 +1,144 @@
+"""Control points place a map that is in the database already, or a reconstruction on its way there."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from featuredb.geo.datum import check_datum
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.maps.feature_map import FeatureMap, Placement
+from ingest.register.control.block import block_of_map, map_of_block
+from ingest.register.control.control_file import ControlFile
+from ingest.register.control.evidence import gcp_evidence
+from ingest.register.control.fit import Vertical
+from ingest.register.control.marks import Control, control_frame, meet
+from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
+
+# A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
+_MAX_FRAME_DISTANCE_M = 2_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GcpRegistration:
+    """A map placed anew by control points, or why not.
+
+    Attributes:
+        placement: with residuals; its reason is None where it was accepted.
+        control: what met the map's photos, and what did not.
+        frame: local frame of the placement.
+        feature_map: to be committed in the old one's place, None where it was refused.
+        moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map.
+    """
+
+    placement: GcpPlacement
+    control: Control
+    frame: LocalFrame
+    feature_map: FeatureMap | None
+    moved_m: FloatArray | None
+
+
+def register_by_gcp(
+    feature_map: FeatureMap,
+    file: ControlFile,
+    options: GcpOptions,
+    height_datum: str = "unknown",
+    other_photos: Mapping[str, str] | None = None,
+) -> GcpRegistration:
+    """Place a map by control points; nothing is written.
+
+    Args:
+        height_datum: of the surveyed heights, where the file's reference system does not say it.
+        other_photos: photos that are not in the map, by name, with the reason.
+    """
+    check_datum(height_datum)
+    frame = _frame(feature_map, file)
+    block = block_of_map(feature_map)
+    control = meet(file, block, frame, other_photos)
+    frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
+    gps, sigma = gps_of_map(feature_map, frame)
+    placement = place_by_gcp(
+        block,
+        control,
+        options,
+        vertical=_vertical_of_map(feature_map, block.xyz, frame_from_map),
+        gps_local=gps,
+        gps_sigma_m=sigma,
+    )
+    if placement.reason is not None or placement.block is None or placement.covariance is None:
+        return GcpRegistration(
+            placement=placement, control=control, frame=frame, feature_map=None, moved_m=None
+        )
+    assert placement.local_from_block is not None
+    placed = map_of_block(
+        feature_map,
+        placement.block,
+        frame,
+        Placement(
+            method="gcp",
+            local_from_sfm=placement.local_from_block @ feature_map.placement.local_from_sfm,
+            covariance=placement.covariance,
+            residual_rms_m=placement.residual_rms_m,
+            evidence=gcp_evidence(placement, control),
+        ),
+        datum_of(file, control, feature_map.height_datum, height_datum),
+    )
+    moved = np.median(placement.block.xyz - frame_from_map.act(block.xyz), axis=0)
+    return GcpRegistration(
+        placement=placement, control=control, frame=frame, feature_map=placed, moved_m=moved
+    )
+
+
+def datum_of(file: ControlFile, control: Control, before: str, said: str) -> str:
+    """Datum of the placed map's heights: the survey's where it gives heights, else what it was."""
+    if np.isfinite(control.surveyed[:, 2]).sum() < 3:
+        return before
+    return file.crs.height_datum if file.crs.height_datum != "unknown" else said
+
+
+def vertical_of(
+    local_from_block: Sim3, covariance: FloatArray, points_block: FloatArray, source: str
+) -> Vertical:
+    """What a placement says about tilt, and height in the middle of its points (n, 3)."""
+    anchor = np.median(points_block, axis=0)
+    by_rotation = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about east tilts north, and so on
+    height = point_jacobian(local_from_block.act(anchor))[2]
+    return Vertical(
+        up_block=local_from_block.rotation.T @ [0.0, 0.0, 1.0],
+        tilt_covariance=by_rotation @ covariance[1:3, 1:3] @ by_rotation.T + np.eye(2) * 1e-10,
+        anchor_block=anchor,
+        anchor_up_m=float(local_from_block.act(anchor)[2]),
+        sigma_up_m=float(np.sqrt(height @ covariance @ height)) + 1e-4,
+        source=source,
+    )
+
+
+def gps_of_map(feature_map: FeatureMap, frame: LocalFrame) -> tuple[FloatArray, float]:
+    """The photos' own positions (k, 3) in a frame, NaN where there is none, and their median sigma."""
+    gps = np.full((len(feature_map.images), 3), np.nan)
+    for row, image in enumerate(feature_map.images):
+        if image.gps is not None:
+            prior = image.gps
+            height = frame.height_m if prior.height_m is None else prior.height_m
+            gps[row] = frame.enu_from_geodetic((prior.latitude_deg, prior.longitude_deg, height))
+    sigmas = [i.gps.sigma_horizontal_m for i in feature_map.images if i.gps is not None]
+    return gps, float(np.median(sigmas)) if sigmas else 0.0
+
+
+def _frame(feature_map: FeatureMap, file: ControlFile) -> LocalFrame:
+    """The map's own frame unless its photos have no GPS and the control points lie elsewhere."""
+    middle = control_frame(file)
+    away = np.linalg.norm(feature_map.frame.enu_from(middle).translation)
+    has_gps = any(image.gps is not None for image in feature_map.images)
+    return feature_map.frame if has_gps or away <= _MAX_FRAME_DISTANCE_M else middle
+
+
+def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map: Sim3) -> Vertical | None:
+    """What the map's present placement says; None where control points made it, which would count twice."""
+    method = feature_map.placement.method
+    if method == "gcp":
+        return None
+    covariance = frame_from_map.compose_covariance(np.zeros((7, 7)), feature_map.placement.covariance)
+    return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")

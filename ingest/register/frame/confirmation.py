@@ -1,0 +1,231 @@
+"""Whether pictures confirm a pose: do pieces of the photo, each on its own, put the scan where it does?
+
+Each piece of the rendering at the pose is searched in the
+photo within a window; without any relation between the two its best place is anywhere in the window, and
+near the middle with the small probability that the area gives. A pose that is right has a third or more of
+its pieces at the middle; a wrong one, even when it was fitted to the same pictures, as many as chance and
+six free parameters give. The evidence is the binomial tail. It does not ask how the pose was found.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from ingest.register.frame.dense_templates import peaks
+from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
+from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.frame.scan_resolution import finest_side_px
+from ingest.register.frame.score_maps import (
+    ScoreMaps,
+    TemplateOptions,
+    cut_templates,
+    scores_at,
+    search_around,
+)
+from ingest.register.frame.source_pictures import source_picture
+from ingest.register.frame_registration import RenderSource
+
+_OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfirmOptions:
+    """Where the line between confirmed and not is; docs/registration.md shows the distributions behind it.
+
+    Attributes:
+        side_px: longer side of the view on which pieces are compared, where the scan is dense enough:
+        finest_spacing: a pixel is at least this share of the mean distance between scan points.
+        search_px: radius of the window in which a piece is searched.
+        near_px: a piece agrees with the pose when its best place is this near.
+        min_pieces: fewer pieces with structure cannot confirm anything.
+        piece_share, min_piece_px, max_piece_px: side of a piece, as a share of the view's longer side,
+            between these.
+        min_agreeing: smallest share of pieces that agree.
+        min_low_agreeing, max_layer_ratio, min_layer_m: a pose is refused when less than that share of the
+            lower half of the pieces, by height, agrees while of the upper half that many times as many do,
+            and the halves lie that far apart: then what stands on the ground was matched, which an ortho
+            image shows displaced, and not the ground.
+        min_log_nfa: smallest evidence, -log10 of the probability that chance puts as many so near, less six
+            free parameters' worth.
+        min_cells: of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width.
+    """
+
+    side_px: int = 480
+    finest_spacing: float = 1.2
+    search_px: int = 16
+    near_px: float = 3.0
+    min_pieces: int = 25
+    piece_share: float = 0.21
+    min_piece_px: int = 40
+    max_piece_px: int = 40
+    min_agreeing: float = 0.2
+    min_low_agreeing: float = 0.0
+    max_layer_ratio: float = 1.5
+    min_layer_m: float = 2.0
+    min_log_nfa: float = 6.0
+    min_cells: int = 4
+    gradients: GradientOptions = field(default_factory=GradientOptions)
+
+    def pieces_of(self, camera: Camera) -> TemplateOptions:
+        """Pieces for a view, overlapping by half."""
+        size = round(self.piece_share * max(camera.width, camera.height) / 2.0) * 2
+        size = int(np.clip(size, self.min_piece_px, self.max_piece_px))
+        return TemplateOptions(size_px=size, spacing_px=size // 2, max_count=600)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Confirmation:
+    """Whether the pictures confirm a pose, and the figures behind it.
+
+    Attributes:
+        pieces, agreeing: how many pieces of the photo were compared, and how many put the scan where the
+            pose does.
+        log_nfa: evidence, see ConfirmOptions.
+        cells: parts of the photo, of 16, that hold an agreeing piece.
+        score: mean score of all pieces at the pose, in standard deviations of chance.
+        local_maximum: whether the mean score falls in all twelve directions of the pose.
+        message: why not, or "".
+        low_share, high_share: of agreeing pieces among the lower and the upper half, by height.
+    """
+
+    confirmed: bool
+    pieces: int
+    agreeing: int
+    log_nfa: float
+    cells: int
+    score: float
+    local_maximum: bool
+    message: str
+    low_share: float = 0.0
+    high_share: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """Of pieces that agree."""
+        return self.agreeing / self.pieces if self.pieces else 0.0
+
+
+def confirm_pose(
+    photo_gray: NDArray[np.uint8],
+    camera: Camera,
+    cam_from_local: Rigid3,
+    cloud: PointCloud,
+    source: RenderSource = "intensity",
+    options: ConfirmOptions = ConfirmOptions(),
+) -> Confirmation:
+    """Asks the photo's pieces where they belong, at a pose that somebody else found.
+
+    Args:
+        photo_gray: (h, w) uint8 of `camera`'s size.
+    """
+    finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
+    view = pinhole_view(photo_gray, camera, min(options.side_px, finest))
+    maps = _maps(view, cam_from_local, cloud, source, options)
+    n = len(maps)
+    if n < options.min_pieces:
+        return Confirmation(
+            confirmed=False,
+            pieces=n,
+            agreeing=0,
+            log_nfa=0.0,
+            cells=0,
+            score=0.0,
+            local_maximum=False,
+            message=f"only {n} pieces of the picture have structure, {options.min_pieces} are needed",
+        )
+    places, _, _ = peaks(maps.maps, 4)
+    off = places - options.search_px
+    near = np.linalg.norm(off, axis=1) <= options.near_px
+    chance = np.pi * (options.near_px + 0.5) ** 2 / (2 * options.search_px + 1) ** 2
+    agreeing = int(near.sum())
+    # Six parameters can bring three pieces into place whatever they show.
+    free, total = max(agreeing // _OVERLAP - 3, 0), n // _OVERLAP - 3
+    log_nfa = float(-binom.logsf(free - 1, total, chance) / np.log(10.0))
+    pixels = (maps.origin + places)[near] / (view.camera.width, view.camera.height)
+    cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
+    score, is_maximum = _around(maps, cam_from_local)
+    layers = _layers(maps.points_local[:, 2], near)
+    message = _objection(agreeing / n, log_nfa, cells, layers, options)
+    return Confirmation(
+        confirmed=not message,
+        pieces=n,
+        agreeing=agreeing,
+        log_nfa=log_nfa,
+        cells=cells,
+        score=score,
+        local_maximum=is_maximum,
+        message=message,
+        low_share=layers.low,
+        high_share=layers.high,
+    )
+
+
+def _maps(
+    view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource, options: ConfirmOptions
+) -> ScoreMaps:
+    pieces = options.pieces_of(view.camera)
+    margin = pieces.size_px // 2
+    rendering = render(cloud, with_margin(view.camera, margin), pose, RenderOptions(threads=1))
+    channels = oriented_gradients(source_picture(rendering, source), rendering.valid, options.gradients)
+    templates = cut_templates(channels, rendering, pieces)
+    photo = oriented_gradients(view.image, view.valid, options.gradients)
+    return search_around(templates, photo, view.camera, pose, options.search_px)
+
+
+def _around(maps: ScoreMaps, pose: Rigid3) -> tuple[float, bool]:
+    """Mean score at the pose, and whether it is less four pixels away in all directions of the pose."""
+    depth = float(np.median(pose.act(maps.points_local)[:, 2]))
+    turn = 4.0 / maps.camera.focal_px
+    width = max(maps.camera.width, maps.camera.height) / 2.0
+    # A turn about the axis and a step along it move the picture's border by four pixels too.
+    scale = np.array([turn, turn, 4.0 / width, turn * depth, turn * depth, 4.0 / width * depth])
+    here = _mean_score(maps, pose)
+    steps = [sign * scale * axis for axis in np.eye(6) for sign in (-1.0, 1.0)]
+    return here, all(_mean_score(maps, Rigid3.exp(step) @ pose) < here for step in steps)
+
+
+def _mean_score(maps: ScoreMaps, pose: Rigid3) -> float:
+    pixels: FloatArray = maps.camera.project(pose.act(maps.points_local))
+    scores, inside = scores_at(maps, pixels[None])
+    return float(scores.sum() / max(int(inside.sum()), 1))
+
+
+class _Layers(NamedTuple):
+    """Shares of agreeing pieces in the lower and the upper half by height, and how far apart these lie."""
+
+    low: float
+    high: float
+    apart_m: float
+
+
+def _layers(height: FloatArray, near: NDArray[np.bool_]) -> _Layers:
+    low = height <= np.median(height)
+    if low.all():
+        return _Layers(float(near.mean()), float(near.mean()), 0.0)
+    apart = float(np.median(height[~low]) - np.median(height[low]))
+    return _Layers(float(near[low].mean()), float(near[~low].mean()), apart)
+
+
+def _objection(share: float, log_nfa: float, cells: int, layers: _Layers, options: ConfirmOptions) -> str:
+    if share < options.min_agreeing:
+        return (
+            f"{share:.0%} of the pieces lie where the pose puts them, {options.min_agreeing:.0%} are needed"
+        )
+    if log_nfa < options.min_log_nfa:
+        return f"evidence of 10^-{log_nfa:.1f} against chance, 10^-{options.min_log_nfa:g} is needed"
+    if cells < options.min_cells:
+        return f"agreement in {cells} of 16 parts of the picture, {options.min_cells} are needed"
+    ground_differs = (
+        layers.low < options.min_low_agreeing and layers.high > options.max_layer_ratio * layers.low
+    )
+    if ground_differs and layers.apart_m > options.min_layer_m:
+        return f"{layers.low:.0%} of the lower pieces agree and {layers.high:.0%} of the upper ones"
+    return ""

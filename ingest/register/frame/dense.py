@@ -1,0 +1,90 @@
+"""Dense templates where point features do not decide: poses to start from, and the fit around a pose."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ingest.register.frame.confirmation import Confirmation, confirm_pose
+from ingest.register.frame.dense_fit import DenseFitOptions, near_places
+from ingest.register.frame.dense_search import register_dense
+from ingest.register.frame.intensity import refine_by_intensity
+from ingest.register.frame.matching import joined
+from ingest.register.frame.search import FrameHypothesis, independent
+from ingest.register.frame.views import FrameViews
+from ingest.register.frame_registration import FramePrior, RenderSource
+from reloc.options import PoseOptions
+from reloc.pose import PoseHypothesis, refine_pose
+
+_MIN_PLACES = 12  # twice what six parameters need
+_FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
+_MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
+
+
+def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
+    """The best few poses that dense templates find around the prior; no matches behind them yet."""
+    found = register_dense(views.gray, views.camera, prior, views.cloud, source)
+    return [
+        FrameHypothesis(
+            pose=PoseHypothesis(
+                cam_from_local=pose.cam_from_local,
+                camera=views.camera,
+                camera_source="request",
+                inliers=np.zeros(0, dtype=bool),
+                prior_focal_px=views.camera.focal_px,
+            ),
+            source=source,
+            kind="dense",
+            matches=joined([]),
+            inliers=joined([]),
+            candidates=pose.pieces,
+            log_nfa=0.0,
+            rival_share=0.0,
+        )
+        for pose in found[:_FINALISTS]
+    ]
+
+
+def dense_fitted(
+    views: FrameViews, start: FrameHypothesis, options: DenseFitOptions
+) -> FrameHypothesis | None:
+    """The pose fitted to all pieces near it, coarse to fine; None where too few are found."""
+    found = start
+    for spacing_px, piece_px in zip(options.spacing_px, options.piece_px, strict=True):
+        side = dense_side_px(views, spacing_px)
+        renderings = views.renders([found.pose.cam_from_local], side)
+        if not renderings:
+            return None
+        matches = near_places(views.gray, views.camera, renderings[0], found.source, piece_px, options)
+        if len(matches) < _MIN_PLACES:
+            return None
+        settings = dense_pose_options(views, options, spacing_px)
+        pose = refine_pose(matches.pixels, matches.points, found.pose, settings)
+        inliers = independent(views.camera, matches.take(pose.inliers))
+        found = replace(found, pose=pose, matches=matches, inliers=inliers)
+    return found
+
+
+def dense_pose_options(views: FrameViews, options: DenseFitOptions, spacing_px: float) -> PoseOptions:
+    """Inlier tolerance of the fit, as a share of the longer side."""
+    return PoseOptions(
+        tolerance_rel=options.tolerance_px / dense_side_px(views, spacing_px), seed=views.options.seed
+    )
+
+
+def dense_side_px(views: FrameViews, spacing_px: float) -> int:
+    """Longer side of renders in which neighbouring scan points are `spacing_px` apart."""
+    side = max(views.camera.width, views.camera.height)
+    wanted = round(spacing_px * side / max(views.spacing_full_px, 1e-6))
+    return int(np.clip(wanted, min(views.options.min_side_px, side), min(_MAX_SIDE_PX, side)))
+
+
+def confirmed(views: FrameViews, found: FrameHypothesis) -> Confirmation:
+    """What the pictures say of a pose."""
+    return confirm_pose(views.gray, found.pose.camera, found.pose.cam_from_local, views.cloud, found.source)
+
+
+def intensity_refined(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:
+    """The pose moved to where the pictures agree best by mutual information and gradient correlation."""
+    pose = found.pose
+    refined = refine_by_intensity(views.gray, pose.camera, pose.cam_from_local, views.cloud, found.source)
+    return replace(found, pose=replace(pose, cam_from_local=refined.cam_from_local))

@@ -1,0 +1,348 @@
+"""Finds the pose of a photo over a scan by summing score maps at the pixels that a pose predicts.
+
+Point features between a photo and laser intensity are right in a few percent of the cases; whole pieces
+matched by oriented gradients in a third to a half. Here no piece has to be right on its own: each has a map
+of scores (`score_maps`), a pose says where in each map to look, and the sum over some hundred pieces is a
+smooth function of the pose with a high maximum at the true one. It is searched coarse to fine: on a grid of
+poses at low resolution, then by downhill simplex, rendering anew at each octave.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp, so3_log
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
+from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.frame.scan_resolution import finest_side_px, viewing_distance_m
+from ingest.register.frame.score_maps import (
+    ScoreMaps,
+    TemplateOptions,
+    cut_templates,
+    scores_at,
+    search_around,
+    search_everywhere,
+)
+from ingest.register.frame.source_pictures import source_picture
+from ingest.register.frame_registration import FramePrior, RenderSource
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DenseOptions:
+    """Settings of the coarse-to-fine search.
+
+    Attributes:
+        sides_px: longer side of the photo's view at each octave, coarse to fine. Octaves finer than the
+            scan's points allow (`finest_spacing`) are left out.
+        finest_spacing: a pixel of the finest view is at least this share of the scan's point spacing; below,
+            splats are larger than details.
+        reach_sigma: how far from the prior is searched.
+        max_margin: the render reaches at most this share of the view's longer side beyond it, on each side;
+            bounds the time when a prior is nearly unknown.
+        turn_step_deg: renders are made for turns about the optical axis this far apart; pieces bear 6
+            degrees.
+        grid_step_px: of pan and tilt in the vote; half the width of a score map's peak.
+        parallax_step_px: positions are tried so close that neighbours differ by this in the picture after pan
+            and tilt have taken up the common shift.
+        candidates: poses from the vote that are refined; kept: those that go on to the next octave.
+        separation_px: two candidates are different if they predict pixels this far apart.
+        refine_radius_px: of the score maps at the finer octaves.
+        score_clip: a single piece counts no more than this many standard deviations.
+        score_weight: of the summed scores against the prior; pieces overlap, so each says less than it seems.
+    """
+
+    sides_px: tuple[int, ...] = (128, 256, 512)
+    finest_spacing: float = 1.2
+    reach_sigma: float = 2.5
+    max_margin: float = 1.6
+    turn_step_deg: float = 6.0
+    grid_step_px: float = 2.0
+    parallax_step_px: float = 5.0
+    max_positions_per_axis: int = 5
+    candidates: int = 12
+    kept: int = 6
+    separation_px: float = 5.0
+    refine_radius_px: int = 12
+    score_clip: float = 6.0
+    score_weight: float = 0.3
+    gradients: GradientOptions = field(default_factory=GradientOptions)
+    templates: TemplateOptions = field(default_factory=TemplateOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DensePose:
+    """A pose and how well the score maps of the finest octave agree with it.
+
+    Attributes:
+        score: sum of the pieces' scores over the root of their number; a random pose has about N(0, 1) times
+            the root of how many neighbouring pieces overlap.
+        mean_score: per piece.
+        pieces: how many the photo shows at this pose.
+    """
+
+    cam_from_local: Rigid3
+    score: float
+    mean_score: float
+    pieces: int
+
+
+_MIN_PIECES = 12  # fewer pieces are not to win by chance
+
+
+def register_dense(
+    photo_gray: NDArray[np.uint8],
+    camera: Camera,
+    prior: FramePrior,
+    cloud: PointCloud,
+    source: RenderSource = "intensity",
+    options: DenseOptions = DenseOptions(),
+) -> list[DensePose]:
+    """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
+
+    They are hypotheses: whether the first is right is for `agreement.confirm_pose` to say.
+
+    Args:
+        photo_gray: (h, w) uint8 of `camera`'s size.
+    """
+    views = [pinhole_view(photo_gray, camera, side) for side in _sides(camera, prior, cloud, options)]
+    poses = _vote(views[0], prior, cloud, source, options)
+    for octave, view in enumerate(views):
+        refined = [_refined(view, pose, prior, cloud, source, options) for pose in poses]
+        found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
+        distinct = _distinct(found, view.camera, prior, options)
+        last = octave == len(views) - 1
+        poses = [p.cam_from_local for p in distinct[: max(1, options.kept // 2**octave)]]
+        if last or not poses:
+            return distinct
+    return []
+
+
+def score_maps_of(
+    view: PinholeView,
+    cam_from_local: Rigid3,
+    margin_px: int,
+    cloud: PointCloud,
+    source: RenderSource,
+    options: DenseOptions,
+    radius_px: int | None,
+) -> ScoreMaps:
+    """Renders at a pose and searches the pieces in the photo, all over it if `radius_px` is None."""
+    rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
+    picture = source_picture(rendering, source)
+    channels = oriented_gradients(picture, rendering.valid, options.gradients)
+    templates = cut_templates(channels, rendering, options.templates)
+    photo = oriented_gradients(view.image, view.valid, options.gradients)
+    if radius_px is None:
+        return search_everywhere(templates, photo, view.camera)
+    return search_around(templates, photo, view.camera, cam_from_local, radius_px)
+
+
+def _vote(
+    view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource, options: DenseOptions
+) -> list[Rigid3]:
+    """The best poses of a grid around the prior, at the coarsest octave."""
+    tilt = options.reach_sigma * np.radians(prior.sigma_tilt_deg)
+    focal, longer = view.camera.params[0], max(view.camera.width, view.camera.height)
+    first = render(cloud, view.camera, prior.cam_from_local, RenderOptions(threads=1, attributes=False))
+    depth = first.depth[first.valid].astype(np.float64)
+    if len(depth) < 100:
+        depth = np.array([viewing_distance_m(cloud, prior.cam_from_local)])
+    distance = float(np.median(depth))
+    sideways = options.reach_sigma * prior.sigma_horizontal_m / distance
+    reach_px = focal * (np.tan(min(tilt, 1.0)) + sideways)
+    margin = int(min(reach_px, options.max_margin * longer))
+    offsets = _position_offsets(prior, view.camera, depth, options)
+    turns = _turns(prior, options)
+    pans = _pan_tilts(reach_px, view.camera, options)
+    found: list[tuple[float, Rigid3]] = []
+    for turn in turns:
+        start = Rigid3(rotation=so3_exp([0, 0, turn]), translation=np.zeros(3)) @ prior.cam_from_local
+        maps = score_maps_of(view, start, margin, cloud, source, options, None)
+        if len(maps) < 4:
+            continue
+        for offset in offsets:
+            moved = Rigid3(rotation=start.rotation, translation=start.translation - start.rotation @ offset)
+            scores = _grid_scores(maps, moved, pans, options)
+            for best in np.argsort(-scores)[:3]:
+                turned = Rigid3(rotation=pans[best], translation=np.zeros(3)) @ moved
+                found.append((float(scores[best]), turned))
+    found.sort(key=lambda item: -item[0])
+    poses = [DensePose(cam_from_local=p, score=s, mean_score=0.0, pieces=0) for s, p in found]
+    distinct = _distinct(poses, view.camera, prior, options)
+    return [p.cam_from_local for p in distinct[: options.candidates]]
+
+
+def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray, options: DenseOptions) -> FloatArray:
+    """Score (m,) of a pose followed by each of m turns (m, 3, 3)."""
+    points = pose.act(maps.points_local).astype(np.float32)
+    focal, cx, cy = maps.camera.params
+    _, height, width = maps.maps.shape
+    x0, y0 = maps.origin[0]
+    flat, base = maps.maps.ravel(), np.arange(len(maps)) * (height * width)
+    scores = np.empty(len(turns))
+    step = max(1, 400_000 // len(maps))
+    for first in range(0, len(turns), step):
+        cam = points @ turns[first : first + step].astype(np.float32).transpose(0, 2, 1)
+        z = np.maximum(cam[..., 2], 1e-3)
+        column = (cam[..., 0] / z * focal + (cx - x0 + 0.5)).astype(np.int32)
+        row = (cam[..., 1] / z * focal + (cy - y0 + 0.5)).astype(np.int32)
+        inside = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (cam[..., 2] > 1e-3)
+        value = flat[base + np.where(inside, row * width + column, 0)]
+        value = np.where(inside, np.clip(value, -options.score_clip, options.score_clip), 0.0)
+        scores[first : first + step] = value.sum(1) / np.sqrt(np.maximum(inside.sum(1), _MIN_PIECES))
+    return scores
+
+
+def _position_offsets(
+    prior: FramePrior, camera: Camera, depth: FloatArray, options: DenseOptions
+) -> list[FloatArray]:
+    """Displacements of the camera (3,), metres, local axes: those that no turn can stand for."""
+    focal = camera.params[0]
+    radius = 0.4 * float(np.hypot(camera.width, camera.height))
+    near, distance = np.percentile(depth, 5), float(np.median(depth))
+    relief = float(distance / max(near, 0.05 * distance) - 1.0)
+    # A sideways move taken up by a turn leaves a keystone and the parallax of what is nearer.
+    sideways_px = prior.sigma_horizontal_m / distance * (radius**2 / focal + focal * relief)
+    along_px = prior.sigma_vertical_m / distance * radius
+
+    def steps(sigma_m: float, effect_px: float) -> FloatArray:
+        reach = 1.6  # sigmas: nine tenths; what lies beyond is within reach of the nearest step
+        count = int(np.ceil(2 * reach * effect_px / options.parallax_step_px))
+        count = min(count | 1, options.max_positions_per_axis)
+        return np.linspace(-reach, reach, count) * sigma_m if count > 1 else np.zeros(1)
+
+    level = steps(prior.sigma_horizontal_m, sideways_px)
+    # Both may shift and scale: which one does depends on how the camera looks.
+    upward = steps(prior.sigma_vertical_m, max(along_px, prior.sigma_vertical_m / distance * focal * relief))
+    return [np.array([x, y, z]) for z in upward for y in level for x in level]
+
+
+def _turns(prior: FramePrior, options: DenseOptions) -> list[float]:
+    """Turns about the optical axis, radians."""
+    steepness = abs(float(prior.cam_from_local.rotation[2, 2]))  # 1 when looking straight down
+    sigma = float(np.hypot(prior.sigma_heading_deg * steepness, prior.sigma_tilt_deg))
+    reach = min(options.reach_sigma * sigma, 180.0)
+    if reach >= 180.0 - options.turn_step_deg / 2:
+        count = int(np.ceil(360.0 / options.turn_step_deg))
+        return [float(a) for a in 2.0 * np.pi * np.arange(count) / count]
+    side = int(np.ceil(max(0.0, reach - options.turn_step_deg / 2) / options.turn_step_deg))
+    return [float(np.radians(i * options.turn_step_deg)) for i in range(-side, side + 1)]
+
+
+def _pan_tilts(reach_px: float, camera: Camera, options: DenseOptions) -> FloatArray:
+    """Rotations (m, 3, 3) that shift the picture's middle over a disc of the given radius."""
+    focal = camera.params[0]
+    reach = min(np.arctan(reach_px / focal), np.radians(40.0))
+    side = int(np.ceil(reach * focal / options.grid_step_px))
+    steps = np.arange(-side, side + 1) * (options.grid_step_px / focal)
+    pan, tilt = (axis.ravel() for axis in np.meshgrid(steps, steps))
+    angle = np.hypot(pan, tilt)
+    pan, tilt, angle = (values[angle <= reach + 1e-9] for values in (pan, tilt, angle))
+    # Rodrigues' formula for axes in the picture's plane.
+    x, y = tilt / np.maximum(angle, 1e-12), pan / np.maximum(angle, 1e-12)
+    c, s, zero = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    rows = [
+        [c + x * x * (1 - c), x * y * (1 - c), y * s],
+        [x * y * (1 - c), c + y * y * (1 - c), -x * s],
+        [-y * s, x * s, c + zero],
+    ]
+    return np.asarray(rows, dtype=np.float64).transpose(2, 0, 1)
+
+
+def _refined(
+    view: PinholeView,
+    pose: Rigid3,
+    prior: FramePrior,
+    cloud: PointCloud,
+    source: RenderSource,
+    options: DenseOptions,
+) -> DensePose | None:
+    """Downhill simplex on the score maps of a render made at the pose."""
+    radius = options.refine_radius_px
+    maps = score_maps_of(view, pose, radius, cloud, source, options, radius)
+    if len(maps) < 4:
+        return None
+    depth = float(np.median(pose.act(maps.points_local)[:, 2]))
+    turn = 2.0 / maps.camera.params[0]  # two pixels
+    scale = np.array([turn, turn, 2 * turn, *(np.array([1.0, 1.0, 1.5]) * turn * depth)])
+    scale[3:] = np.minimum(scale[3:], max(prior.sigma_horizontal_m, prior.sigma_vertical_m))
+
+    def cost(step: FloatArray) -> float:
+        moved = Rigid3.exp(step * scale) @ pose
+        total, _ = _summed(maps, moved, options)
+        return -options.score_weight * total + 0.5 * prior_distance(moved, prior) ** 2
+
+    simplex = np.vstack([np.zeros(6), np.eye(6)])
+    result = minimize(
+        cost,
+        np.zeros(6),
+        method="Nelder-Mead",
+        options={"initial_simplex": simplex, "maxfev": 300, "xatol": 0.02, "fatol": 0.02, "adaptive": True},
+    )
+    moved = Rigid3.exp(result.x * scale) @ pose
+    total, pieces = _summed(maps, moved, options)
+    return DensePose(
+        cam_from_local=moved,
+        score=total / float(np.sqrt(max(pieces, _MIN_PIECES))),
+        mean_score=total / max(pieces, 1),
+        pieces=pieces,
+    )
+
+
+def _summed(maps: ScoreMaps, pose: Rigid3, options: DenseOptions) -> tuple[float, int]:
+    cam = pose.act(maps.points_local)
+    focal, cx, cy = maps.camera.params
+    z = np.maximum(cam[:, 2:], 1e-3)
+    pixels = cam[:, :2] / z * focal + (cx, cy)
+    scores, inside = scores_at(maps, pixels[None])
+    return float(np.clip(scores[0], -options.score_clip, options.score_clip).sum()), int(inside.sum())
+
+
+def prior_distance(pose: Rigid3, prior: FramePrior) -> float:
+    """Distance of a pose from the prior in the prior's own standard deviations."""
+    start = prior.cam_from_local
+    moved = (pose.center - start.center) / (
+        prior.sigma_horizontal_m,
+        prior.sigma_horizontal_m,
+        prior.sigma_vertical_m,
+    )
+    turned = start.rotation.T @ so3_log(pose.rotation @ start.rotation.T)  # about east, north, up
+    turned = np.degrees(turned) / (prior.sigma_tilt_deg, prior.sigma_tilt_deg, prior.sigma_heading_deg)
+    return float(np.sqrt(moved @ moved + turned @ turned))
+
+
+def _distinct(
+    poses: Sequence[DensePose], camera: Camera, prior: FramePrior, options: DenseOptions
+) -> list[DensePose]:
+    """Those that show something else than every better one."""
+    kept: list[DensePose] = []
+    corners = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)]) * (
+        camera.width,
+        camera.height,
+    )
+    rays = np.column_stack([camera.unproject(corners), np.ones(len(corners))])
+    seen: list[FloatArray] = []
+    for pose in poses:
+        cam_from_prior = pose.cam_from_local @ prior.cam_from_local.inverse()
+        # Compared on a plane across the optical axis, far away beside the step between positions.
+        here = cam_from_prior.inverse().act(rays * 100.0)
+        pixels = here[:, :2] / np.maximum(here[:, 2:], 1e-3) * camera.params[0]
+        if all(np.abs(pixels - other).max() > options.separation_px for other in seen):
+            kept.append(pose)
+            seen.append(pixels)
+    return kept
+
+
+def _sides(camera: Camera, prior: FramePrior, cloud: PointCloud, options: DenseOptions) -> list[int]:
+    """Longer sides of the octaves that photo and scan can fill."""
+    most = finest_side_px(camera, prior.cam_from_local, cloud, options.finest_spacing)
+    sides = [side for side in options.sides_px if side <= 1.2 * most]
+    return sides or [options.sides_px[0]]

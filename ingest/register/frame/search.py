@@ -1,0 +1,228 @@
+"""From a coarse prior to a first pose: star renders, pooled features, consistent matches, LO-RANSAC."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.render.rendering import Rendering
+from ingest.register.frame.consistency import ConsistencyOptions, consistent_matches
+from ingest.register.frame.matching import FrameMatches, guided_matches, joined, pooled_matches
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.pool import Pool
+from ingest.register.frame.star import fan_headings_deg, star_poses, turned_about_vertical
+from ingest.register.frame.views import FrameViews
+from ingest.register.frame_registration import FramePrior, RenderSource
+from reloc.acceptance import independent_inliers, log_nfa
+from reloc.options import PoseOptions
+from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+
+MatchKind = Literal["upright", "oriented", "dense"]
+
+_NADIR_COSINE = 0.87  # within 30 degrees of straight down a heading is a rotation of the image
+# One structure's keypoints at several scales lie this close, share of the longer side (3 px at 1600).
+_SAME_STRUCTURE_REL = 0.002
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameHypothesis:
+    """A pose with the matches behind it.
+
+    Attributes:
+        pose: with the lens. source: what was rendered.
+        matches: all that it was found among. inliers: those of them that agree and are independent.
+        candidates: matches before any selection by geometry; log_nfa: evidence that the pose is no chance
+            among these, so that nothing that was selected by the pose testifies for it.
+        kind: what was matched first.
+        rival_share: support of the best pose elsewhere, as a share of this one's.
+    """
+
+    pose: PoseHypothesis
+    source: RenderSource
+    kind: MatchKind
+    matches: FrameMatches
+    inliers: FrameMatches
+    candidates: int
+    log_nfa: float
+    rival_share: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RenderGroup:
+    """Renders whose features share one reference view.
+
+    Attributes:
+        reference: pose in which neighbourhood is judged. max_turn_deg: how far the photo may be turned to it.
+    """
+
+    reference: Rigid3
+    renderings: Sequence[Rendering]
+    max_turn_deg: float
+
+
+def star_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
+    """Renders of the star around the prior: for features with orientation, and upright ones."""
+    options = views.options
+    poses = star_poses(prior, views.look.depth_m, views.camera, options.star)
+    turn = 180.0 if _any_heading(prior, options) else options.consistency.max_turn_deg
+    renderings = views.renders(poses, views.side_px(options.search_side_px))
+    return [RenderGroup(reference=prior.cam_from_local, renderings=renderings, max_turn_deg=turn)]
+
+
+def fan_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
+    """Renders at the headings that the star leaves out, one view each; none where the heading is known."""
+    options = views.options
+    groups = []
+    for angle in fan_headings_deg(prior.sigma_heading_deg, options.star)[1:]:
+        pose = turned_about_vertical(prior.cam_from_local, angle)
+        renderings = views.renders([pose], views.side_px(options.search_side_px))
+        groups.append(
+            RenderGroup(reference=pose, renderings=renderings, max_turn_deg=options.consistency.max_turn_deg)
+        )
+    return groups
+
+
+def oriented_features_suffice(prior: FramePrior) -> bool:
+    """Whether an unknown heading is a mere rotation of the image, as in nadir photos."""
+    return bool(prior.cam_from_local.rotation[2, 2] < -_NADIR_COSINE)
+
+
+def search(
+    views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource, upright: bool
+) -> FrameHypothesis | None:
+    """A pose from one source and one kind of features, or None where no pose has matches behind it."""
+    options = views.options
+    features = views.photo_features(
+        upright, round(1.25 * views.side_px(options.search_side_px)), options.photo_features
+    )
+    raw, kept = [], []
+    for group in groups:
+        pools = views.pools(group.renderings, source, upright, options.search_features)
+        if not pools:
+            continue
+        matches = pooled_matches(
+            features, joined_pools(pools), options.same_place * views.look.depth_m, options.max_ratio
+        )
+        raw.append(matches)
+        kept.append(_consistent(views, matches, group, options.consistency))
+    return _hypothesis(views, joined(raw), joined(kept), source, upright)
+
+
+def guided(views: FrameViews, start: FrameHypothesis, radius_px: float) -> FrameHypothesis | None:
+    """The pose from matches looked for where `start` predicts them, on a render from its pose."""
+    options = views.options
+    side_px = views.side_px(options.final_side_px)
+    renderings = views.renders([start.pose.cam_from_local], side_px)
+    if not renderings:
+        return None
+    pool = joined_pools(views.pools(renderings, start.source, True, options.final_features))
+    features = views.photo_features(True, round(1.25 * side_px), options.final_features)
+    matches = guided_matches(
+        features,
+        pool,
+        start.pose.camera,
+        start.pose.cam_from_local,
+        radius_px,
+        options.same_place * views.look.depth_m,
+        options.max_ratio,
+    )
+    settings = pose_options(views)
+    pose = estimate_pose(matches.pixels, matches.points, start.pose.camera, _lens(options), settings)
+    if pose is None:
+        return None
+    pose = refine_pose(matches.pixels, matches.points, _with_prior_lens(pose, start.pose), settings)
+    return replace(
+        start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
+    )
+
+
+def pose_options(views: FrameViews) -> PoseOptions:
+    """Tolerance by the density of the scan: a keypoint on splats is no better located than these."""
+    options = views.options
+    side = max(views.camera.width, views.camera.height)
+    by_scan = views.spacing_full_px / side
+    tolerance = float(np.clip(by_scan, options.tolerance_rel, options.max_tolerance_rel))
+    return PoseOptions(tolerance_rel=tolerance, seed=options.seed)
+
+
+def joined_pools(pools: Sequence[Pool]) -> Pool:
+    """One pool of all."""
+    return Pool(
+        points=np.concatenate([p.points for p in pools]),
+        descriptors=np.concatenate([p.descriptors for p in pools]),
+        fingerprint=pools[0].fingerprint,
+    )
+
+
+def _consistent(
+    views: FrameViews, matches: FrameMatches, group: RenderGroup, options: ConsistencyOptions
+) -> FrameMatches:
+    camera = views.camera
+    reference = camera.project(group.reference.act(matches.points))
+    found = consistent_matches(
+        matches.pixels,
+        reference,
+        float(max(camera.width, camera.height)),
+        float(camera.width * camera.height),
+        replace(options, max_turn_deg=group.max_turn_deg),
+    )
+    return matches.take(found.kept)
+
+
+def _hypothesis(
+    views: FrameViews, raw: FrameMatches, kept: FrameMatches, source: RenderSource, upright: bool
+) -> FrameHypothesis | None:
+    settings = pose_options(views)
+    pose = estimate_pose(kept.pixels, kept.points, views.camera, _lens(views.options), settings)
+    if pose is None:
+        return None
+    pose = refine_pose(kept.pixels, kept.points, pose, settings)
+    tolerance_px = settings.tolerance_rel * max(views.camera.width, views.camera.height)
+    error = reprojection_errors(raw.pixels, raw.points, pose.camera, pose.cam_from_local)
+    testimony = independent(views.camera, raw.take(error < tolerance_px))
+    return FrameHypothesis(
+        pose=pose,
+        source=source,
+        kind="upright" if upright else "oriented",
+        matches=kept,
+        inliers=independent(views.camera, kept.take(pose.inliers)),
+        candidates=len(raw),
+        log_nfa=log_nfa(
+            len(raw), len(testimony), tolerance_px, views.camera.width, views.camera.height, sample=3
+        ),
+        rival_share=_rival(views, kept, pose, settings) / max(pose.count, 1),
+    )
+
+
+def _rival(views: FrameViews, kept: FrameMatches, best: PoseHypothesis, settings: PoseOptions) -> int:
+    """Inliers of the best pose among the matches that the winner does not explain."""
+    tolerance_px = settings.tolerance_rel * max(views.camera.width, views.camera.height)
+    error = reprojection_errors(kept.pixels, kept.points, best.camera, best.cam_from_local)
+    # What lies a little off the winner is its own: slopes, a bent scan, a lens that is not quite right.
+    rest = kept.take(error > 4.0 * tolerance_px)
+    other = estimate_pose(rest.pixels, rest.points, best.camera, "request", settings)
+    if other is None:
+        return 0
+    return len(independent(views.camera, rest.take(other.inliers)))
+
+
+def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
+    """Those inliers that are measurements of their own."""
+    gap = _SAME_STRUCTURE_REL * max(camera.width, camera.height)
+    return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
+
+
+def _lens(options: FrameOptions) -> CameraSource:
+    return "exif" if options.estimate_focal else "request"
+
+
+def _with_prior_lens(pose: PoseHypothesis, start: PoseHypothesis) -> PoseHypothesis:
+    """What was known of the lens beforehand stays what it was: a round's result is no new prior."""
+    return replace(pose, prior_focal_px=start.prior_focal_px)
+
+
+def _any_heading(prior: FramePrior, options: FrameOptions) -> bool:
+    return prior.sigma_heading_deg >= options.star.full_circle_sigma_deg

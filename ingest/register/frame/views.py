@@ -1,0 +1,137 @@
+"""The photo's features, and renders of the scan from any pose at the size that suits both."""
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from featuredb.render.rendering import Rendering
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.pool import Pool, pool_features
+from ingest.register.frame_registration import FramePrior, RenderSource
+
+_LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover
+_LOOK_WIDER = 2.0  # and sees so many times as far to every side: the prior may look past the scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FirstLook:
+    """What the prior sees of the scan.
+
+    Attributes:
+        depth_m: median distance along the optical axis.
+        cover: share of the view, taken twice as wide, that shows the scan.
+        spacing_m: between neighbouring points, median over what is seen.
+    """
+
+    depth_m: float
+    cover: float
+    spacing_m: float
+
+
+def first_look(cloud: PointCloud, camera: Camera, prior: FramePrior) -> FirstLook | None:
+    """Distance, cover and density of the scan where the prior looks; None where it sees nothing."""
+    factor = _LOOK_SIDE_PX / max(camera.width, camera.height)
+    width, height = (max(round(side * factor), 32) for side in (camera.width, camera.height))
+    wide = Camera.from_focal(width, height, camera.focal_px * factor / _LOOK_WIDER, model="PINHOLE")
+    rendering = render(cloud, wide, prior.cam_from_local, RenderOptions(attributes=False, threads=1))
+    depth = rendering.depth[rendering.valid]
+    if len(depth) == 0:
+        return None
+    spacing = _spacing_of_points(cloud, np.unique(rendering.index[rendering.index >= 0]))
+    return FirstLook(depth_m=float(np.median(depth)), cover=float(rendering.valid.mean()), spacing_m=spacing)
+
+
+def _spacing_of_points(cloud: PointCloud, rows: NDArray[np.int32]) -> float:
+    """Spacing of the finest nodes around some points of the cloud."""
+    sample = cloud.xyz[rows[:: max(len(rows) // 200, 1)]]
+    nodes = cloud.nodes
+    inside = (sample[:, None] >= nodes.box_min).all(axis=2) & (sample[:, None] <= nodes.box_max).all(axis=2)
+    finest = np.where(inside, nodes.spacing_m, np.inf).min(axis=1)
+    return float(np.median(finest[np.isfinite(finest)]))
+
+
+class FrameViews:
+    """One photo and one scan; renders and features are made on a small pool of threads.
+
+    Args:
+        gray: (h, w) uint8, the photo. camera: of the photo, full size.
+    """
+
+    def __init__(
+        self,
+        gray: NDArray[np.uint8],
+        camera: Camera,
+        cloud: PointCloud,
+        look: FirstLook,
+        options: FrameOptions,
+    ) -> None:
+        self.gray, self.camera, self.cloud, self.look, self.options = gray, camera, cloud, look, options
+        self.points_drawn: list[int] = []
+        self._features: dict[tuple[bool, int], Features] = {}
+
+    @property
+    def spacing_full_px(self) -> float:
+        """Distance of neighbouring scan points, in pixels of the full-size photo."""
+        return self.look.spacing_m * self.camera.focal_px / self.look.depth_m
+
+    def side_px(self, most_px: int) -> int:
+        """Longer side of renders: no finer than the scan, no smaller than features need."""
+        side = max(self.camera.width, self.camera.height)
+        by_scan = round(self.options.spacing_px * side / max(self.spacing_full_px, 1e-6))
+        return int(np.clip(by_scan, min(self.options.min_side_px, side), min(most_px, side)))
+
+    def render_camera(self, side_px: int) -> Camera:
+        """The photo's camera, shrunk."""
+        factor = side_px / max(self.camera.width, self.camera.height)
+        if factor >= 1.0:
+            return self.camera
+        return self.camera.scaled_to(
+            max(round(self.camera.width * factor), 1), max(round(self.camera.height * factor), 1)
+        )
+
+    def renders(self, poses: Sequence[Rigid3], side_px: int) -> list[Rendering]:
+        """The scan from each pose; those that show next to nothing of it are left out."""
+        camera = self.render_camera(side_px)
+        single = RenderOptions(threads=1)
+        with ThreadPoolExecutor(self._threads()) as threads:
+            made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))
+        self.points_drawn += [r.points_drawn for r in made]
+        return [r for r in made if r.valid.mean() >= self.options.verdict.min_cover]
+
+    def photo_features(self, upright: bool, side_px: int, count: int) -> Features:
+        """Features of the photo at about the size of the renders; kept for the next call."""
+        key = (upright, side_px)
+        if key not in self._features:
+            self._features[key] = extract(
+                self.gray,
+                ExtractorOptions(
+                    max_side_px=max(side_px, 64),
+                    max_features=count,
+                    oversample=1.5,
+                    contrast_threshold=0.01,
+                    upright=upright,
+                ),
+            )
+        return self._features[key]
+
+    def pools(
+        self, renderings: Sequence[Rendering], source: RenderSource, upright: bool, count: int
+    ) -> list[Pool]:
+        """Features of each render with their scan points."""
+        options = self.options.pool
+        options = replace(options, extractor=replace(options.extractor, max_features=count))
+        with ThreadPoolExecutor(self._threads()) as threads:
+            return list(threads.map(lambda r: pool_features([r], source, upright, options), renderings))
+
+    def _threads(self) -> int:
+        return self.options.threads or min(len(os.sched_getaffinity(0)), 4)

@@ -1,0 +1,388 @@
+"""Final adjustment of a map by a scan: several registered frames and the scan's surface straighten it.
+
+A similarity cannot mend a lens. Over nearly flat ground structure from motion trades focal length against
+height without a trace in its residuals; placed on a scan, such a map fits its own photos and lies on the
+ground, and yet its cameras stand metres too high. What the registered frames see of the scan (their
+correspondences) and the scan's surface under all points of the map determine poses, lens and points together.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.render.cloud import PointCloud
+from ingest.precision import linearise
+from ingest.register.control.block import Block, block_of_map, map_of_block
+from ingest.register.structure.pairs import RegisteredImage
+from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
+from ingest.register.structure.scan_block import Control, Planes, Sigmas, lens_covariance, solve
+from ingest.register.structure.similarity import similarities
+from ingest.register.structure.surface_fit import Surface, SurfaceOptions, plane_distances, surface_near
+
+AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustLidarOptions:
+    """The adjustment and its gates.
+
+    Attributes:
+        min_control: correspondences of registered frames; fewer leave lens and height to the surface alone.
+        min_sigma_rel: least standard deviation of keypoints and of correspondences with the scan, as a share
+            of the photo's longer side: a pixel in 4000. Tracks alone may fit to a third of that, but what
+            lens models leave is common to neighbours and does not average out; trusted to their noise,
+            thousands of tracks outvote the frames' correspondences (tools/scan_poses.py shows it).
+        min_surface_m: of a scan's surface against map points; roughness of grass and pavement.
+        focal_rel: standard deviation of the focal length's prior: structure from motion over flat ground
+            was 25 % off on `brighton`.
+        center_rel: of the principal point's, as a share of the longer side: most lenses are centred to that.
+        distortion: of a distortion coefficient's.
+        rounds: of looking up the scan's planes; it ends earlier when points move by less than `settled_m`.
+        steps: of the solver in each round.
+        settled_m: see above; far below a scan's noise.
+        reach_m: a plane further from a point says nothing of it.
+        max_control_rel: median miss of the correspondences after the adjustment, as a share of the photo's
+            longer side: 8 pixels in 4000. Honest ones miss by about two; more means that frames, map and
+            scan contradict each other, and that robust weights have put the frames aside.
+        max_reprojection_growth: of the median reprojection error, or of `reprojection_floor_rel` of the
+            longer side where it is smaller (half a pixel in 4000).
+        surface: the scan as planes; finer than for the similarity, since single points are moved.
+    """
+
+    min_control: int = 60
+    min_sigma_rel: float = 0.00025
+    min_surface_m: float = 0.03
+    focal_rel: float = 0.3
+    center_rel: float = 0.02
+    distortion: float = 0.1
+    rounds: int = 25
+    steps: int = 4
+    settled_m: float = 1e-3
+    reach_m: float = 1.0
+    max_control_rel: float = 0.002
+    max_reprojection_growth: float = 0.1
+    reprojection_floor_rel: float = 0.000125
+    surface: SurfaceOptions = field(default_factory=lambda: SurfaceOptions(max_surface_points=250_000))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LidarAdjustment:
+    """An adjusted map, or why the similarity stands.
+
+    Attributes:
+        reason: gate that refused it, or None; `message` says it for people.
+        block: the map in the cloud's local frame, None when refused.
+        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity) and of what its
+            lens leaves open, or None.
+        before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
+        figures: before and after, JSON-able.
+        seconds: of the whole.
+    """
+
+    reason: AdjustReason | None
+    message: str
+    block: Block | None
+    covariance: FloatArray | None
+    before_m: FloatArray
+    after_m: FloatArray
+    figures: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+
+    @property
+    def accepted(self) -> bool:
+        return self.reason is None
+
+
+def adjust_to_scan(
+    feature_map: FeatureMap,
+    structure: StructurePlacement,
+    registered: Sequence[RegisteredImage],
+    cloud: PointCloud,
+    options: AdjustLidarOptions | None = None,
+) -> LidarAdjustment:
+    """Adjust a map that `structure` has placed, lens included.
+
+    Args:
+        structure: an accepted placement of this map on this cloud.
+        registered: the frames with their correspondences, in the cloud's local frame. A frame without
+            correspondences takes part by the pairs of structure projection, which know no better lens than
+            the one it was registered with.
+    """
+    options = options or AdjustLidarOptions()
+    started = time.perf_counter()
+    assert structure.new_from_old is not None  # accepted
+    to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
+    start = block_of_map(feature_map).moved(structure.new_from_old @ to_cloud)
+    control = control_of(feature_map, structure, registered)
+    nothing = np.full(len(start.xyz), np.nan)
+    if len(control.xyz) < options.min_control:
+        words = f"{len(control.xyz)} correspondences with the scan, at least {options.min_control} are needed"
+        return _refused("NO_CONTROL", words, nothing, nothing, {}, started)
+    low, high = np.percentile(start.xyz, [1, 99], axis=0)
+    surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
+    if surface is None:
+        return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {}, started)
+    block = _iterate(start, control, surface, options)
+    before = plane_distances(surface, start.xyz, options.reach_m)
+    after = plane_distances(surface, block.xyz, options.reach_m)
+    figures = {
+        "control": len(control.xyz),
+        "frames": len(np.unique(control.photo_of)),
+        "before": _state(start, control, before),
+        "after": _state(block, control, after),
+        "options": asdict(options),
+    }
+    reason, message = _gate(block, figures, options)
+    if reason is not None:
+        return _refused(reason, message, before, after, figures, started)
+    return LidarAdjustment(
+        reason=None,
+        message="adjusted to the scan",
+        block=block,
+        covariance=_placement_covariance(block, control, surface, structure, start, options),
+        before_m=before,
+        after_m=after,
+        figures=figures,
+        seconds=time.perf_counter() - started,
+    )
+
+
+def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: PointCloud) -> FeatureMap:
+    """The map with the adjusted poses, points and lenses, in its own local frame; the scan's height datum.
+
+    `local_from_sfm` becomes the similarity next to the old one; what is left over is the adjustment itself.
+    """
+    assert adjustment.block is not None
+    assert adjustment.covariance is not None  # accepted
+    map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
+    block = adjustment.block.moved(map_from_cloud)
+    whole = _nearest_similarity(block_of_map(feature_map).centers(), block.centers())
+    _, covariance = move_in_map_frame(feature_map, Sim3.identity(), adjustment.covariance, cloud)
+    placement = Placement(
+        method="lidar",
+        local_from_sfm=whole @ feature_map.placement.local_from_sfm,
+        covariance=covariance,
+        residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
+        evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
+    )
+    return map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+
+
+def control_of(
+    feature_map: FeatureMap, structure: StructurePlacement, registered: Sequence[RegisteredImage]
+) -> Control:
+    """Scan points that the registered frames see, by their correspondences or else by their pairs."""
+    row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
+    xyz, xy, photo_of = [], [], []
+    for frame, item in enumerate(registered):
+        points, pixels = item.registration.points_local, item.registration.pixels
+        if len(points) == 0:
+            points, pixels = _pairs_as_control(feature_map, structure, frame, item.image_id)
+        xyz.append(points)
+        xy.append(pixels)
+        photo_of.append(np.full(len(points), row_of_image[item.image_id], dtype=np.int64))
+    return Control(
+        xyz=np.concatenate(xyz).reshape(-1, 3),
+        photo_of=np.concatenate(photo_of),
+        xy=np.concatenate(xy).reshape(-1, 2),
+    )
+
+
+def _pairs_as_control(
+    feature_map: FeatureMap, structure: StructurePlacement, frame: int, image_id: int
+) -> tuple[FloatArray, FloatArray]:
+    assert structure.pairs is not None  # accepted
+    rows = np.flatnonzero((structure.pairs.frame_of == frame) & structure.inliers)
+    observations = feature_map.observations
+    mine = np.flatnonzero(observations.image_id == image_id)
+    row_of_point = dict(zip(observations.point_index[mine].tolist(), mine.tolist(), strict=True))
+    seen = [row_of_point[int(p)] for p in structure.pairs.point_index[rows]]
+    return structure.pairs.target[rows], observations.xy[seen].astype(np.float64)
+
+
+def _iterate(start: Block, control: Control, surface: Surface, options: AdjustLidarOptions) -> Block:
+    """Rounds of planes, standard deviations and solving until the points settle."""
+    block = start
+    for _ in range(options.rounds):
+        planes = _planes(surface, block.xyz, options.reach_m)
+        sigmas = _sigmas(block, control, planes, options)
+        moved = solve(block, control, planes, start.cameras, sigmas, options.steps)
+        settled = np.median(np.linalg.norm(moved.xyz - block.xyz, axis=1)) < options.settled_m
+        settled &= np.linalg.norm(moved.centers() - block.centers(), axis=1).max() < 5 * options.settled_m
+        block = moved
+        if settled:
+            break
+    return block
+
+
+def _placement_covariance(
+    block: Block,
+    control: Control,
+    surface: Surface,
+    structure: StructurePlacement,
+    start: Block,
+    options: AdjustLidarOptions,
+) -> FloatArray:
+    """(7, 7): the similarity's, and what the lens leaves open for whoever is localised through it.
+
+    A principal point that is wrong by a pixel moves a camera that looks down by a pixel on the ground, a
+    focal length that is wrong by a thousandth lifts it by a thousandth of the distance. Points do not move
+    so far: for them the covariance is on the safe side. Residuals count with their spread as it is, and as
+    neighbours err alike, by as much less as the pairs of structure projection do.
+    """
+    assert structure.covariance is not None  # accepted
+    planes = _planes(surface, block.xyz, options.reach_m)
+    sigmas = _sigmas(block, control, planes, replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3))
+    lenses = lens_covariance(block, control, planes, start.cameras, sigmas)
+    distances = np.linalg.norm(block.xyz[block.point_of] - block.centers()[block.photo_of], axis=1)
+    distance = float(np.median(distances))
+    variances = []
+    for camera, lens in zip(block.cameras, lenses, strict=True):
+        template = camera.to_pycolmap()
+        focal, center = template.focal_length_idxs(), template.principal_point_idxs()
+        relative = np.diag(lens) * (distance / camera.focal_px) ** 2
+        variances.append([relative[center].max(), relative[center].max(), relative[focal].max()])
+    covariance = np.array(structure.covariance)
+    dilution = float(structure.figures["neighbours_factor"])
+    covariance[4:, 4:] += dilution * np.diag(np.max(variances, axis=0))
+    return covariance
+
+
+def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> Planes:
+    centred = np.ascontiguousarray(xyz - surface.middle)
+    found, _ = surface.tree.batch_nearest_neighbor_search(centred)
+    return Planes(
+        offset=plane_distances(surface, xyz, reach_m),
+        normals=surface.normals[np.asarray(found).astype(np.int64)],
+    )
+
+
+def _sigmas(block: Block, control: Control, planes: Planes, options: AdjustLidarOptions) -> Sigmas:
+    """Each kind of residual weighs by its own spread as it is now."""
+    longer = _longer_side(block)
+    return Sigmas(
+        track_px=max(options.min_sigma_rel * longer, _spread(_track_residuals(block))),
+        control_px=max(options.min_sigma_rel * longer, _spread(_control_residuals(block, control))),
+        surface_m=max(options.min_surface_m, _spread(planes.offset)),
+        focal_rel=options.focal_rel,
+        center_rel=options.center_rel,
+        distortion=options.distortion,
+    )
+
+
+def _longer_side(block: Block) -> int:
+    return max(max(camera.width, camera.height) for camera in block.cameras)
+
+
+def _spread(residuals: FloatArray) -> float:
+    """Standard deviation by the median, NaN left out."""
+    finite = np.abs(residuals[np.isfinite(residuals)])
+    return 1.4826 * float(np.median(finite)) if len(finite) else 0.0
+
+
+def _track_residuals(block: Block) -> FloatArray:
+    return _residuals(block, block.xyz, block.point_of, block.photo_of, block.xy)
+
+
+def _control_residuals(block: Block, control: Control) -> FloatArray:
+    return _residuals(block, control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy)
+
+
+def _residuals(
+    block: Block,
+    points: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    xy: FloatArray,
+) -> FloatArray:
+    """Observed minus projected (m, 2), pixels."""
+    return linearise(
+        block.cameras, block.camera_of, block.cam_from_block, points, point_of, photo_of, xy
+    ).residual
+
+
+def _state(block: Block, control: Control, distances: FloatArray) -> dict[str, Any]:
+    tracks = np.linalg.norm(_track_residuals(block), axis=1)
+    seen = np.linalg.norm(_control_residuals(block, control), axis=1)
+    near = np.abs(distances[np.isfinite(distances)])
+    return {
+        "reprojection_median_px": float(np.nanmedian(tracks)),
+        "reprojection_rms_px": float(np.sqrt(np.nanmean(tracks**2))),
+        "control_median_px": float(np.nanmedian(seen)),
+        "surface_points": len(near),
+        "surface_median_m": float(np.median(near)) if len(near) else None,
+        "surface_rms_m": float(np.sqrt((near**2).mean())) if len(near) else None,
+        "cameras": [[camera.model, *camera.params] for camera in block.cameras],
+    }
+
+
+def _gate(
+    block: Block, figures: dict[str, Any], options: AdjustLidarOptions
+) -> tuple[AdjustReason | None, str]:
+    before, after = figures["before"], figures["after"]
+    if any(_folds_inside(camera) for camera in block.cameras):
+        return "LENS", "the adjusted lens would fold the picture's corners"
+    allowed = options.max_control_rel * _longer_side(block)
+    if after["control_median_px"] > allowed:
+        return "CONTROL", (
+            f"the frames' correspondences still miss by {after['control_median_px']:.1f} pixels, at most "
+            f"{allowed:.1f} are believed"
+        )
+    limit = (1.0 + options.max_reprojection_growth) * max(
+        before["reprojection_median_px"], options.reprojection_floor_rel * _longer_side(block)
+    )
+    if after["reprojection_median_px"] > limit:
+        return "REPROJECTION", (
+            f"the scan would raise the median reprojection error from {before['reprojection_median_px']:.2f} "
+            f"to {after['reprojection_median_px']:.2f} pixels"
+        )
+    if after["surface_median_m"] is None or after["surface_median_m"] > before["surface_median_m"]:
+        return "SURFACE", "the adjustment brings the map no closer to the scan"
+    return None, ""
+
+
+def _folds_inside(camera: Camera) -> bool:
+    """Whether the lens polynomial turns back before the corner of the image."""
+    center = camera.to_pycolmap()
+    reach = np.hypot(
+        max(center.principal_point_x, camera.width - center.principal_point_x),
+        max(center.principal_point_y, camera.height - center.principal_point_y),
+    )
+    return bool(camera.tan_of_fold < reach / camera.focal_px)
+
+
+def _nearest_similarity(source: FloatArray, target: FloatArray) -> Sim3:
+    """Least-squares similarity of the camera centres; the identity's neighbour where they are on a line."""
+    scale, rotation, translation, usable = similarities(source[None], target[None])
+    if not usable[0]:
+        shift = target.mean(axis=0) - source.mean(axis=0)
+        return Sim3(scale=1.0, rotation=np.eye(3), translation=shift)
+    return Sim3(scale=float(scale[0]), rotation=rotation[0], translation=translation[0])
+
+
+def _refused(
+    reason: AdjustReason,
+    message: str,
+    before: FloatArray,
+    after: FloatArray,
+    figures: dict[str, Any],
+    started: float,
+) -> LidarAdjustment:
+    return LidarAdjustment(
+        reason=reason,
+        message=message,
+        block=None,
+        covariance=None,
+        before_m=before,
+        after_m=after,
+        figures=figures,
+        seconds=time.perf_counter() - started,
+    )

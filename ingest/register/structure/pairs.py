@@ -1,0 +1,179 @@
+"""3D/3D pairs: points of a map, projected through a registered frame onto the scan."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from ingest.register.frame_registration import FrameRegistration
+from ingest.register.structure.depth_filter import DepthFilterOptions, SurfaceHits, surface_at
+from ingest.register.structure.similarity import Pairs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairOptions:
+    """How pairs are made.
+
+    Attributes:
+        render_width_px: of the depth image; about the resolution at which airborne scans have a point in
+            most pixels of a drone's photo.
+        pixel_sigma_rel: standard deviation of a keypoint against the scan, as a share of the photo's longer
+            side: a pixel in 2000, what lens models leave.
+        scan_sigma_m: of the scan's points across their surface, beyond what the roughness shows.
+        max_point_sigma_rel: map points less certain than this share of their distance are left out.
+        cells: per side of the grid of neighbourhoods in a frame.
+        depth: filter of the depth image.
+    """
+
+    render_width_px: int = 1000
+    pixel_sigma_rel: float = 0.0005
+    scan_sigma_m: float = 0.03
+    max_point_sigma_rel: float = 0.05
+    cells: int = 6
+    depth: DepthFilterOptions = field(default_factory=DepthFilterOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RegisteredImage:
+    """A frame of a map that was registered to the scan.
+
+    Attributes:
+        image_id: of the map's image.
+        registration: accepted, in the local frame of the cloud.
+        camera: the lens with which it was registered, where the registration does not name it itself;
+            None for the map's own.
+    """
+
+    image_id: int
+    registration: FrameRegistration
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        if not self.registration.accepted:
+            raise InvalidValueError(
+                f"RegisteredImage {self.image_id}: expected an accepted registration, "
+                f"found {self.registration.reason}"
+            )
+
+
+def structure_pairs(
+    feature_map: FeatureMap,
+    source: FloatArray,
+    registered: Sequence[RegisteredImage],
+    cloud: PointCloud,
+    options: PairOptions,
+) -> Pairs:
+    """Pairs of all frames.
+
+    Args:
+        source: (n, 3) the map's points in the cloud's local frame, at their present place.
+
+    Raises:
+        InvalidValueError: a registered image that the map does not have.
+    """
+    images = {image.image_id: image for image in feature_map.images}
+    missing = [r.image_id for r in registered if r.image_id not in images]
+    if missing:
+        raise InvalidValueError(f"structure_pairs: the map {feature_map.map_id} has no images {missing}")
+    uncertainty = _point_covariances(feature_map)
+    parts = [
+        _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud, options)
+        for row, r in enumerate(registered)
+    ]
+    joined = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in (
+            *("point_index", "frame_of", "source", "target", "normals"),
+            *("covariance", "by_frame", "cell_of", "frame_covariance"),
+        )
+    }
+    return Pairs(**joined)
+
+
+def _pairs_of_frame(
+    feature_map: FeatureMap,
+    source: FloatArray,
+    uncertainty: FloatArray,
+    image: MapImage,
+    registered: RegisteredImage,
+    row: int,
+    cloud: PointCloud,
+    options: PairOptions,
+) -> Pairs:
+    pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
+    assert pose is not None
+    assert covariance is not None  # accepted
+    camera = registered.registration.camera or registered.camera or feature_map.cameras[image.camera_id]
+    width = min(options.render_width_px, camera.width)
+    small = camera.scaled_to(width, round(camera.height * width / camera.width))
+    rendering = render(cloud, small, pose, RenderOptions(attributes=False))
+    observations = feature_map.observations
+    mine = observations.image_id == image.image_id
+    points = observations.point_index[mine]
+    pixels = observations.xy[mine].astype(np.float64) * (
+        small.width / camera.width,
+        small.height / camera.height,
+    )
+    hits = surface_at(rendering, cloud, pixels, options.depth)
+    distance = np.linalg.norm(hits.points - pose.center, axis=1)
+    largest = np.sqrt(np.linalg.eigvalsh(uncertainty[points])[:, -1])
+    kept = hits.valid & (largest <= options.max_point_sigma_rel * np.where(hits.valid, distance, 0.0))
+    own, by_frame = _errors(hits, pose, camera, options)
+    grid = np.minimum(
+        (pixels / (small.width, small.height) * options.cells).astype(np.int64), options.cells - 1
+    )
+    cell = row * options.cells**2 + grid[:, 1] * options.cells + grid[:, 0]
+    return Pairs(
+        point_index=points[kept],
+        frame_of=np.full(int(kept.sum()), row, dtype=np.int64),
+        source=source[points[kept]],
+        target=hits.points[kept],
+        normals=hits.normals[kept],
+        covariance=own[kept] + uncertainty[points[kept]],
+        by_frame=by_frame[kept],
+        cell_of=cell[kept],
+        frame_covariance=covariance[None],
+    )
+
+
+def _errors(
+    hits: SurfaceHits, pose: Rigid3, camera: Camera, options: PairOptions
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance (n, 3, 3) of each hit by its own errors, and derivative (n, 3, 6) by the frame's pose.
+
+    A ray that turns or shifts by d meets the surface's plane at d - u (n.d)/(n.u), u being its direction.
+    """
+    rays = hits.points - pose.center
+    direction = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    facing = np.einsum("ij,ij->i", hits.normals, direction)
+    slide = np.eye(3) - direction[:, :, None] * hits.normals[:, None, :] / facing[:, None, None]
+    pixel_m = options.pixel_sigma_rel * max(camera.width, camera.height) / camera.focal_px * hits.depths
+    across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    shifted = slide @ across
+    own = (pixel_m**2)[:, None, None] * shifted @ np.swapaxes(shifted, 1, 2)
+    along = hits.sigma_ray_m**2 + (options.scan_sigma_m / facing) ** 2
+    own += along[:, None, None] * direction[:, :, None] * direction[:, None, :]
+    # T_true = exp(xi) T moves the point at camera coordinates p by -R' (omega x p + nu).
+    in_camera = pose.act(hits.points)
+    by_pose = np.concatenate([_skews(in_camera), np.broadcast_to(-np.eye(3), (len(rays), 3, 3))], axis=2)
+    return own, slide @ (pose.rotation.T @ by_pose)
+
+
+def _skews(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.einsum("nk,kij->nij", vectors, np.array([skew(axis) for axis in np.eye(3)])))
+
+
+def _point_covariances(feature_map: FeatureMap) -> FloatArray:
+    """(n, 3, 3) of the map's points, relative to the map's gauge."""
+    packed = feature_map.points.covariance.astype(np.float64)
+    order: NDArray[np.int64] = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+    return packed[:, order]

@@ -1,0 +1,393 @@
+"""Structure projection: registered frames carry the map's points onto the scan, and the map follows.
+
+Structure-projection paper, 2.4: depth image of the registered frame, the map's visible points projected on
+it, 3D/3D pairs, RANSAC similarity, refinement on SIM(3), ICP against the scan. Here the refinement weighs
+pairs by their own covariance and knows that all pairs of a frame share its pose error; ICP is GICP and may
+not leave the evidence.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.render.cloud import PointCloud
+from ingest.register.control.block import block_of_map, map_of_block
+from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
+from ingest.register.structure.similarity import (
+    Pairs,
+    SimilarityFit,
+    SimilarityOptions,
+    ransac_similarity,
+    refine_similarity,
+)
+from ingest.register.structure.surface_fit import (
+    GicpOutcome,
+    Surface,
+    SurfaceOptions,
+    guarded_gicp,
+    moved,
+    plane_distances,
+    reach_of,
+    surface_near,
+)
+
+StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StructureOptions:
+    """Structure projection and its gates.
+
+    Attributes:
+        tolerance_rel: a pair further off, as a share of its distance from the camera, is an outlier of
+            RANSAC: reconstructions bend by up to about a percent of the flying height.
+        min_tolerance_m: but never less than the scan's own noise and spacing explain.
+        min_pairs: inliers; the paper speaks of hundreds. Thirty fix a similarity to a fifth of a pair's
+            sigma.
+        min_inlier_share: of the pairs; with fewer the frame or the map is wrong.
+        min_spread_rel: second singular value of the inliers' spread over their distance from the camera;
+            pairs closer to a line leave the rotation about it open.
+        max_residual_rel: root mean square of the inliers' residuals over their distance.
+        max_scale_change: of the map against its present placement, beyond the sigmas of both. GPS that was
+            accepted knows the scale to a tenth or better.
+        scale_sigmas: how many sigmas of both placements the scale may differ.
+    """
+
+    tolerance_rel: float = 0.015
+    min_tolerance_m: float = 0.15
+    min_pairs: int = 30
+    min_inlier_share: float = 0.3
+    min_spread_rel: float = 0.02
+    max_residual_rel: float = 0.01
+    max_scale_change: float = 0.05
+    scale_sigmas: float = 4.0
+    pairs: PairOptions = field(default_factory=PairOptions)
+    similarity: SimilarityOptions = field(default_factory=SimilarityOptions)
+    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StructurePlacement:
+    """Where structure projection puts a map, or why it does not.
+
+    Attributes:
+        reason: gate that refused it, or None; `message` says it for people.
+        new_from_old: similarity of the scan's local frame that moves the map from its present place to
+            the new one, None when refused.
+        covariance: (7, 7) of its left perturbation, None when refused.
+        pairs: the 3D/3D pairs, None without frames.
+        inliers: (n,) bool of the pairs.
+        before_m, after_m: signed distance of every point of the map from the scan's surface; NaN where no
+            scan is near. After: at the new place.
+        figures: what the decision rests on, JSON-able.
+        seconds: by step, in order.
+    """
+
+    reason: StructureReason | None
+    message: str
+    new_from_old: Sim3 | None
+    covariance: FloatArray | None
+    pairs: Pairs | None
+    inliers: NDArray[np.bool_]
+    before_m: FloatArray
+    after_m: FloatArray
+    figures: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def accepted(self) -> bool:
+        return self.reason is None
+
+
+def project_structure(
+    feature_map: FeatureMap,
+    registered: Sequence[RegisteredImage],
+    cloud: PointCloud,
+    options: StructureOptions | None = None,
+) -> StructurePlacement:
+    """Place a map on a scan by frames of the map that were registered to it.
+
+    Args:
+        registered: frames with their poses in the cloud's local frame; one is enough.
+    """
+    options = options or StructureOptions()
+    clock = _Clock()
+    count = len(feature_map.points)
+    if not registered:
+        return _refused("NO_FRAMES", "no frame is registered to the scan", count, clock)
+    source = feature_map.points_local(cloud.frame)
+    pairs = structure_pairs(feature_map, source, registered, cloud, options.pairs)
+    clock.lap("depth and pairs")
+    if len(pairs) < options.min_pairs:
+        words = f"{len(pairs)} of the map's points meet the scan, at least {options.min_pairs} are needed"
+        return _refused("TOO_FEW_PAIRS", words, count, clock, pairs)
+    distances = _distances(pairs, registered)
+    tolerance = np.maximum(options.min_tolerance_m, options.tolerance_rel * distances)
+    start = ransac_similarity(pairs, tolerance, options.similarity)
+    clock.lap("RANSAC")
+    if start is None:
+        return _refused("NO_SIMILARITY", "the pairs lie on a line or coincide", count, clock, pairs)
+    near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
+    reason, message, figures = _gate_of_pairs(pairs, near, distances, options)
+    if reason is not None:
+        return _refused(reason, message, count, clock, pairs, figures)
+    kept = _rows(pairs, near)
+    fit = refine_similarity(start, kept, options.similarity)
+    clock.lap("refinement")
+    figures |= _figures_of_fit(fit, kept, feature_map, registered)
+    reason, message = _gate_of_fit(fit, distances[near], figures, options)
+    inliers = near.copy()
+    inliers[near] = fit.inliers
+    if reason is not None:
+        return _refused(reason, message, count, clock, pairs, figures, inliers)
+    return _onto_surface(source, pairs, inliers, fit, cloud, figures, clock, options)
+
+
+def _onto_surface(
+    source: FloatArray,
+    pairs: Pairs,
+    inliers: NDArray[np.bool_],
+    fit: SimilarityFit,
+    cloud: PointCloud,
+    figures: dict[str, Any],
+    clock: "_Clock",
+    options: StructureOptions,
+) -> StructurePlacement:
+    """The last step of an accepted similarity: GICP under its guard, and the residuals before and after."""
+    sim = fit.target_from_source
+    placed = sim.act(source)
+    before = after = np.full(len(source), np.nan)
+    # Points far from all others (gross errors of matching) would make the box endless.
+    low, high = np.percentile(placed, [1, 99], axis=0)
+    surface = surface_near(cloud, np.clip(placed, low, high), options.surface)
+    clock.lap("surface")
+    if surface is not None:
+        if options.surface.gicp:
+            outcome = guarded_gicp(
+                surface, placed, sim.act(pairs.source[inliers]), fit.covariance, options.surface
+            )
+            figures["gicp"] = _gicp_figures(outcome)
+            if outcome.accepted:
+                sim = moved(sim, outcome.move)
+            clock.lap("GICP")
+        before, after = _surface_distances(surface, source, sim.act(source), options.surface)
+        figures["surface"] = {"before": _summary(before), "after": _summary(after)}
+        clock.lap("residuals")
+    return StructurePlacement(
+        reason=None,
+        message="placed on the scan",
+        new_from_old=sim,
+        covariance=fit.covariance,
+        pairs=pairs,
+        inliers=inliers,
+        before_m=before,
+        after_m=after,
+        figures=figures,
+        seconds=clock.seconds,
+    )
+
+
+def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud) -> FeatureMap:
+    """The map at its new place: same ids, points, descriptors and local frame; the scan's height datum.
+
+    The new placement's `local_from_sfm` is the old one followed by the move, both in the map's frame.
+    """
+    assert structure.new_from_old is not None
+    assert structure.covariance is not None  # accepted
+    move, covariance = move_in_map_frame(feature_map, structure.new_from_old, structure.covariance, cloud)
+    placement = Placement(
+        method="lidar",
+        local_from_sfm=move @ feature_map.placement.local_from_sfm,
+        covariance=covariance,
+        residual_rms_m=float(structure.figures["residual_rms_m"]),
+        evidence={"structure": structure.figures, "replaces": feature_map.placement.method},
+    )
+    block = block_of_map(feature_map).moved(move)
+    return map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+
+
+def move_in_map_frame(
+    feature_map: FeatureMap, new_from_old: Sim3, covariance: FloatArray, cloud: PointCloud
+) -> tuple[Sim3, FloatArray]:
+    """A move and its covariance, given in the cloud's local frame, in the map's."""
+    map_from_cloud = Sim3.from_rigid3(feature_map.frame.enu_from(cloud.frame))
+    adjoint = map_from_cloud.adjoint()
+    moved_covariance = adjoint @ covariance @ adjoint.T
+    return map_from_cloud @ new_from_old @ map_from_cloud.inverse(), (
+        moved_covariance + moved_covariance.T
+    ) / 2
+
+
+def _distances(pairs: Pairs, registered: Sequence[RegisteredImage]) -> FloatArray:
+    """(n,) from the registered cameras, metres."""
+    centers = np.array([r.registration.cam_from_local.center for r in registered])  # type: ignore[union-attr]
+    return np.asarray(np.linalg.norm(pairs.target - centers[pairs.frame_of], axis=1))
+
+
+def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
+    return Pairs(
+        point_index=pairs.point_index[kept],
+        frame_of=pairs.frame_of[kept],
+        source=pairs.source[kept],
+        target=pairs.target[kept],
+        normals=pairs.normals[kept],
+        covariance=pairs.covariance[kept],
+        by_frame=pairs.by_frame[kept],
+        cell_of=pairs.cell_of[kept],
+        frame_covariance=pairs.frame_covariance,
+    )
+
+
+def _gate_of_pairs(
+    pairs: Pairs, near: NDArray[np.bool_], distances: FloatArray, options: StructureOptions
+) -> tuple[StructureReason | None, str, dict[str, Any]]:
+    """Whether RANSAC's inliers can carry a similarity."""
+    used = int(near.sum())
+    spread = 0.0
+    if used >= 3:
+        centred = pairs.target[near] - pairs.target[near].mean(axis=0)
+        across = float(np.linalg.svd(centred, compute_uv=False)[1]) / np.sqrt(used)
+        spread = across / float(np.median(distances[near]))
+    figures: dict[str, Any] = {
+        "frames": len(pairs.frame_covariance),
+        "pairs": len(pairs),
+        "ransac_inliers": used,
+        "ransac_inlier_share": used / len(pairs),
+        "spread_rel": spread,
+    }
+    if used < options.min_pairs or used < options.min_inlier_share * len(pairs):
+        return (
+            "TOO_FEW_PAIRS",
+            f"{used} of {len(pairs)} pairs agree on a similarity, at least {options.min_pairs} and "
+            f"{options.min_inlier_share:.0%} are needed",
+            figures,
+        )
+    if spread < options.min_spread_rel:
+        return (
+            "NO_SPREAD",
+            f"the pairs lie along a line: {spread:.1%} of their distance across it, at least "
+            f"{options.min_spread_rel:.0%} are needed",
+            figures,
+        )
+    return None, "", figures
+
+
+def _figures_of_fit(
+    fit: SimilarityFit, pairs: Pairs, feature_map: FeatureMap, registered: Sequence[RegisteredImage]
+) -> dict[str, Any]:
+    """What is written into the evidence."""
+    residuals = np.linalg.norm(fit.residuals_m[fit.inliers], axis=1)
+    along = np.einsum("ij,ij->i", fit.residuals_m, pairs.normals)[fit.inliers]
+    sim = fit.target_from_source
+    middle = pairs.source[fit.inliers].mean(axis=0)
+    corrections = fit.frame_corrections
+    return {
+        "inliers": int(fit.inliers.sum()),
+        "inliers_by_frame": np.bincount(pairs.frame_of[fit.inliers], minlength=len(registered)).tolist(),
+        "frame_images": [r.image_id for r in registered],
+        "residual_rms_m": float(np.sqrt((residuals**2).mean())),
+        "residual_median_m": float(np.median(residuals)),
+        "residual_across_surface_median_m": float(np.median(np.abs(along))),
+        "sigma_factor": fit.spread,
+        "neighbours_factor": fit.neighbours_factor,
+        "scale_change": sim.scale - 1.0,
+        "scale_sigma": float(np.sqrt(fit.covariance[0, 0])),
+        "previous_scale_sigma": float(np.sqrt(feature_map.placement.covariance[0, 0])),
+        "shift_m": (sim.act(middle) - middle).tolist(),
+        "turn_deg": float(np.degrees(np.linalg.norm(sim.log()[1:4]))),
+        "frame_corrections_m": np.linalg.norm(corrections[:, 3:], axis=1).tolist(),
+    }
+
+
+def _gate_of_fit(
+    fit: SimilarityFit, distances: FloatArray, figures: dict[str, Any], options: StructureOptions
+) -> tuple[StructureReason | None, str]:
+    limit = max(options.min_tolerance_m, options.max_residual_rel * float(np.median(distances[fit.inliers])))
+    if figures["inliers"] < options.min_pairs:
+        return "TOO_FEW_PAIRS", (
+            f"{figures['inliers']} pairs remain after refinement, at least {options.min_pairs} are needed"
+        )
+    if figures["residual_rms_m"] > limit:
+        return "RESIDUALS", (
+            f"the pairs miss each other by {figures['residual_rms_m']:.2f} m, at most {limit:.2f} m is "
+            "believed: the map is bent, or the frame is not where it seems"
+        )
+    change = abs(float(np.log(fit.target_from_source.scale)))
+    sigma = float(np.hypot(figures["scale_sigma"], figures["previous_scale_sigma"]))
+    allowed = max(options.max_scale_change, options.scale_sigmas * sigma)
+    if change > allowed:
+        return "SCALE", (
+            f"the map would change its size by {change:.1%}, at most {allowed:.1%} agrees with its present "
+            "placement"
+        )
+    return None, ""
+
+
+def _surface_distances(
+    surface: Surface, before: FloatArray, after: FloatArray, options: SurfaceOptions
+) -> tuple[FloatArray, FloatArray]:
+    """Distances of the same points, those that have scan near them at the new place."""
+    after_m = plane_distances(surface, after, reach_of(surface, options))
+    before_m = np.where(np.isfinite(after_m), plane_distances(surface, before, np.inf), np.nan)
+    return before_m, after_m
+
+
+def _summary(distances: FloatArray) -> dict[str, float | int | None]:
+    near = np.abs(distances[np.isfinite(distances)])
+    if len(near) == 0:
+        return {"points": 0, "median_m": None, "rms_m": None, "p90_m": None}
+    return {
+        "points": len(near),
+        "median_m": float(np.median(near)),
+        "rms_m": float(np.sqrt((near**2).mean())),
+        "p90_m": float(np.percentile(near, 90)),
+    }
+
+
+def _gicp_figures(outcome: GicpOutcome) -> dict[str, Any]:
+    return {"accepted": outcome.accepted, "message": outcome.message, **outcome.figures}
+
+
+class _Clock:
+    """Wall time by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        now = time.perf_counter()
+        self.seconds[step] = now - self._last
+        self._last = now
+
+
+def _refused(
+    reason: StructureReason,
+    message: str,
+    points: int,
+    clock: _Clock,
+    pairs: Pairs | None = None,
+    figures: dict[str, Any] | None = None,
+    inliers: NDArray[np.bool_] | None = None,
+) -> StructurePlacement:
+    nothing = np.full(points, np.nan)
+    none = np.zeros(0 if pairs is None else len(pairs), dtype=bool)
+    return StructurePlacement(
+        reason=reason,
+        message=message,
+        new_from_old=None,
+        covariance=None,
+        pairs=pairs,
+        inliers=none if inliers is None else inliers,
+        before_m=nothing,
+        after_m=nothing,
+        figures=figures or {},
+        seconds=clock.seconds,
+    )
