@@ -11,7 +11,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.precision import linearise
-from ingest.register.control.block import Block, block_of_map, map_of_block
+from ingest.register.block import Block, block_of_map, map_of_block
 from ingest.register.structure.adjustment import (
     AdjustLidarOptions,
     LidarAdjustment,

@@ -16,7 +16,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
 from featuredb.render.cloud import CloudNodes, PointCloud
-from ingest.register.control.block import block_of_map, map_of_block
+from ingest.register.block import block_of_map, map_of_block
 from ingest.register.frame_registration import FrameRegistration
 from ingest.register.structure.pairs import RegisteredImage
 

@@ -15,7 +15,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
-from ingest.register.control.block import Block
+from ingest.register.block import Block
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.normal_system import (

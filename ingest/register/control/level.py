@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.control.block import Block
+from ingest.register.block import Block
 from ingest.register.control.fit import Vertical
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.control.block import Block
+from ingest.register.block import Block
 from ingest.register.control.control_file import ControlFile, Mark
 
 

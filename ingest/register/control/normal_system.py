@@ -14,7 +14,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.precision import Linearised, linearise
-from ingest.register.control.block import Block
+from ingest.register.block import Block
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 

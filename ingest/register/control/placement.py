@@ -17,8 +17,8 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from ingest.register.block import Block
 from ingest.register.control.adjust import Adjusted, AdjustOptions, adjust
-from ingest.register.control.block import Block
 from ingest.register.control.fit import (
     ControlFit,
     FitOptions,

@@ -10,7 +10,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
-from ingest.register.control.block import block_of_map, map_of_block
+from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.evidence import gcp_evidence
 from ingest.register.control.fit import Vertical

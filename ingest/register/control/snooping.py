@@ -15,8 +15,8 @@ from scipy.stats import f as f_distribution
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.precision import Linearised, linearise
+from ingest.register.block import Block
 from ingest.register.control.adjust import Adjusted
-from ingest.register.control.block import Block
 from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control
 from ingest.register.control.normal_system import Weights

@@ -20,7 +20,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
 from ingest.precision import linearise
-from ingest.register.control.block import Block, block_of_map, map_of_block
+from ingest.register.block import Block, block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
 from ingest.register.structure.scan_block import Control, Planes, Sigmas, lens_covariance, solve

@@ -18,7 +18,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
-from ingest.register.control.block import block_of_map, map_of_block
+from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,

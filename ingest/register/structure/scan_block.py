@@ -17,7 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.precision import linearise
-from ingest.register.control.block import Block
+from ingest.register.block import Block
 
 _RELATIVE_STEP = 1e-6  # of central differences by the lens parameters
 
