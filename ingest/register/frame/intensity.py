@@ -58,7 +58,8 @@ class IntensityOptions:
             is kept.
         min_gain: nor is a pose kept that raises the measure by less.
         sigma_px: standard deviation, in pixels of the finest octave, of how far the refined picture lies off;
-            scales the covariance. Measured on windows and simulated frames, docs/registration.md.
+            scales the covariance. A judgement, not calibrated: edges in laser intensity and photo differ by
+            about a pixel, and the average over many by less.
         max_evaluations: per octave.
     """
 
