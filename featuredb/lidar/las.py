@@ -177,6 +177,7 @@ def _laspy() -> ModuleType:
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
     """Errors of laspy, lazrs and the system as ScanFileError."""
+    _laspy()
     import lazrs
     from laspy.errors import LaspyException
 

@@ -18,6 +18,7 @@ from featuredb.errors import (
     ConflictError,
     FeatureDbError,
     GeodesyError,
+    MissingExtraError,
     ScanError,
     ScanFileError,
     ScanNotFoundError,
@@ -565,3 +566,14 @@ def test_ortho_colours_what_is_seen_from_above(database: Database, tmp_path: Pat
         assert colour[high].mean() > 0.99
         assert colour[below].mean() < 0.01  # the lawn under the roof keeps its own: none
         assert colour[inside & ~below & ~high].mean() > 0.9
+
+
+@pytest.mark.parametrize("package", ["laspy", "lazrs"])
+def test_a_missing_package_is_named(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    path = write_scan(tmp_path / "a.laz", grid_points())
+    monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(MissingExtraError, match=rf"{package}.*featuredb\[lidar\]"):
+        add_scan(database, [path])
+    assert not Path(database.url).exists()
