@@ -21,7 +21,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database, MapSummary, Snapshot
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
+from ingest.register.anchor.anchor_map import place_map
 from ingest.register.anchor.frames import TriedFrames, try_frames
 from ingest.register.anchor.photo_files import PhotoFiles, find_photos
 from ingest.register.anchor.picks import pose_from_picks
@@ -29,6 +29,7 @@ from ingest.register.anchor.proposal_file import SavedProposals, load_proposals,
 from ingest.register.anchor.report import AnchorReport, write_anchor_report
 from ingest.register.anchor.start import image_named, prior_from_rough_pose
 from ingest.register.anchor.start_files import read_picks, read_pose
+from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 
 _LOG = logging.getLogger(__name__)

@@ -23,8 +23,8 @@ from ingest.anchor_cli import summary
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.register.anchor.anchor_map import AnchorOptions
 from ingest.register.anchor.frames import FramesOptions
+from ingest.register.anchor.values import AnchorOptions
 from schemas import load_schema
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, write_hill_photos
 from tests.support.hill_scan import EPSG, write_hill_scan

@@ -13,9 +13,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from ingest.register.anchor.anchor_map import with_fuller_lens
 from ingest.register.anchor.page import FramePicture, flick_page
 from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
+from ingest.register.anchor.placing import with_fuller_lens
 from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
 from ingest.register.anchor.proposals import ProposalOptions, propose_frames, small_camera
 from ingest.register.anchor.start import cam_from_grid

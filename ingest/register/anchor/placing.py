@@ -1,0 +1,145 @@
+"""A map placed by registered frames: projected and adjusted, in rounds while its lens changes."""
+
+import logging
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.render.cloud import PointCloud
+from ingest.executor import Progress
+from ingest.register.anchor.frames import TriedFrame, register_again
+from ingest.register.anchor.proposals import PhotoReader
+from ingest.register.anchor.values import AnchorOptions, PlaceRound
+from ingest.register.structure.adjustment import (
+    LidarAdjustment,
+    adjust_to_scan,
+    adjusted_map,
+)
+from ingest.register.structure.pairs import RegisteredImage
+from ingest.register.structure.projection import (
+    StructurePlacement,
+    placed_map,
+    project_structure,
+)
+
+_LOG = logging.getLogger(__name__)
+
+
+def place_in_rounds(
+    feature_map: FeatureMap,
+    frames: Sequence[TriedFrame],
+    cloud: PointCloud,
+    read_gray: PhotoReader,
+    options: AnchorOptions,
+    progress: Progress,
+) -> tuple[FeatureMap | None, list[PlaceRound], str]:
+    """The map by structure projection and adjustment, again with a better lens while that changes.
+
+    A frame registered with a wrong lens finds matches that fit the wrong lens: the adjustment moves it part
+    of the way, and the next registration finds others. Each round places the map as it was.
+    """
+    placed: FeatureMap | None = None
+    rounds: list[PlaceRound] = []
+    base = feature_map
+    for number in range(options.lens_rounds):
+        lens = (placed or feature_map).cameras
+        registered = [with_lens(frame, lens) for frame in frames]
+        start, cpu = time.perf_counter(), time.process_time()
+        structure = project_structure(feature_map, registered, cloud, options.structure)
+        structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
+        if not structure.accepted:
+            return placed, rounds, f"{structure.reason}: {structure.message}"
+        start = time.perf_counter()
+        base, adjustment = _adjusted(base, structure, registered, cloud, options, choose=number == 0)
+        adjust_s = time.perf_counter() - start
+        if adjustment.accepted:
+            placed = adjusted_map(base, adjustment, cloud)
+        elif placed is None:
+            placed = placed_map(feature_map, structure, cloud)
+        rounds.append(
+            PlaceRound(
+                frames=tuple(frames),
+                structure_s=structure_s,
+                structure_cpu_s=structure_cpu_s,
+                adjust_s=adjust_s,
+                focal_px=tuple(camera.focal_px for camera in placed.cameras),
+                figures={
+                    "structure": structure.figures,
+                    "adjustment": adjustment.figures | {"reason": adjustment.reason},
+                },
+            )
+        )
+        progress("place", number + 1, options.lens_rounds)
+        change = max(
+            abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(placed.cameras, lens, strict=True)
+        )
+        if change < options.lens_settled or number + 1 == options.lens_rounds:
+            break
+        again = register_again(
+            placed,
+            cloud,
+            frames,
+            read_gray,
+            (options.again_sigma_m, options.again_sigma_deg),
+            options.frames.frame,
+        )
+        kept = [frame for frame in again if frame.registration.accepted]
+        if len(kept) < len(frames):
+            lost = [f.image.name for f in again if not f.registration.accepted]
+            _LOG.warning("not registered again with the adjusted lens: %s", ", ".join(lost))
+        if not kept:
+            break
+        frames = kept
+    return placed, rounds, ""
+
+
+def _adjusted(
+    base: FeatureMap,
+    structure: StructurePlacement,
+    registered: Sequence[RegisteredImage],
+    cloud: PointCloud,
+    options: AnchorOptions,
+    *,
+    choose: bool,
+) -> tuple[FeatureMap, LidarAdjustment]:
+    """The adjustment, and the map that it belongs to: with `choose` one with a fuller lens, if that pays."""
+    plain = adjust_to_scan(base, structure, registered, cloud, options.adjust)
+    richer = with_fuller_lens(base)
+    if not choose or richer is base or len(registered) < options.fuller_lens_frames:
+        return base, plain
+    fuller = adjust_to_scan(richer, structure, registered, cloud, options.adjust)
+    if not fuller.accepted:
+        return base, plain
+    if plain.accepted:
+        before, after = (a.figures["after"]["control_median_px"] for a in (plain, fuller))
+        if after > (1.0 - options.fuller_lens_gain) * before:
+            return base, plain
+    return richer, fuller
+
+
+def with_fuller_lens(feature_map: FeatureMap) -> FeatureMap:
+    """The same map whose radial cameras have tangential terms and two focal lengths, as yet without effect.
+
+    The map itself where no camera is radial.
+    """
+    cameras = tuple(_fuller(camera) for camera in feature_map.cameras)
+    return feature_map if cameras == feature_map.cameras else replace(feature_map, cameras=cameras)
+
+
+def _fuller(camera: Camera) -> Camera:
+    if camera.model not in ("SIMPLE_RADIAL", "RADIAL"):
+        return camera
+    f, cx, cy, *radial = camera.params
+    k1, k2 = (*radial, 0.0)[:2]
+    return replace(camera, model="OPENCV", params=(f, f, cx, cy, k1, k2, 0.0, 0.0))
+
+
+def with_lens(frame: TriedFrame, lens: Sequence[Camera]) -> RegisteredImage:
+    """The frame with the lens that it was registered with."""
+    return RegisteredImage(
+        image_id=frame.image.image_id,
+        registration=frame.registration,
+        camera=lens[frame.image.camera_id],
+    )
