@@ -50,6 +50,10 @@ def place_in_rounds(
         structure = project_structure(feature_map, registered, cloud, options.structure)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
         if not structure.accepted:
+            if placed is not None:
+                _LOG.warning(
+                    "round %d: %s; the map stays as the round before placed it", number + 1, structure.message
+                )
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
         base, adjustment = _adjusted(base, structure, registered, cloud, options, choose=number == 0)
