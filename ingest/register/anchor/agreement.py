@@ -22,8 +22,8 @@ class AgreementOptions:
     Attributes:
         max_apart_share: median distance between the places of the same map points, as a share of the
             distance from which they are seen. `featuredb anchor` prints how far apart right frames are: up to
-            0.27 m on brighton, from 40 to 50 m, 0.07 m in the simulated town; this allows five times that. Wrong
-            frames have not been measured: none has passed the verdict so far.
+            0.27 m on brighton, from 40 to 50 m, 0.07 m in the simulated town; this allows five times that.
+            Wrong frames have not been measured: none has passed the verdict so far.
         min_apart_m: and never less than this, for frames that are close to what they see.
     """
 
