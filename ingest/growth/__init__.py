@@ -1,0 +1,1 @@
+"""Growing beyond the anchors: photos are placed by the maps that exist, behind gates."""
