@@ -5,6 +5,7 @@ cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,26 @@ from reloc.acceptance import confidence, verdict
 from reloc.answer import make_answer
 from reloc.candidates import IndexedArea
 from reloc.options import LocaliseOptions
-from reloc.pose import pose_uncertainty
+from reloc.pose import PoseUncertainty, pose_uncertainty
 from reloc.prior import contradicts_prior
 from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
 from reloc.rivals import runner_up
-from reloc.search import Search, pairs, search
+from reloc.search import Candidate, Search, pairs, search
 from reloc.stopwatch import Stopwatch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Localised:
+    """A result with what it was made of, for callers that go on from there.
+
+    Attributes:
+        best: the believed pose with its matches and area; None exactly where the result has no pose.
+        uncertainty: of that pose, measured part only, in the area's axes.
+    """
+
+    result: LocaliseResult
+    best: Candidate | None = None
+    uncertainty: PoseUncertainty | None = None
 
 
 def localise(
@@ -48,10 +63,39 @@ def localise(
     watch = Stopwatch()
     features = extract(gray, options.extractor)
     watch.split("features")
+    return _localised(features, request, areas, options, snapshot, watch).result
+
+
+def localise_features(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions | None = None,
+    snapshot: int = 0,
+) -> Localised:
+    """`localise` of a photo whose features are there already, strongest and best spread first.
+
+    Raises:
+        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        InvalidValueError: the request's camera is of another image size.
+    """
+    options = options or LocaliseOptions()
+    check_extractor(areas, options)
+    return _localised(features, request, areas, options, snapshot, Stopwatch())
+
+
+def _localised(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions,
+    snapshot: int,
+    watch: Stopwatch,
+) -> Localised:
     found = search(features, request, areas, options, watch)
-    result = _decide(found, features, request, options, snapshot, watch)
+    localised = _decide(found, features, request, options, snapshot, watch)
     watch.split("answer")
-    return result
+    return localised
 
 
 def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:
@@ -72,11 +116,9 @@ def _decide(
     options: LocaliseOptions,
     snapshot: int,
     watch: Stopwatch,
-) -> LocaliseResult:
-    def refuse(
-        reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None
-    ) -> LocaliseResult:
-        return LocaliseResult(
+) -> Localised:
+    def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
+        result = LocaliseResult(
             reason=reason,
             detail=detail,
             pose=None,
@@ -89,6 +131,7 @@ def _decide(
             evidence=found.candidates[0].evidence if found.candidates else None,
             timings_ms=watch.timings_ms,
         )
+        return Localised(result=result)
 
     if found.reason is not None:
         return refuse(found.reason, found.detail)
@@ -108,7 +151,7 @@ def _decide(
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
-    return LocaliseResult(
+    result = LocaliseResult(
         reason=None,
         detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
         pose=answer,
@@ -121,3 +164,4 @@ def _decide(
         evidence=best.evidence,
         timings_ms=watch.timings_ms,
     )
+    return Localised(result=result, best=best, uncertainty=uncertainty)
