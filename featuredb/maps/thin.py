@@ -1,0 +1,269 @@
+"""Fewer descriptors for the same answers: every image keeps seeing enough points, well spread over it.
+
+A K-cover (Li, Snavely and Huttenlocher, ECCV 2010): points are chosen one after the other, each time the one
+that most images still lack, until every image sees K chosen points, or all that it has. A gain counts less in a
+part of an image that has points already, and for a point that is badly known. Gains only shrink as more is
+chosen, so a heap of old gains finds the greatest one without computing the others anew.
+
+A point that is not chosen loses its descriptors and stays as geometry. Answers read described points only, so
+the index, its memory and a query's time shrink as if the point were gone; what stays serves what works on
+tracks (placing a map on a scan, adjusting its lens, exports), costs a tenth of the bytes, and leaves the numbers
+of all points as they were. `keep_points=False` removes it altogether.
+"""
+
+import heapq
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap, MapObservations, MapPoints
+
+# The grid on which acceptance counts how much of a photo holds inliers.
+_GRID = 10
+_THINNED = "thinned"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ThinOptions:
+    """How far a map is thinned.
+
+    Attributes:
+        cover: K, described points that each image keeps seeing.
+        max_views: described observations that a chosen point keeps, those that differ most in direction and
+            distance. More only repeat what the mean descriptor says already.
+        keep_points: points that are not chosen stay without descriptors.
+    """
+
+    cover: int = 200
+    max_views: int = 8
+    keep_points: bool = True
+
+    def __post_init__(self) -> None:
+        # Localisation believes a pose from 15 inliers on, and a photo finds a part of what its neighbours see.
+        if self.cover < 15:
+            raise InvalidValueError(f"ThinOptions.cover: expected at least 15 points, found {self.cover}")
+        if self.max_views < 2:
+            raise InvalidValueError(f"ThinOptions.max_views: expected at least 2, found {self.max_views}")
+
+
+def thin_map(feature_map: FeatureMap, options: ThinOptions | None = None) -> FeatureMap:
+    """The map with as few described points and observations as the cover asks for.
+
+    Every image sees at least `cover` described points, or as many as before. Poses, placement, parents and
+    status stay. A map that was thinned by these very options comes back as it is.
+    """
+    options = options or ThinOptions()
+    note = asdict(options)
+    earlier = feature_map.provenance.get(_THINNED)
+    if earlier is not None and earlier.get("options") == note:
+        return feature_map
+    points = k_cover(feature_map, options.cover)
+    described = _thinned_views(feature_map, points, options)
+    note = {"options": note, "points_before": len(_described_points(feature_map)), "points": int(points.sum())}
+    return with_descriptors(feature_map, described, options.keep_points, {_THINNED: note})
+
+
+def with_descriptors(
+    feature_map: FeatureMap,
+    described: NDArray[np.bool_],
+    keep_points: bool,
+    provenance: dict[str, object] | None = None,
+) -> FeatureMap:
+    """The map with descriptors at some of its observations only.
+
+    Args:
+        described: (m,) observations that keep theirs; those that have none are left without.
+        keep_points: else points that lost all their descriptors go, with their observations.
+        provenance: added to the map's.
+    """
+    seen = feature_map.observations
+    kept = seen.has_descriptor & described
+    noted = feature_map.provenance | (provenance or {})
+    observations = replace(
+        seen, has_descriptor=kept, descriptors=np.where(kept[:, None], seen.descriptors, np.uint8(0))
+    )
+    if keep_points:
+        return replace(feature_map, observations=observations, provenance=noted)
+    had, has = (_has_any(feature_map, which) for which in (seen.has_descriptor, kept))
+    stays = has | ~had
+    rows = np.flatnonzero(stays[seen.point_index])
+    new_row = np.cumsum(stays) - 1
+    return replace(
+        feature_map,
+        points=_take_points(feature_map.points, stays),
+        observations=MapObservations(
+            point_index=new_row[seen.point_index[rows]],
+            **{
+                name: getattr(observations, name)[rows]
+                for name in ("image_id", "xy", "scale", "angle", "has_descriptor", "descriptors")
+            },
+        ),
+        provenance=noted,
+    )
+
+
+def k_cover(feature_map: FeatureMap, cover: int) -> NDArray[np.bool_]:
+    """Chosen points (n,): every image sees `cover` of them, or all of its described points.
+
+    Args:
+        cover: K, at least 1.
+    """
+    point, image, cell = _sightings(feature_map)
+    weight = _precision(feature_map)
+    need = np.minimum(np.bincount(image, minlength=len(feature_map.images)), cover).tolist()
+    taken = [0] * len(need)
+    in_cell: dict[int, int] = {}
+    order = np.argsort(point, kind="stable")
+    starts = np.searchsorted(point[order], np.arange(len(feature_map.points) + 1))
+    images, cells = image[order].tolist(), (image * _GRID**2 + cell)[order].tolist()
+    bounds, weights = starts.tolist(), weight.tolist()
+
+    def gain(row: int) -> float:
+        return weights[row] * sum(
+            1.0 / (1 + in_cell.get(cells[k], 0))
+            for k in range(bounds[row], bounds[row + 1])
+            if taken[images[k]] < need[images[k]]
+        )
+
+    heap = [(-gain(row), row) for row in np.unique(point).tolist()]
+    heapq.heapify(heap)
+    chosen = np.zeros(len(feature_map.points), dtype=np.bool_)
+    while heap:
+        stale, row = heapq.heappop(heap)
+        now = gain(row)
+        if now <= 0.0:
+            continue
+        if -stale > now:
+            heapq.heappush(heap, (-now, row))
+            continue
+        chosen[row] = True
+        for k in range(bounds[row], bounds[row + 1]):
+            taken[images[k]] += 1
+            in_cell[cells[k]] = in_cell.get(cells[k], 0) + 1
+    return chosen
+
+
+def described_points_of_images(feature_map: FeatureMap) -> NDArray[np.int64]:
+    """How many described points each image (i,) sees."""
+    _, image, _ = _sightings(feature_map)
+    return np.bincount(image, minlength=len(feature_map.images)).astype(np.int64)
+
+
+def _sightings(
+    feature_map: FeatureMap,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """Point row, image row and cell of the image's grid, once for each image that sees a described point."""
+    seen = feature_map.observations
+    rows = np.flatnonzero(seen.has_descriptor)
+    image = _image_rows(feature_map, seen.image_id[rows])
+    _, first = np.unique(seen.point_index[rows] * len(feature_map.images) + image, return_index=True)
+    rows, image = rows[first], image[first]
+    sizes = np.array(
+        [(feature_map.cameras[i.camera_id].width, feature_map.cameras[i.camera_id].height) for i in
+         feature_map.images], dtype=np.float64,
+    ).reshape(-1, 2)  # fmt: skip
+    place = np.clip((seen.xy[rows] * (_GRID / sizes[image])).astype(np.int64), 0, _GRID - 1)
+    return seen.point_index[rows], image, place[:, 1] * _GRID + place[:, 0]
+
+
+def _image_rows(feature_map: FeatureMap, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
+    ids = np.array([image.image_id for image in feature_map.images], dtype=np.int32)
+    by_id = np.argsort(ids)
+    return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
+
+
+def _precision(feature_map: FeatureMap) -> FloatArray:
+    """Weight (n,) in (0, 1) of each point: a half at the median of sigma over viewing distance.
+
+    A pose feels a point's error as an angle. Within a factor of two of the median the weight changes less than
+    a view more or less does, so that it decides among points seen equally well.
+    """
+    n = len(feature_map.points)
+    _, distance = _views(feature_map)
+    nearest = np.full(n, np.inf)
+    np.minimum.at(nearest, feature_map.observations.point_index, distance)
+    variance = feature_map.points.covariance[:, [0, 3, 5]].astype(np.float64).sum(axis=1)
+    angle = np.sqrt(np.maximum(variance, 0.0)) / nearest
+    known = angle > 0
+    middle = float(np.median(angle[known])) if known.any() else 1.0
+    return np.asarray(1.0 / (1.0 + angle / middle), dtype=np.float64)
+
+
+def _views(feature_map: FeatureMap) -> tuple[FloatArray, FloatArray]:
+    """Unit vector (m, 3) from the point to the camera and distance (m,) of each observation, local metres."""
+    seen = feature_map.observations
+    centers = np.array([i.cam_from_local.center for i in feature_map.images]).reshape(-1, 3)
+    toward = centers[_image_rows(feature_map, seen.image_id)] - feature_map.points_local()[seen.point_index]
+    distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
+    return toward / distance[:, None], distance
+
+
+def _thinned_views(
+    feature_map: FeatureMap, points: NDArray[np.bool_], options: ThinOptions
+) -> NDArray[np.bool_]:
+    """Observations (m,) of the chosen points that keep their descriptor.
+
+    A point with too many views keeps those that are farthest apart, and those of images that would fall below
+    the cover without it.
+    """
+    seen = feature_map.observations
+    kept = seen.has_descriptor & points[seen.point_index]
+    image = _image_rows(feature_map, seen.image_id)
+    # An image may see a point twice, which counts once.
+    pairs = np.unique(np.stack([image[kept], seen.point_index[kept]]), axis=1)
+    spare = np.bincount(pairs[0], minlength=len(feature_map.images)) - options.cover
+    direction, distance = _views(feature_map)
+    # A factor of two in distance changes a descriptor about as much as half a radian in direction.
+    place = np.hstack([direction, 0.5 * np.log2(distance)[:, None]])
+    rows = np.flatnonzero(kept)
+    rows = rows[np.argsort(seen.point_index[rows], kind="stable")]
+    starts = np.flatnonzero(np.diff(seen.point_index[rows], prepend=-1))
+    for group in np.split(rows, starts[1:]):
+        if len(group) <= options.max_views:
+            continue
+        for row in reversed(group[_farthest_first(place[group])][options.max_views :]):
+            if spare[image[row]] > 0:
+                spare[image[row]] -= 1
+                kept[row] = False
+    return kept
+
+
+def _farthest_first(place: FloatArray) -> NDArray[np.intp]:
+    """Order (v,) in which each next row of `place` (v, d) is the farthest from all before it.
+
+    The first is the one nearest to the middle, whose descriptor is the most usual one.
+    """
+    first = int(np.argmin(np.linalg.norm(place - place.mean(axis=0), axis=1)))
+    order = [first]
+    gap = np.linalg.norm(place - place[first], axis=1)
+    gap[first] = -1.0
+    while len(order) < len(place):
+        order.append(int(np.argmax(gap)))
+        gap = np.minimum(gap, np.linalg.norm(place - place[order[-1]], axis=1))
+        gap[order] = -1.0
+    return np.array(order)
+
+
+def _described_points(feature_map: FeatureMap) -> NDArray[np.int64]:
+    seen = feature_map.observations
+    return np.unique(seen.point_index[seen.has_descriptor])
+
+
+def _has_any(feature_map: FeatureMap, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Points (n,) with at least one observation of `which` (m,)."""
+    found = np.zeros(len(feature_map.points), dtype=np.bool_)
+    found[feature_map.observations.point_index[which]] = True
+    return found
+
+
+def _take_points(points: MapPoints, rows: NDArray[np.bool_]) -> MapPoints:
+    return MapPoints(
+        utm=points.utm[rows],
+        rgb=points.rgb[rows],
+        track_length=points.track_length[rows],
+        error_px=points.error_px[rows],
+        covariance=points.covariance[rows],
+    )
