@@ -1,0 +1,113 @@
+"""A feature map moved by a similarity: points, poses and covariances, as one rigid and scaled whole."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints, Placement
+
+_UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))  # order of MapPoints.covariance
+
+
+def move_map(
+    feature_map: FeatureMap,
+    new_from_old: Sim3,
+    frame: LocalFrame | None = None,
+    *,
+    covariance: FloatArray | None = None,
+    evidence: Mapping[str, Any] | None = None,
+) -> FeatureMap:
+    """The map where a similarity takes it; its local frame, ids, observations and lenses stay.
+
+    A move that is the identity, bit for bit, leaves points, poses and their covariances bit for bit.
+
+    Args:
+        new_from_old: of coordinates in `frame`, metres.
+        frame: in which the similarity is meant; default: the map's own.
+        covariance: (7, 7) of the new placement, left perturbation in the map's own frame; default: the old
+            one, carried along.
+        evidence: of the new placement; default: the old one.
+    """
+    move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
+    placement = feature_map.placement
+    adjoint = move.adjoint()
+    moved = Placement(
+        method=placement.method,
+        local_from_sfm=placement.local_from_sfm if is_identity(move) else move @ placement.local_from_sfm,
+        covariance=_symmetric(adjoint @ placement.covariance @ adjoint.T)
+        if covariance is None
+        else np.asarray(covariance, dtype=np.float64),
+        residual_rms_m=placement.residual_rms_m,
+        evidence=dict(placement.evidence if evidence is None else evidence),
+    )
+    if is_identity(move):
+        return replace(feature_map, placement=moved)
+    return replace(
+        feature_map,
+        images=tuple(_moved_image(image, move) for image in feature_map.images),
+        points=_moved_points(feature_map, move),
+        placement=moved,
+    )
+
+
+def is_identity(move: Sim3) -> bool:
+    """Whether it is the identity bit for bit."""
+    return bool(move.scale == 1.0 and np.array_equal(move.matrix(), np.eye(4)))
+
+
+def in_frame(move: Sim3, frame: LocalFrame, other: LocalFrame) -> Sim3:
+    """The same move of the same things, of coordinates in another local frame."""
+    if frame == other or is_identity(move):
+        return move
+    other_from_frame = Sim3.from_rigid3(other.enu_from(frame))
+    return other_from_frame @ move @ other_from_frame.inverse()
+
+
+def covariance_in_frame(covariance: FloatArray, frame: LocalFrame, other: LocalFrame) -> FloatArray:
+    """The covariance (7, 7) of a left perturbation, of coordinates in another local frame."""
+    if frame == other:
+        return np.asarray(covariance, dtype=np.float64)
+    adjoint = Sim3.from_rigid3(other.enu_from(frame)).adjoint()
+    return _symmetric(adjoint @ np.asarray(covariance, dtype=np.float64) @ adjoint.T)
+
+
+def _moved_image(image: MapImage, move: Sim3) -> MapImage:
+    """The camera frame grows with the map, so that a pose's shift counts in new metres: exp(omega, s nu)."""
+    pose: Rigid3 = move.act_on_pose(image.cam_from_local)
+    covariance = image.covariance
+    if covariance is not None:
+        growth = np.repeat([1.0, move.scale], 3)
+        covariance = covariance * np.outer(growth, growth)
+    return replace(image, cam_from_local=pose, covariance=covariance)
+
+
+def _moved_points(feature_map: FeatureMap, move: Sim3) -> MapPoints:
+    points = feature_map.points
+    if not len(points):
+        return points
+    utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
+    turned = move.rotation @ full_covariances(points.covariance) @ move.rotation.T
+    return replace(
+        points,
+        utm=utm,
+        covariance=(move.scale**2 * turned)[:, _UPPER[0], _UPPER[1]].astype(np.float32),
+    )
+
+
+def full_covariances(upper: NDArray[np.float32]) -> FloatArray:
+    """(n, 3, 3) float64 from upper triangles (n, 6) in the order of MapPoints.covariance."""
+    full = np.zeros((len(upper), 3, 3))
+    full[:, _UPPER[0], _UPPER[1]] = upper
+    full[:, _UPPER[1], _UPPER[0]] = upper
+    return full
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)
