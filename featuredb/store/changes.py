@@ -1,13 +1,14 @@
 """Changes to the table `maps` as pure functions from rows to rows. Applying them is `Database`'s business."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from featuredb.errors import MapNotFoundError, StoreError
 from featuredb.store.encode import Row
 
-RETIRED = "retired"
+ACTIVE = "active"
 QUARANTINED = "quarantined"
+RETIRED = "retired"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,6 +89,60 @@ def retire_map(rows: Sequence[Row], map_id: str, reason: str) -> tuple[Change, l
     return Change(rows=changed, added=[], only_adds=False), retired
 
 
+def change_status(
+    rows: Sequence[Row], map_ids: Sequence[str], status: str, reason: str
+) -> tuple[Change, list[str]]:
+    """Make maps active or quarantined; returns the change and the ids whose status changes.
+
+    Active maps that lose their last chain of active parents are quarantined, too.
+
+    Raises:
+        MapNotFoundError: no such map.
+        StoreError: another status, no reason, a retired map, or parents that do not carry a promotion.
+    """
+    if status not in (ACTIVE, QUARANTINED):
+        raise StoreError(f"expected the status {ACTIVE} or {QUARANTINED}, found {status!r}; use `retire`")
+    if not reason.strip():
+        raise StoreError(
+            f"{status} for {', '.join(map_ids)}: expected a reason, for those who will ask later"
+        )
+    known = {row["map_id"]: row for row in rows}
+    for map_id in map_ids:
+        if map_id not in known:
+            raise MapNotFoundError(f"no map {map_id}; `featuredb maps` lists what there is")
+        if known[map_id]["status"] == RETIRED:
+            raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
+    wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]
+    if not wanted:
+        return Change(rows=list(rows), added=[], only_adds=True), []
+    changed = [{**r, "status": status, "status_reason": reason} if r["map_id"] in wanted else r for r in rows]
+    standing = anchored(changed, statuses=(ACTIVE,))
+    if status == ACTIVE:
+        _check_parents(known, [m for m in wanted if m not in standing])
+        return Change(rows=changed, added=[], only_adds=False), wanted
+    fallen = sorted(anchored(rows, statuses=(ACTIVE,)) - standing - set(wanted))
+    because = f"{reason} ({', '.join(wanted)})"
+    changed = [
+        {**r, "status": QUARANTINED, "status_reason": because} if r["map_id"] in fallen else r
+        for r in changed
+    ]
+    return Change(rows=changed, added=[], only_adds=False), [*wanted, *fallen]
+
+
+def _check_parents(known: Mapping[str, Row], refused: Sequence[str]) -> None:
+    if not refused:
+        return
+    parents = {
+        f"{parent} is {known[parent]['status'] if parent in known else 'not there'}"
+        for map_id in refused
+        for parent in known[map_id]["parents"]
+    }
+    raise StoreError(
+        f"map {', '.join(refused)} cannot be promoted: no chain of active parents leads to an anchor "
+        f"({'; '.join(sorted(parents))}); promote the parents first or in the same command"
+    )
+
+
 def descendants(rows: Iterable[Row], ancestors: Iterable[str]) -> dict[str, str]:
     """Live maps with a chain of live parents up to one of `ancestors`, and the ancestor that each hangs on.
 
@@ -114,12 +169,16 @@ def _quarantined(row: Row, ancestor: str) -> Row:
     return {**row, "status": QUARANTINED, "status_reason": reason}
 
 
-def anchored(rows: Iterable[Row], without: str | None = None) -> set[str]:
-    """Ids of live maps that have a chain of live parents down to a map without parents.
+def anchored(
+    rows: Iterable[Row],
+    without: str | None = None,
+    statuses: Collection[str] = (ACTIVE, QUARANTINED),
+) -> set[str]:
+    """Ids of maps of the given statuses that have a chain of such parents down to a map without parents.
 
     With `without`, as if that map were not there.
     """
-    live = {row["map_id"]: row["parents"] for row in rows if row["status"] != RETIRED}
+    live = {row["map_id"]: row["parents"] for row in rows if row["status"] in statuses}
     live.pop(without or "", None)
     reached = {map_id for map_id, parents in live.items() if not parents}
     while True:

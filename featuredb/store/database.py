@@ -2,31 +2,31 @@
 
 import logging
 import threading
-import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
-import pyarrow as pa
-
-from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
-from featuredb.maps.feature_map import FeatureMap
-from featuredb.store.changes import RETIRED, Change, add_maps, live_row, retire_map
+from featuredb.errors import ConflictError, StoreError
+from featuredb.maps.feature_map import FeatureMap, MapStatus
+from featuredb.store.changes import RETIRED, Change, add_maps, change_status, live_row, retire_map
+from featuredb.store.commits import (
+    LONGEST_COMMIT,
+    HistoryEntry,
+    apply_change,
+    commit_as_of,
+    history_entry,
+    new_write_id,
+    read_rows,
+)
 from featuredb.store.delta import Commit, Table, retry_stale
-from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
+from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CHILD_TABLES, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
 
-# A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
-# orphans; it is well below the vacuum's shortest default grace of a day.
-LONGEST_COMMIT = timedelta(hours=6)
-
-# Keys of what a commit to `maps` says about itself.
-OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
-KEPT_FROM = "featuredb.kept_from"
+_STATUS_OPERATION = {"active": "promote", "quarantined": "quarantine"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,14 +48,17 @@ class CommitResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryEntry:
-    """One version of the database: number, UTC time, operation (commit, retire, ...), maps and reason."""
+class StatusResult:
+    """What a change of status did.
+
+    Attributes:
+        version: snapshot that shows it.
+        changed: ids of the maps whose status changed, none where nothing was to be done; those asked for
+            first, behind them maps that were quarantined because they hang on one of these alone.
+    """
 
     version: int
-    timestamp: datetime
-    operation: str
-    maps: tuple[str, ...]
-    reason: str
+    changed: tuple[str, ...]
 
 
 class Database:
@@ -123,7 +126,7 @@ class Database:
         maps = self.table(MAPS)
         if as_of is None:
             return self._snapshot_of(maps, maps.commits(limit=1)[0])
-        commit = _commit_as_of(as_of, maps.commits())
+        commit = commit_as_of(as_of, maps.commits())
         return self._snapshot_of(self.table(MAPS, commit.version), commit)
 
     def poll_version(self) -> int:
@@ -237,6 +240,46 @@ class Database:
         retry_stale(f"retire {map_id}", attempt)
         return tuple(retired)
 
+    def set_status(
+        self,
+        map_ids: Sequence[str],
+        status: MapStatus,
+        reason: str,
+        *,
+        based_on: Mapping[str, str] | None = None,
+        active: Collection[str] | None = None,
+    ) -> StatusResult:
+        """Promote maps (`active`) or put them into quarantine, in one commit; history says which.
+
+        A map is promoted only if a chain of active parents, its companions of this call included, leads to
+        an anchor. A map that loses its last such chain by a quarantine is quarantined, too.
+
+        Args:
+            reason: kept with each map.
+            based_on: write ids, by id, of the maps that the decision was about.
+            active: write ids of all maps that were active when the decision was made (with canaries, for
+                example); None: does not matter.
+
+        Raises:
+            ConflictError: other writers were faster too many times, a map of `based_on` has been placed
+                anew, retired or rolled back, or other maps than `active` answer now; nothing has changed.
+            MapNotFoundError: no such map.
+            StoreError: no reason, a retired map, another status than these two, a chain that is not there.
+        """
+        changed: list[str] = []
+
+        def attempt() -> int:
+            maps = self.table(MAPS)
+            rows = read_rows(maps)
+            _check_unchanged(rows, based_on or {})
+            _check_active(rows, active)
+            change, changed[:] = change_status(rows, map_ids, status, reason)
+            operation = _STATUS_OPERATION[status]
+            return apply_change(maps, change, operation=operation, maps_changed=changed, reason=reason)
+
+        version = retry_stale(f"{status} for {', '.join(map_ids)}", attempt)
+        return StatusResult(version=version, changed=tuple(changed))
+
     def rollback(self, as_of: int | datetime) -> int:
         """Make a new version that shows what an earlier one showed; returns its number.
 
@@ -256,16 +299,7 @@ class Database:
 
     def history(self) -> list[HistoryEntry]:
         """All versions, newest first."""
-        return [
-            HistoryEntry(
-                version=commit.version,
-                timestamp=commit.timestamp,
-                operation=commit.metadata.get(OPERATION, _OPERATIONS.get(commit.operation, "")),
-                maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
-                reason=commit.metadata.get(REASON, ""),
-            )
-            for commit in self.table(MAPS).commits()
-        ]
+        return [history_entry(commit) for commit in self.table(MAPS).commits()]
 
     def _snapshot_of(self, maps: Table, commit: Commit) -> Snapshot:
         return Snapshot(
@@ -289,14 +323,6 @@ class Database:
         return f"{self.url}/{name}"
 
 
-_OPERATIONS = {
-    "CREATE TABLE": "init",
-    "OPTIMIZE": "compact",
-    "VACUUM START": "vacuum",
-    "VACUUM END": "vacuum",
-}
-
-
 def normal_url(url: str) -> str:
     """An absolute path for local places, the URL without trailing slash for others."""
     if url.startswith("file://"):
@@ -304,16 +330,6 @@ def normal_url(url: str) -> str:
     if "://" in url:
         return url.rstrip("/")
     return str(Path(url).expanduser().absolute())
-
-
-def new_write_id(now: datetime) -> str:
-    """32 hex digits that begin with the time in milliseconds, so that an orphan tells its age."""
-    return f"{int(now.timestamp() * 1000):012x}{uuid.uuid4().hex[:20]}"
-
-
-def write_time(write_id: str) -> datetime:
-    """When the rows of a write id were begun, UTC."""
-    return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
 
 
 def _already_there(
@@ -338,69 +354,11 @@ def _check_unchanged(rows: Sequence[Row], based_on: Mapping[str, str]) -> None:
             )
 
 
-def read_rows(maps: Table) -> list[Row]:
-    """All rows of a version of `maps`.
-
-    Raises:
-        SnapshotNotFoundError: its files are gone.
-        StoreError: they cannot be read.
-    """
-    try:
-        table = maps.dataset().to_table()
-        # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
-        created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
-        rows: list[Row] = table.drop_columns("created_at").to_pylist()
-        for row, time in zip(rows, created, strict=True):
-            row["created_at"] = time.replace(tzinfo=UTC)
-    except FileNotFoundError as error:
-        raise SnapshotNotFoundError(
-            f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise StoreError(f"cannot read the table maps ({error}); run `featuredb verify`") from error
-    return rows
-
-
-def _commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
-    """The commit of a number, or the newest at a time; commits come newest first."""
-    first_kept = oldest_kept_version(commits)
-    readable = [commit for commit in commits if commit.version >= first_kept]
-    if isinstance(as_of, datetime):
-        if as_of.tzinfo is None:
-            raise SnapshotNotFoundError(f"expected a time with a time zone, found {as_of.isoformat()}")
-        fitting = [commit for commit in readable if commit.timestamp <= as_of]
-    else:
-        fitting = [commit for commit in readable if commit.version == as_of]
-    if not fitting:
-        raise SnapshotNotFoundError(
-            f"expected a version from {readable[-1].version} ({readable[-1].timestamp.isoformat()}) to "
-            f"{readable[0].version}, found {as_of}; `featuredb history` lists them, older ones were vacuumed"
+def _check_active(rows: Sequence[Row], active: Collection[str] | None) -> None:
+    """Refuse a decision that was made beside other maps than those that answer now."""
+    now = {row["write_id"] for row in rows if row["status"] == "active"}
+    if active is not None and now != set(active):
+        raise ConflictError(
+            f"the active maps have changed since this was decided ({len(now - set(active))} came, "
+            f"{len(set(active) - now)} went); run the command again"
         )
-    return fitting[0]
-
-
-def oldest_kept_version(commits: Sequence[Commit]) -> int:
-    """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
-    return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
-
-
-def apply_change(
-    maps: Table,
-    change: Change,
-    *,
-    operation: str,
-    maps_changed: Sequence[str],
-    reason: str = "",
-    extra: Mapping[str, str] | None = None,
-) -> int:
-    """Commit a change as the very next version and return its number.
-
-    Raises:
-        StaleVersionError: someone else committed since `maps` was read.
-    """
-    if change.only_adds and not change.added:
-        return maps.version
-    metadata = {OPERATION: operation, CHANGED: "\n".join(maps_changed), REASON: reason, **(extra or {})}
-    if change.only_adds:
-        return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
-    return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)

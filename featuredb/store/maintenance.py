@@ -8,14 +8,8 @@ import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.database import (
-    KEPT_FROM,
-    Database,
-    apply_change,
-    oldest_kept_version,
-    read_rows,
-    write_time,
-)
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows, write_time
+from featuredb.store.database import Database
 from featuredb.store.delta import Commit, Table, retry_stale
 from featuredb.store.scans import has_scans, retired_since, scan_rows
 from featuredb.store.tables import CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES

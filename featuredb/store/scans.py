@@ -20,15 +20,8 @@ from featuredb.errors import ConflictError, ScanNotFoundError, StoreError
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.changes import RETIRED
-from featuredb.store.database import (
-    CHANGED,
-    LONGEST_COMMIT,
-    OPERATION,
-    REASON,
-    Database,
-    new_write_id,
-    read_rows,
-)
+from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id, read_rows
+from featuredb.store.database import Database
 from featuredb.store.delta import Table, retry_stale
 from featuredb.store.encode import Row
 from featuredb.store.snapshot import UtmBox

@@ -11,7 +11,8 @@ import pyarrow.dataset as ds
 from featuredb.errors import FeatureDbError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store.database import Database, oldest_kept_version
+from featuredb.store.commits import oldest_kept_version
+from featuredb.store.database import Database
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history

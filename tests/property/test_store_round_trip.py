@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from featuredb.store.database import new_write_id, write_time
+from featuredb.store.commits import new_write_id, write_time
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest, encode_map, map_rows_table
 from featuredb.store.verify import verify

@@ -1,0 +1,129 @@
+"""What every commit has in common: its name, its place as the very next version, how it is read back."""
+
+import uuid
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import pyarrow as pa
+
+from featuredb.errors import SnapshotNotFoundError, StoreError
+from featuredb.store.changes import Change
+from featuredb.store.delta import Commit, Table
+from featuredb.store.encode import Row, map_rows_table
+
+# A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
+# orphans; it is well below the vacuum's shortest default grace of a day.
+LONGEST_COMMIT = timedelta(hours=6)
+
+# Keys of what a commit to `maps` says about itself.
+OPERATION, CHANGED, REASON = "featuredb.operation", "featuredb.maps", "featuredb.reason"
+KEPT_FROM = "featuredb.kept_from"
+
+
+_OPERATIONS = {
+    "CREATE TABLE": "init",
+    "OPTIMIZE": "compact",
+    "VACUUM START": "vacuum",
+    "VACUUM END": "vacuum",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryEntry:
+    """One version of the database: number, UTC time, operation (commit, retire, ...), maps and reason."""
+
+    version: int
+    timestamp: datetime
+    operation: str
+    maps: tuple[str, ...]
+    reason: str
+
+
+def history_entry(commit: Commit) -> HistoryEntry:
+    """A commit to `maps`, as people read it."""
+    return HistoryEntry(
+        version=commit.version,
+        timestamp=commit.timestamp,
+        operation=commit.metadata.get(OPERATION, _OPERATIONS.get(commit.operation, "")),
+        maps=tuple(filter(None, commit.metadata.get(CHANGED, "").split("\n"))),
+        reason=commit.metadata.get(REASON, ""),
+    )
+
+
+def new_write_id(now: datetime) -> str:
+    """32 hex digits that begin with the time in milliseconds, so that an orphan tells its age."""
+    return f"{int(now.timestamp() * 1000):012x}{uuid.uuid4().hex[:20]}"
+
+
+def write_time(write_id: str) -> datetime:
+    """When the rows of a write id were begun, UTC."""
+    return datetime.fromtimestamp(int(write_id[:12], 16) / 1000.0, tz=UTC)
+
+
+def read_rows(maps: Table) -> list[Row]:
+    """All rows of a version of `maps`.
+
+    Raises:
+        SnapshotNotFoundError: its files are gone.
+        StoreError: they cannot be read.
+    """
+    try:
+        table = maps.dataset().to_table()
+        # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
+        created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
+        rows: list[Row] = table.drop_columns("created_at").to_pylist()
+        for row, time in zip(rows, created, strict=True):
+            row["created_at"] = time.replace(tzinfo=UTC)
+    except FileNotFoundError as error:
+        raise SnapshotNotFoundError(
+            f"version {maps.version} is gone, vacuum removed its files ({error}); choose a newer one"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise StoreError(f"cannot read the table maps ({error}); run `featuredb verify`") from error
+    return rows
+
+
+def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
+    """The commit of a number, or the newest at a time; commits come newest first."""
+    first_kept = oldest_kept_version(commits)
+    readable = [commit for commit in commits if commit.version >= first_kept]
+    if isinstance(as_of, datetime):
+        if as_of.tzinfo is None:
+            raise SnapshotNotFoundError(f"expected a time with a time zone, found {as_of.isoformat()}")
+        fitting = [commit for commit in readable if commit.timestamp <= as_of]
+    else:
+        fitting = [commit for commit in readable if commit.version == as_of]
+    if not fitting:
+        raise SnapshotNotFoundError(
+            f"expected a version from {readable[-1].version} ({readable[-1].timestamp.isoformat()}) to "
+            f"{readable[0].version}, found {as_of}; `featuredb history` lists them, older ones were vacuumed"
+        )
+    return fitting[0]
+
+
+def oldest_kept_version(commits: Sequence[Commit]) -> int:
+    """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
+    return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
+
+
+def apply_change(
+    maps: Table,
+    change: Change,
+    *,
+    operation: str,
+    maps_changed: Sequence[str],
+    reason: str = "",
+    extra: Mapping[str, str] | None = None,
+) -> int:
+    """Commit a change as the very next version and return its number.
+
+    Raises:
+        StaleVersionError: someone else committed since `maps` was read.
+    """
+    if change.only_adds and not change.added:
+        return maps.version
+    metadata = {OPERATION: operation, CHANGED: "\n".join(maps_changed), REASON: reason, **(extra or {})}
+    if change.only_adds:
+        return maps.swap(map_rows_table(change.added), mode="append", metadata=metadata)
+    return maps.swap(map_rows_table(change.rows), mode="overwrite", metadata=metadata)
