@@ -11,7 +11,7 @@ from featuredb.errors import ImageError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
-from ingest.executor import Executor, Progress, no_progress
+from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photo import Photo
 from ingest.workspace import Workspace, read_arrays, write_arrays
@@ -73,8 +73,9 @@ def extract_photos(
         if not target.exists():
             tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
     outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
+    reasons = (o.reason if isinstance(o, Lost) else o for o in outcomes)
     return Extracted(
-        unreadable={name: reason for name, reason in zip(tasks, outcomes, strict=True) if reason},
+        unreadable={name: reason for name, reason in zip(tasks, reasons, strict=True) if reason},
         reused=len(photos) - len(tasks),
     )
 

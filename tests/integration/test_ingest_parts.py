@@ -1,15 +1,12 @@
-"""Work folder and executor: what is written is complete, and what dies is told."""
+"""Work folder: what is written is complete."""
 
 import os
-import signal
-import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from featuredb.errors import IngestError
-from ingest.executor import InProcessExecutor, PoolExecutor
 from ingest.workspace import (
     atomic_file,
     atomic_folder,
@@ -20,73 +17,6 @@ from ingest.workspace import (
     write_arrays,
     write_json,
 )
-
-
-def square(value: int) -> int:
-    return value * value
-
-
-def fail_at_three(value: int) -> int:
-    if value == 3:
-        raise ValueError("three is not wanted")
-    return value
-
-
-def die_at_five(value: int) -> int:
-    if value == 5:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return value
-
-
-def thread_caps(_: int) -> tuple[str | None, int]:
-    import cv2
-
-    return os.environ.get("OMP_NUM_THREADS"), cv2.getNumThreads()
-
-
-def test_pool_and_in_process_agree_and_report_progress() -> None:
-    items = list(range(40))
-    told: list[tuple[str, int, int]] = []
-    with PoolExecutor(2) as pool:
-        found = pool.map("squares", square, items, lambda *step: told.append(step))
-        assert pool.map("again", square, [7]) == [49]
-    assert found == InProcessExecutor().map("squares", square, items) == [i * i for i in items]
-    assert told[-1] == ("squares", 40, 40)
-    assert [done for _, done, _ in told] == sorted(done for _, done, _ in told)
-
-
-def test_a_task_that_raises_is_raised_here() -> None:
-    with PoolExecutor(2) as pool, pytest.raises(ValueError, match="three is not wanted"):
-        pool.map("numbers", fail_at_three, list(range(10)))
-
-
-def test_a_worker_that_dies_is_an_error_and_no_hang() -> None:
-    failed: list[BaseException] = []
-
-    def run() -> None:
-        with PoolExecutor(2) as pool:
-            try:
-                pool.map("numbers", die_at_five, list(range(50)))
-            except IngestError as error:
-                failed.append(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(60.0)
-    assert not thread.is_alive()
-    assert len(failed) == 1
-    assert "worker process died" in str(failed[0])
-    assert "run the same command again" in str(failed[0])
-
-
-def test_workers_have_their_threads_capped_and_the_parent_keeps_its_environment(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    with PoolExecutor(1) as pool:
-        (caps,) = pool.map("caps", thread_caps, [0])
-    assert caps == ("1", 1)
-    assert os.environ["OMP_NUM_THREADS"] == "7"
 
 
 def test_an_interrupted_write_leaves_nothing(tmp_path: Path) -> None:
