@@ -89,3 +89,11 @@ class ScanFileError(ScanError):
 
 class ScanNotFoundError(StoreError):
     """The database has no such scan, or none at all."""
+
+
+class CandidateNotFoundError(StoreError):
+    """The database has no such contributed photo, or no longer its image."""
+
+
+class CanaryNotFoundError(StoreError):
+    """The database has no such known query."""

@@ -12,8 +12,9 @@ import atexit
 import json
 import logging
 import random
+import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -46,11 +47,9 @@ ATTEMPTS = (
 )
 FIRST_PAUSE_S = 0.02  # a commit on a local disk takes about 10 ms
 LONGEST_PAUSE_S = 2.0
-# Compaction puts maps one after the other into a file; reading one skips the row groups of the others.
-# 32768 observations are 4 MB, large enough to be read in one go.
-ROW_GROUP_ROWS = 32_768
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
+_HEX = re.compile(r"[0-9a-f]{1,64}")
 
 
 class StaleVersionError(StoreError):
@@ -241,8 +240,27 @@ class Table:
 
     def delete_writes(self, write_ids: Iterable[str]) -> None:
         """Remove the rows of these write ids in one commit."""
-        quoted = ", ".join(f"'{write_id}'" for write_id in sorted(write_ids))
-        self._maintain(lambda: self._delta.delete(f"write_id IN ({quoted})"))
+        self.delete_rows("write_id", write_ids)
+
+    def delete_rows(
+        self, column: str, values: Iterable[str], metadata: Mapping[str, str] | None = None
+    ) -> int:
+        """Remove the rows with these values (ids in hexadecimal) in one commit; returns how many there were.
+
+        Their bytes stay in files of earlier versions until a vacuum.
+        """
+        wanted = sorted(values)
+        if not all(_HEX.fullmatch(value) for value in wanted):
+            raise StoreError(f"{self.spec.name}: expected ids in hexadecimal, found {wanted[:3]}")
+        quoted = ", ".join(f"'{value}'" for value in wanted)
+        metrics = self._maintain(
+            lambda: self._delta.delete(
+                f"{column} IN ({quoted})",
+                writer_properties=_writer_properties(self.spec),
+                commit_properties=CommitProperties(custom_metadata=dict(metadata or {})),
+            )
+        )
+        return int(metrics["num_deleted_rows"] or 0)
 
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""
@@ -251,14 +269,26 @@ class Table:
         )
         return int(metrics["numFilesRemoved"]) - int(metrics["numFilesAdded"])
 
-    def vacuum(self, retention: timedelta, *, dry_run: bool, keep_versions: Sequence[int] = ()) -> list[str]:
-        """Delete files that no version within the retention uses, tracked or not; returns their paths."""
+    def vacuum(
+        self,
+        retention: timedelta,
+        *,
+        dry_run: bool,
+        keep_versions: Sequence[int] = (),
+        untracked: bool = True,
+    ) -> list[str]:
+        """Delete files that no version within the retention uses; returns their paths.
+
+        Args:
+            untracked: also files that the log does not know: those of crashed writers, but with a short
+                retention those of a writer at work, too.
+        """
         with _as_store_error(f"cannot vacuum {self._delta.table_uri}"):
             removed = self._delta.vacuum(
                 retention_hours=round(retention.total_seconds() / 3600),
                 dry_run=dry_run,
                 enforce_retention_duration=False,
-                full=True,
+                full=untracked,
                 keep_versions=list(keep_versions) or None,
             )
         return [str(path) for path in removed]
@@ -323,7 +353,7 @@ def _writer_properties(spec: TableSpec) -> WriterProperties:
     plain = ColumnProperties(dictionary_enabled=False, encoding="DELTA_LENGTH_BYTE_ARRAY")
     return WriterProperties(
         compression="ZSTD",
-        max_row_group_size=ROW_GROUP_ROWS,
+        max_row_group_size=spec.row_group_rows,
         column_properties=dict.fromkeys(spec.plain_bytes, plain) or None,
     )
 

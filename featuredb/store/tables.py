@@ -3,7 +3,8 @@
 `maps` has one row per map and decides what is visible. The child tables hold the rows of images, points and
 observations; each row names the `write_id` of the commit attempt that wrote it, and counts only when a row of
 `maps` names that `write_id`. `lidar` and `lidar_points` hold scans in the same way, and are made when the
-first scan is added. See docs/store.md.
+first scan is added. `candidates` and `candidate_images` hold contributed photos, `canaries` known queries;
+they, too, are made on first use. See docs/store.md.
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,13 @@ TABLES = (MAPS, *CHILD_TABLES)
 LIDAR = "lidar"
 LIDAR_POINTS = "lidar_points"
 LIDAR_TABLES = (LIDAR, LIDAR_POINTS)
+CANDIDATES = "candidates"
+CANDIDATE_IMAGES = "candidate_images"
+CANDIDATE_TABLES = (CANDIDATES, CANDIDATE_IMAGES)
+CANARIES = "canaries"
+# Compaction puts maps one after the other into a file; reading one skips the row groups of the others.
+# 32768 observations are 4 MB, large enough to be read in one go.
+ROW_GROUP_ROWS = 32_768
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,6 +41,7 @@ class TableSpec:
         partition_by: partition columns, () for none.
         statistics: columns whose minimum and maximum go into the log; the others would only bloat it.
         plain_bytes: columns of bytes without repetition, for which a dictionary is a waste.
+        row_group_rows: rows that are read together.
     """
 
     name: str
@@ -40,6 +49,7 @@ class TableSpec:
     partition_by: tuple[str, ...] = ()
     statistics: tuple[str, ...] = ()
     plain_bytes: tuple[str, ...] = ()
+    row_group_rows: int = ROW_GROUP_ROWS
 
 
 def _required(name: str, kind: pa.DataType) -> pa.Field:
@@ -218,6 +228,60 @@ _LIDAR_POINTS_SCHEMA = pa.schema(
     ]
 )
 
+_CANDIDATES_SCHEMA = pa.schema(
+    [
+        _required("candidate_id", pa.string()),
+        _required("write_id", pa.string()),
+        _required("event_index", pa.int32()),
+        _required("event", pa.string()),
+        _required("at", pa.timestamp("us", tz="UTC")),
+        pa.field("owner", pa.string()),
+        pa.field("licence", pa.string()),
+        pa.field("client_id", pa.string()),
+        pa.field("sha256", pa.string()),
+        pa.field("size_bytes", pa.int64()),
+        pa.field("width", pa.int32()),
+        pa.field("height", pa.int32()),
+        pa.field("snapshot", pa.int64()),
+        pa.field("answer_status", pa.string()),
+        pa.field("request", pa.string()),
+        pa.field("answer", pa.string()),
+        pa.field("map_id", pa.string()),
+        pa.field("reason_code", pa.string()),
+        pa.field("reason", pa.string()),
+    ]
+)
+
+_CANDIDATE_IMAGES_SCHEMA = pa.schema(
+    [
+        _required("candidate_id", pa.string()),
+        _required("write_id", pa.string()),
+        _required("image", pa.binary()),
+    ]
+)
+
+_CANARIES_SCHEMA = pa.schema(
+    [
+        _required("canary_id", pa.string()),
+        _required("write_id", pa.string()),
+        _required("name", pa.string()),
+        _required("created_at", pa.timestamp("us", tz="UTC")),
+        _required("sha256", pa.string()),
+        _required("request", pa.string()),
+        _required("expected", pa.string()),
+        pa.field("epsg", pa.int32()),
+        *(pa.field(name, pa.float64()) for name in ("easting", "northing", "height")),
+        pa.field("cam_from_utm_xyzw", _DOUBLES),
+        pa.field("height_datum", pa.string()),
+        pa.field("tolerance_m", pa.float64()),
+        pa.field("tolerance_deg", pa.float64()),
+        _required("origin", pa.string()),
+        pa.field("snapshot", pa.int64()),
+        _required("note", pa.string()),
+        _required("image", pa.binary()),
+    ]
+)
+
 SPECS: dict[str, TableSpec] = {
     MAPS: TableSpec(name=MAPS, schema=_MAPS_SCHEMA, statistics=("map_id", "write_id")),
     IMAGES: TableSpec(
@@ -245,5 +309,22 @@ SPECS: dict[str, TableSpec] = {
         schema=_LIDAR_POINTS_SCHEMA,
         partition_by=("zone", "tile", "level"),
         statistics=("write_id", "easting", "northing"),
+    ),
+    CANDIDATES: TableSpec(
+        name=CANDIDATES, schema=_CANDIDATES_SCHEMA, statistics=("candidate_id", "write_id")
+    ),
+    CANDIDATE_IMAGES: TableSpec(
+        name=CANDIDATE_IMAGES,
+        schema=_CANDIDATE_IMAGES_SCHEMA,
+        statistics=("candidate_id", "write_id"),
+        plain_bytes=("image",),
+        row_group_rows=1,  # a photo has megabytes and is read alone
+    ),
+    CANARIES: TableSpec(
+        name=CANARIES,
+        schema=_CANARIES_SCHEMA,
+        statistics=("canary_id", "write_id"),
+        plain_bytes=("image",),
+        row_group_rows=1,
     ),
 }

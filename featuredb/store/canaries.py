@@ -1,0 +1,261 @@
+"""Known queries: photos whose right answer is known, to be asked before maps are promoted. Table `canaries`.
+
+A row is a canary; removing it removes the row, in one commit. The table is made by the first one. Canaries
+have versions of their own: a rollback of maps leaves them alone: they say what is true, whatever maps say.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
+from featuredb.geo.datum import check_datum
+from featuredb.geo.utm import zone_of
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.store.commits import CHANGED, OPERATION, new_write_id
+from featuredb.store.database import Database
+from featuredb.store.delta import Table, retry_stale
+from featuredb.store.encode import Row
+from featuredb.store.tables import CANARIES, SPECS
+
+Origin = Literal["person", "answer"]
+LONGEST_NAME = 200
+_UNIT = 1e-6  # how far the norm of a stored quaternion may be from 1
+_LIGHT = [field.name for field in SPECS[CANARIES].schema if field.name != "image"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class KnownPose:
+    """Where a photo was taken, and how far an answer may be from it.
+
+    Attributes:
+        epsg: UTM zone, 326zz or 327zz.
+        utm: (3,) easting, northing, height of the camera centre, metres.
+        height_datum: of the height; "unknown" where nobody knows.
+        cam_from_utm_xyzw: (4,) unit quaternion, grid axes (east, north, up) to camera axes.
+        tolerance_m: an answer further from `utm` than this is a regression.
+        tolerance_deg: as is one turned by more than this.
+
+    Raises:
+        InvalidValueError, GeodesyError
+    """
+
+    epsg: int
+    utm: FloatArray
+    height_datum: str
+    cam_from_utm_xyzw: FloatArray
+    tolerance_m: float
+    tolerance_deg: float
+
+    def __post_init__(self) -> None:
+        zone_of(self.epsg)
+        check_datum(self.height_datum)
+        object.__setattr__(self, "utm", frozen_array("KnownPose.utm", self.utm, (3,)))
+        quaternion = frozen_array("KnownPose.cam_from_utm_xyzw", self.cam_from_utm_xyzw, (4,))
+        object.__setattr__(self, "cam_from_utm_xyzw", quaternion)
+        if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT:
+            raise InvalidValueError(
+                f"KnownPose.cam_from_utm_xyzw: expected a unit quaternion, found {quaternion.tolist()}"
+            )
+        for name, value in (("tolerance_m", self.tolerance_m), ("tolerance_deg", self.tolerance_deg)):
+            if not 0 < value < np.inf:
+                raise InvalidValueError(f"KnownPose.{name}: expected a finite number > 0, found {value}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Canary:
+    """A photo whose right answer is known; its bytes are loaded on demand.
+
+    Attributes:
+        canary_id: first 32 hex digits of the SHA-256 of its name.
+        name: unique.
+        created_at: UTC.
+        sha256: of the image file's bytes.
+        request: what is asked with it (camera, prior), as on the wire.
+        pose: the right answer; None: it must not be localised (a photo of another town).
+        origin: "person": someone vouches for it; "answer": it is what `snapshot` answered.
+        snapshot: that snapshot, or None.
+        note: where it comes from, in words.
+    """
+
+    canary_id: str
+    name: str
+    created_at: datetime
+    sha256: str
+    pose: KnownPose | None
+    origin: Origin
+    snapshot: int | None = None
+    request: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""
+
+
+def has_canaries(database: Database) -> bool:
+    """Whether the table of canaries exists."""
+    return Table.exists(database.table_url(CANARIES), database.storage_options)
+
+
+def add_canary(
+    database: Database,
+    name: str,
+    image: bytes,
+    pose: KnownPose | None,
+    *,
+    origin: Origin,
+    snapshot: int | None = None,
+    request: Mapping[str, Any] | None = None,
+    note: str = "",
+) -> Canary:
+    """Add a known query; adding the same again changes nothing. See `Canary`.
+
+    Raises:
+        StoreError: another canary has this name, or the store failed.
+        ConflictError: other writers were faster too many times.
+        InvalidValueError: no name, no image, a request that JSON cannot hold, an answer without its snapshot.
+    """
+    if not name.strip() or len(name) > LONGEST_NAME:
+        raise InvalidValueError(f"canary: expected a name of 1 to {LONGEST_NAME} characters, found {name!r}")
+    if not image:
+        raise InvalidValueError(f"canary {name}: expected the bytes of an image file, found none")
+    if (origin == "answer") != (snapshot is not None):
+        raise InvalidValueError(f"canary {name}: expected a snapshot exactly where the origin is an answer")
+    try:
+        asked = json.dumps(dict(request or {}), sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"canary {name}: expected a request that JSON can hold: {error}") from error
+    now = datetime.now(UTC)
+    row: Row = {
+        "canary_id": hashlib.sha256(name.encode()).hexdigest()[:32],
+        "write_id": new_write_id(now),
+        "name": name,
+        "created_at": now,
+        "sha256": hashlib.sha256(image).hexdigest(),
+        "request": asked,
+        **_pose_columns(pose),
+        "origin": origin,
+        "snapshot": snapshot,
+        "note": note,
+    }
+    Table.create(database.table_url(CANARIES), SPECS[CANARIES], database.storage_options)
+
+    def attempt() -> Row:
+        table = database.table(CANARIES)
+        for other in _rows(table):
+            if other["name"] == name:
+                return _same(other, row)
+        rows = pa.Table.from_pylist([{**row, "image": image}], schema=SPECS[CANARIES].schema)
+        table.swap(rows, mode="append", metadata={OPERATION: "canary add", CHANGED: name})
+        return row
+
+    return _canary(retry_stale(f"add canary {name}", attempt))
+
+
+def list_canaries(database: Database) -> list[Canary]:
+    """All known queries, by name."""
+    if not has_canaries(database):
+        return []
+    return [_canary(row) for row in sorted(_rows(database.table(CANARIES)), key=lambda row: str(row["name"]))]
+
+
+def remove_canary(database: Database, name: str) -> None:
+    """Remove a known query.
+
+    Raises:
+        CanaryNotFoundError: there is none of this name.
+        ConflictError, StoreError
+    """
+    rows = _rows(database.table(CANARIES)) if has_canaries(database) else []
+    mine = [row["canary_id"] for row in rows if row["name"] == name]
+    if not mine:
+        raise CanaryNotFoundError(f"no canary {name!r}; `featuredb canary list` lists what there is")
+    database.table(CANARIES).delete_rows("canary_id", mine, {OPERATION: "canary remove", CHANGED: name})
+
+
+def load_canary_image(database: Database, canary: Canary) -> bytes:
+    """The bytes of a canary's photo.
+
+    Raises:
+        CanaryNotFoundError: it was removed.
+        StoreError: they cannot be read, or are not those that were added.
+    """
+    mine = ds.field("canary_id") == canary.canary_id
+    if not has_canaries(database):
+        raise CanaryNotFoundError(f"no canary {canary.name!r}")
+    dataset = database.table(CANARIES).dataset([("canary_id", "=", canary.canary_id)])
+    try:
+        found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(
+            f"canary {canary.name}: cannot read its image ({error}); run `featuredb verify`"
+        ) from error
+    if not len(found):
+        raise CanaryNotFoundError(f"canary {canary.name!r} was removed")
+    image: bytes = found[0].as_py()
+    if hashlib.sha256(image).hexdigest() != canary.sha256:
+        raise StoreError(f"canary {canary.name}: its image is not the one that was added")
+    return image
+
+
+def _rows(table: Table) -> list[Row]:
+    """All rows without their images."""
+    try:
+        found = table.dataset().to_table(_LIGHT, use_threads=False)
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(f"cannot read the table canaries ({error}); run `featuredb verify`") from error
+    # As in commits.read_rows: no look into the system's time zone files.
+    times = found["created_at"].cast(pa.timestamp("us")).to_pylist()
+    rows: Iterable[Row] = found.drop_columns("created_at").to_pylist()
+    return [{**row, "created_at": time.replace(tzinfo=UTC)} for row, time in zip(rows, times, strict=True)]
+
+
+def _same(there: Row, wanted: Row) -> Row:
+    """The row that is there, if it says the same."""
+    differing = [k for k in _LIGHT if k not in ("write_id", "created_at") and there[k] != wanted.get(k)]
+    if differing:
+        raise StoreError(
+            f"there is a canary {wanted['name']!r} with another {', '.join(differing)}; "
+            "remove it first, or choose another name"
+        )
+    return there
+
+
+def _pose_columns(pose: KnownPose | None) -> Row:
+    names = ("epsg", "easting", "northing", "height", "cam_from_utm_xyzw", "height_datum", "tolerance_m",
+             "tolerance_deg")  # fmt: skip
+    if pose is None:
+        return {"expected": "not_localised", **dict.fromkeys(names)}
+    easting, northing, height = (float(v) for v in pose.utm)
+    rotation = [float(q) for q in pose.cam_from_utm_xyzw]
+    values = (pose.epsg, easting, northing, height, rotation, pose.height_datum, float(pose.tolerance_m),
+              float(pose.tolerance_deg))  # fmt: skip
+    return {"expected": "localised", **dict(zip(names, values, strict=True))}
+
+
+def _canary(row: Row) -> Canary:
+    pose = None
+    if row["expected"] == "localised":
+        pose = KnownPose(
+            epsg=row["epsg"],
+            utm=np.array([row["easting"], row["northing"], row["height"]]),
+            height_datum=row["height_datum"],
+            cam_from_utm_xyzw=np.array(row["cam_from_utm_xyzw"]),
+            tolerance_m=row["tolerance_m"],
+            tolerance_deg=row["tolerance_deg"],
+        )
+    return Canary(
+        canary_id=row["canary_id"],
+        name=row["name"],
+        created_at=row["created_at"],
+        sha256=row["sha256"],
+        request=json.loads(row["request"]),
+        pose=pose,
+        origin=row["origin"],
+        snapshot=row["snapshot"],
+        note=row["note"],
+    )
