@@ -9,6 +9,23 @@ from featuredb.store.encode import Row
 ACTIVE = "active"
 QUARANTINED = "quarantined"
 RETIRED = "retired"
+# Columns that say where a map lies; equal ones mean that it was not placed anew.
+_PLACE = (
+    "epsg",
+    "height_datum",
+    "method",
+    "generation",
+    "parents",
+    "origin_latitude_deg",
+    "origin_longitude_deg",
+    "origin_height_m",
+    "local_from_sfm_scale",
+    "local_from_sfm_rotation",
+    "local_from_sfm_translation",
+    "placement_covariance",
+    "placement_evidence",
+    "cameras",
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,16 +50,25 @@ def live_row(rows: Iterable[Row], map_id: str) -> Row | None:
     return next((row for row in rows if row["map_id"] == map_id and row["status"] != RETIRED), None)
 
 
-def add_maps(rows: Sequence[Row], new_rows: Sequence[Row], replaces: Sequence[str]) -> Change:
+def add_maps(
+    rows: Sequence[Row], new_rows: Sequence[Row], replaces: Sequence[str], *, moves: bool = True
+) -> Change:
     """Add maps in the place of those that `replaces` names.
 
     A retired row of the same map id gives way to the new one. A replaced map of another id stays in the table
     as retired, with the reason. Maps that hang on a replaced one, directly or through others, were placed by
     what no longer holds: they are quarantined, with the reason, unless they are among the new ones.
 
+    Args:
+        moves: False where the new maps are the old ones at the very same place, thinned for example; then
+            nothing that hangs on them is touched.
+
     Raises:
         MapNotFoundError: a map to be replaced is not there.
+        StoreError: with `moves` false, a new map is not the successor of one at the same place.
     """
+    if not moves:
+        _check_same_place(rows, new_rows)
     new_ids = [row["map_id"] for row in new_rows]
     for map_id in replaces:
         if not any(row["map_id"] == map_id for row in rows):
@@ -54,7 +80,7 @@ def add_maps(rows: Sequence[Row], new_rows: Sequence[Row], replaces: Sequence[st
         if row["map_id"] in replaces and row["status"] != RETIRED:
             row = {**row, "status": RETIRED, "status_reason": f"replaced by {', '.join(new_ids)}"}
         kept.append(row)
-    stale = descendants(kept, [m for m in replaces if live_row(rows, m) is not None])
+    stale = descendants(kept, [m for m in replaces if live_row(rows, m) is not None]) if moves else {}
     flagged = [row["map_id"] for row in kept if row["map_id"] in stale and row["status"] != QUARANTINED]
     kept = [_quarantined(row, stale[row["map_id"]]) if row["map_id"] in flagged else row for row in kept]
     unchanged = len(kept) == len(rows) and all(a is b for a, b in zip(kept, rows, strict=True))
@@ -162,6 +188,17 @@ def descendants(rows: Iterable[Row], ancestors: Iterable[str]) -> dict[str, str]
         if not more:
             return {map_id: top for map_id, top in root.items() if map_id not in tops}
         root |= more
+
+
+def _check_same_place(rows: Sequence[Row], new_rows: Sequence[Row]) -> None:
+    for new in new_rows:
+        old = live_row(rows, new["map_id"])
+        differing = [name for name in _PLACE if old is None or old[name] != new[name]]
+        if differing:
+            raise StoreError(
+                f"map {new['map_id']}: expected a state at the same place as the live one, found another "
+                f"{', '.join(differing)}; commit it as one that moves"
+            )
 
 
 def _quarantined(row: Row, ancestor: str) -> Row:

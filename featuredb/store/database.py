@@ -139,7 +139,12 @@ class Database:
             return self._poll_table.version
 
     def commit_map(
-        self, feature_map: FeatureMap, *, replaces: str | None = None, based_on: str | None = None
+        self,
+        feature_map: FeatureMap,
+        *,
+        replaces: str | None = None,
+        based_on: str | None = None,
+        moves: bool = True,
     ) -> CommitResult:
         """Make one map visible; see `commit_maps`.
 
@@ -148,7 +153,10 @@ class Database:
         """
         write_ids = {replaces: based_on} if replaces is not None and based_on is not None else {}
         return self.commit_maps(
-            [feature_map], replaces=() if replaces is None else (replaces,), based_on=write_ids
+            [feature_map],
+            replaces=() if replaces is None else (replaces,),
+            based_on=write_ids,
+            moves=moves,
         )[0]
 
     def commit_maps(
@@ -157,6 +165,7 @@ class Database:
         *,
         replaces: Sequence[str] = (),
         based_on: Mapping[str, str] | None = None,
+        moves: bool = True,
     ) -> list[CommitResult]:
         """Make maps visible, all in one commit.
 
@@ -167,6 +176,8 @@ class Database:
 
         Args:
             based_on: write ids, by id, of the replaced maps that the new ones were made from.
+            moves: False where the new maps are the old ones at the same place, thinned for example: what
+                they placed stands, and nothing is quarantined.
 
         Raises:
             ConflictError: other writers were faster too many times, or a map of `based_on` has been placed
@@ -198,7 +209,7 @@ class Database:
             version = maps.version
             flagged: tuple[str, ...] = ()
             if pending:
-                change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces)
+                change = add_maps(rows, [encoded[m.map_id].row for m in pending], replaces, moves=moves)
                 version = apply_change(
                     maps,
                     change,
