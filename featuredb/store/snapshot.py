@@ -1,5 +1,6 @@
 """One version of a database, for reading. Nothing that is committed later shows in it."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -9,6 +10,7 @@ import pyarrow.dataset as ds
 
 from featuredb.errors import MapNotFoundError, StoreError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
+from featuredb.maps.lineage import Lineage, drift_and_budget, trace
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map
 from featuredb.store.delta import Table
@@ -44,12 +46,14 @@ class MapSummary:
     Attributes:
         write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
         content_digest: SHA-256 of everything but the status.
-        status_reason: why it was retired or quarantined, "" otherwise.
+        status_reason: why it was promoted, quarantined or retired; "" where it has its first status.
         created_at: UTC.
         box: of the points; None for a map without points.
         tiles: names of all tiles that hold rows of the map.
         images, points, observations, descriptors: counts.
         residual_rms_m: of the placement, metres.
+        drift_m, budget_m: of a map that other maps placed: 95 % bound of its position against its anchors,
+            and what growth allowed, metres; None where the placement does not say.
     """
 
     map_id: str
@@ -74,6 +78,8 @@ class MapSummary:
     extractor_fingerprint: str
     source: str
     licence: str
+    drift_m: float | None = None
+    budget_m: float | None = None
 
 
 class Snapshot:
@@ -104,6 +110,11 @@ class Snapshot:
             MapNotFoundError: the snapshot has no such map.
         """
         return _summary(self._row(map_id))
+
+    def lineages(self) -> dict[str, Lineage]:
+        """What each map of the snapshot stands on, retired ones included, by id."""
+        known = {m.map_id: m for m in self.maps(include_retired=True)}
+        return {map_id: trace(map_id, known) for map_id in known}
 
     def maps_in(self, epsg: int, e0: float, n0: float, e1: float, n1: float) -> list[MapSummary]:
         """Maps of one UTM zone, not retired, whose box touches e0 <= e <= e1, n0 <= n <= n1 (metres)."""
@@ -165,6 +176,7 @@ class Snapshot:
 
 def _summary(row: Row) -> MapSummary:
     box = None if row[BOUNDS[0]] is None else UtmBox(**{name: row[name] for name in BOUNDS})
+    drift_m, budget_m = drift_and_budget(json.loads(row["placement_evidence"]))
     return MapSummary(
         map_id=row["map_id"],
         write_id=row["write_id"],
@@ -188,4 +200,6 @@ def _summary(row: Row) -> MapSummary:
         extractor_fingerprint=row["extractor_fingerprint"],
         source=row["source"],
         licence=row["licence"],
+        drift_m=drift_m,
+        budget_m=budget_m,
     )
