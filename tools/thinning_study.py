@@ -120,7 +120,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     with (args.out / "thinning.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(asdict(rows[0])))
         writer.writeheader()
-        writer.writerows({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(r).items()} for r in rows)
+        writer.writerows(
+            {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in asdict(r).items()} for r in rows
+        )
     plot(rows, args.out / "thinning.png")
     return 0
 
@@ -133,7 +135,9 @@ def curve(study: Study, covers: Sequence[int], max_views: int, seed: int) -> "li
         options = ThinOptions(cover=cover, max_views=max_views)
         thin = thin_map(study.feature_map, options)
         seconds = time.process_time() - start
-        dropped = thin_map(study.feature_map, ThinOptions(cover=cover, max_views=max_views, keep_points=False))
+        dropped = thin_map(
+            study.feature_map, ThinOptions(cover=cover, max_views=max_views, keep_points=False)
+        )
         rows.append(_measure(study, thin, dropped, "cover", cover, seconds))
         described = thin.observations.point_index[thin.observations.has_descriptor]
         chance = by_chance(study.feature_map, len(np.unique(described)), seed, keep_points=True)
@@ -150,9 +154,7 @@ def by_chance(feature_map: FeatureMap, count: int, seed: int, *, keep_points: bo
     return with_descriptors(feature_map, np.isin(seen.point_index, drawn), keep_points)
 
 
-def _measure(
-    study: Study, thin: FeatureMap, dropped: FeatureMap, how: str, cover: int, thin_s: float
-) -> Row:
+def _measure(study: Study, thin: FeatureMap, dropped: FeatureMap, how: str, cover: int, thin_s: float) -> Row:
     area = build_area([thin])
     index = build_index(area.descriptors)
     indexed = [IndexedArea(area=area, index=index)]
@@ -211,7 +213,9 @@ def line(row: Row) -> str:
 def plot(rows: Sequence[Row], path: Path) -> None:
     """Recall, error and query time against described points."""
     names = list(dict.fromkeys(r.study for r in rows))
-    figure, axes = plt.subplots(len(names), 3, figsize=(13, 3.6 * len(names)), layout="constrained", squeeze=False)
+    figure, axes = plt.subplots(
+        len(names), 3, figsize=(13, 3.6 * len(names)), layout="constrained", squeeze=False
+    )
     for name, line_axes in zip(names, axes, strict=True):
         mine = [r for r in rows if r.study == name]
         whole = mine[0]

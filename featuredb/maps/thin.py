@@ -1,14 +1,14 @@
 """Fewer descriptors for the same answers: every image keeps seeing enough points, well spread over it.
 
 A K-cover (Li, Snavely and Huttenlocher, ECCV 2010): points are chosen one after the other, each time the one
-that most images still lack, until every image sees K chosen points, or all that it has. A gain counts less in a
-part of an image that has points already, and for a point that is badly known. Gains only shrink as more is
-chosen, so a heap of old gains finds the greatest one without computing the others anew.
+that most images still lack, until every image sees K chosen points, or all that it has. A gain counts less
+in a part of an image that has points already, and for a point that is badly known. Gains only shrink as more
+is chosen, so a heap of old gains finds the greatest one without computing the others anew.
 
-A point that is not chosen loses its descriptors and stays as geometry. Answers read described points only, so
-the index, its memory and a query's time shrink as if the point were gone; what stays serves what works on
-tracks (placing a map on a scan, adjusting its lens, exports), costs a tenth of the bytes, and leaves the numbers
-of all points as they were. `keep_points=False` removes it altogether.
+A point that is not chosen loses its descriptors and stays as geometry. Answers read described points only,
+so the index, its memory and a query's time shrink as if the point were gone; what stays serves what works on
+tracks (placing a map on a scan, adjusting its lens, exports) and leaves the numbers of all points as they
+were. `keep_points=False` removes it altogether (docs/growth.md has the bytes of both).
 """
 
 import heapq
@@ -42,7 +42,7 @@ class ThinOptions:
     keep_points: bool = True
 
     def __post_init__(self) -> None:
-        # Localisation believes a pose from 15 inliers on, and a photo finds a part of what its neighbours see.
+        # Localisation believes a pose from 15 inliers on, and a photo finds only a part of what is there.
         if self.cover < 15:
             raise InvalidValueError(f"ThinOptions.cover: expected at least 15 points, found {self.cover}")
         if self.max_views < 2:
@@ -62,7 +62,11 @@ def thin_map(feature_map: FeatureMap, options: ThinOptions | None = None) -> Fea
         return feature_map
     points = k_cover(feature_map, options.cover)
     described = _thinned_views(feature_map, points, options)
-    note = {"options": note, "points_before": len(_described_points(feature_map)), "points": int(points.sum())}
+    note = {
+        "options": note,
+        "points_before": len(_described_points(feature_map)),
+        "points": int(points.sum()),
+    }
     return with_descriptors(feature_map, described, options.keep_points, {_THINNED: note})
 
 
@@ -178,8 +182,8 @@ def _image_rows(feature_map: FeatureMap, image_id: NDArray[np.int32]) -> NDArray
 def _precision(feature_map: FeatureMap) -> FloatArray:
     """Weight (n,) in (0, 1) of each point: a half at the median of sigma over viewing distance.
 
-    A pose feels a point's error as an angle. Within a factor of two of the median the weight changes less than
-    a view more or less does, so that it decides among points seen equally well.
+    A pose feels a point's error as an angle. Within a factor of two of the median the weight changes less
+    than a view more or less does, so that it decides among points seen equally well.
     """
     n = len(feature_map.points)
     _, distance = _views(feature_map)

@@ -1,0 +1,96 @@
+"""The command that thins a map: fewer descriptors, every image still covered."""
+
+import argparse
+import sys
+from typing import Any
+
+import numpy as np
+
+from featuredb.cli.common import add_database_argument, open_database
+from featuredb.errors import MapNotFoundError, StoreError
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.thin import ThinOptions, described_points_of_images, thin_map
+from featuredb.store import MapSummary, Snapshot
+
+_DEFAULTS = ThinOptions()
+
+
+def register(subparsers: Any) -> None:
+    """Add `thin` to the parser of `featuredb`."""
+    text = "keep only as many descriptors as answers need; the earlier state stays, see rollback"
+    parser = subparsers.add_parser("thin", help=text, description=text)
+    add_database_argument(parser)
+    parser.add_argument("map_id", metavar="MAP", help="id of an active map, or its first letters")
+    parser.add_argument(
+        "--cover",
+        type=int,
+        default=_DEFAULTS.cover,
+        metavar="K",
+        help="described points that every image keeps seeing (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--max-views",
+        type=int,
+        default=_DEFAULTS.max_views,
+        metavar="N",
+        help="described observations that a point keeps (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--drop-points",
+        action="store_true",
+        help="remove the other points altogether; by default they stay as geometry without descriptors",
+    )
+    parser.add_argument("--dry-run", action="store_true", help="only say what would become of the map")
+    parser.set_defaults(run=run_thin)
+
+
+def run_thin(args: argparse.Namespace) -> int:
+    """Thin the map and commit it as a new state of itself.
+
+    Raises:
+        MapNotFoundError: no live map of that id.
+        StoreError: the map is not active.
+        InvalidValueError: options out of range.
+        ConflictError: someone else changed the map meanwhile.
+    """
+    options = ThinOptions(cover=args.cover, max_views=args.max_views, keep_points=not args.drop_points)
+    database = open_database(args)
+    snapshot = database.snapshot()
+    summary = _active_map(snapshot, args.map_id)
+    before = snapshot.load_map(summary.map_id)
+    after = thin_map(before, options)
+    sys.stdout.write(f"map {summary.map_id}: {_figures(before)} -> {_figures(after)}\n")
+    if args.dry_run:
+        return 0
+    if after is before:
+        sys.stdout.write("thinned so before; nothing to do\n")
+        return 0
+    done = database.commit_map(after, replaces=summary.map_id, based_on=summary.write_id, moves=False)
+    sys.stdout.write(
+        f"version {done.version}; `featuredb rollback {database.url} {snapshot.version}` brings back the "
+        "state before\n"
+    )
+    return 0
+
+
+def _active_map(snapshot: Snapshot, map_id: str) -> MapSummary:
+    maps = snapshot.maps()
+    found = [m for m in maps if m.map_id == map_id] or [m for m in maps if m.map_id.startswith(map_id)]
+    if len(found) != 1:
+        raise MapNotFoundError(
+            f"snapshot {snapshot.version} has {len(found)} live maps {map_id}; `featuredb maps` lists them"
+        )
+    if found[0].status != "active":
+        raise StoreError(f"map {found[0].map_id} is {found[0].status}; only active maps are thinned")
+    return found[0]
+
+
+def _figures(feature_map: FeatureMap) -> str:
+    seen = feature_map.observations
+    described = len(np.unique(seen.point_index[seen.has_descriptor]))
+    cover = described_points_of_images(feature_map)
+    least = int(cover.min()) if len(cover) else 0
+    return (
+        f"{described} described points of {len(feature_map.points)}, {int(seen.has_descriptor.sum())} "
+        f"descriptors, at least {least} points in an image"
+    )
