@@ -1,0 +1,195 @@
+"""Step: every new photo is localised by the existing maps, by itself."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from featuredb.features.features import Features
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.index.area import Area
+from ingest.growth.values import FeaturesOf, LocalisedPhoto
+from ingest.photo import Photo
+from reloc.candidates import IndexedArea
+from reloc.localise import Localised, localise_features
+from reloc.matching import Matches, guided_matches, visible_points
+from reloc.options import LocaliseOptions
+from reloc.pose import PoseHypothesis, pose_uncertainty, refine_pose
+from reloc.result import LocaliseRequest
+from reloc.search import pairs
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocaliseEachOptions:
+    """How new photos are localised.
+
+    Attributes:
+        localise: as for queries; the extractor named there is not used, features exist.
+        max_features: so many of a photo's features, strongest and best spread first, look for the pose; a
+            query has 3,000. All of them take part in the guided matching that follows.
+        retry_without_geotag: a photo that its geotag does not lead to a map is tried without it: a tenth
+            of the positions of community photos are wrong by kilometres.
+        least_inliers_of_map: a map counts among a photo's maps from so many inliers on; the number that a
+            pose itself needs at least.
+    """
+
+    localise: LocaliseOptions = field(default_factory=LocaliseOptions)
+    max_features: int = 4000
+    retry_without_geotag: bool = True
+    least_inliers_of_map: int = 15
+
+
+def localise_photos(
+    photos: Sequence[Photo],
+    rows: Sequence[int],
+    features_of: FeaturesOf,
+    areas: Sequence[IndexedArea],
+    options: LocaliseEachOptions | None = None,
+) -> tuple[dict[int, LocalisedPhoto], dict[int, str]]:
+    """Localise photos in the areas of the active maps, each for itself.
+
+    Args:
+        photos: all new photos. rows: those to be localised.
+        areas: of a reloc.localiser.Localiser; those of another extractor than a photo's are left out.
+
+    Returns:
+        What was localised by row, and for the others the reason by row.
+    """
+    options = options or LocaliseEachOptions()
+    found: dict[int, LocalisedPhoto] = {}
+    reasons: dict[int, str] = {}
+    for row in rows:
+        outcome = localise_photo(photos[row], row, features_of(row).features, areas, options)
+        if isinstance(outcome, LocalisedPhoto):
+            found[row] = outcome
+        else:
+            reasons[row] = outcome
+    _LOG.info("%d of %d photos localised in %d areas", len(found), len(rows), len(areas))
+    return found, reasons
+
+
+def localise_photo(
+    photo: Photo, row: int, features: Features, areas: Sequence[IndexedArea], options: LocaliseEachOptions
+) -> LocalisedPhoto | str:
+    """One photo, or the reason why it is not localised."""
+    usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
+    if not usable:
+        return "NO_COVERAGE: no active map has descriptors of this extractor"
+    settings = replace(
+        options.localise, extractor=replace(options.localise.extractor, upright=_is_upright(features))
+    )
+    few = features.take(np.arange(min(options.max_features, len(features))))
+    request = LocaliseRequest(
+        camera_key=photo.camera_key or None, exif_focal_px=photo.focal_px, prior=photo.gps
+    )
+    outcome = localise_features(few, request, usable, settings)
+    by_prior = photo.gps is not None and outcome.best is not None
+    if outcome.best is None and photo.gps is not None and options.retry_without_geotag:
+        again = localise_features(few, replace(request, prior=None), usable, settings)
+        outcome = again if again.best is not None else outcome
+    if outcome.best is None:
+        return f"{outcome.result.reason}: {outcome.result.detail}"
+    return _densified(row, features, outcome, by_prior, options)
+
+
+def _is_upright(features: Features) -> bool:
+    return "-upright-" in features.fingerprint
+
+
+def _densified(
+    row: int, features: Features, outcome: Localised, by_prior: bool, options: LocaliseEachOptions
+) -> LocalisedPhoto:
+    """The pose refined on matches of all features with every map that it should see."""
+    assert outcome.best is not None
+    assert outcome.uncertainty is not None
+    area, pose = outcome.best.area, outcome.best.pose
+    settings = options.localise
+    matches = match_each_map(features, area, pose, options)
+    uncertainty = outcome.uncertainty
+    if len(matches) >= 4:
+        pixels, points = pairs(features, area, matches)
+        better = refine_pose(pixels, points, pose, settings.pose)
+        matches = _take(matches, better.inliers)
+        pixels, points = pairs(features, area, matches)
+        if len(matches) >= outcome.best.evidence.inliers:
+            pose = better
+            uncertainty = pose_uncertainty(
+                pixels, points, area.point_covariance[matches.point], better, settings.pose
+            )
+    of_map = area.point_map[matches.point]
+    counts = np.bincount(of_map, minlength=len(area.maps))
+    order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
+    place = np.full(len(area.maps), -1)
+    place[order] = np.arange(len(order))
+    return LocalisedPhoto(
+        row=row,
+        frame=area.frame,
+        cam_from_local=pose.cam_from_local,
+        covariance=uncertainty.covariance,
+        camera=pose.camera,
+        feature_rows=matches.feature,
+        pixels=features.xy[matches.feature].astype(np.float64),
+        map_ids=tuple(area.maps[i].map_id for i in order),
+        map_of=place[of_map],
+        point_of=area.point_row[matches.point],
+        points=area.points[matches.point],
+        point_covariance=area.point_covariance[matches.point],
+        by_prior=by_prior,
+        result=outcome.result,
+    )
+
+
+def match_each_map(
+    features: Features, area: Area, pose: PoseHypothesis, options: LocaliseEachOptions
+) -> Matches:
+    """Guided matches of all features with the points that each map should show, map by map.
+
+    Two maps of one place have the same points twice; each may have its match. Maps with fewer matches
+    within the tolerance than a pose needs are left out: chance alone gives a few.
+    """
+    everything = np.arange(len(area.points), dtype=np.int64)
+    visible = visible_points(area, everything, pose.camera, pose.cam_from_local)
+    parts = []
+    tolerance_px = options.localise.pose.tolerance_rel * max(pose.camera.width, pose.camera.height)
+    for map_row in np.unique(area.point_map[visible]):
+        points = visible[area.point_map[visible] == map_row].astype(np.int32)
+        matches = guided_matches(
+            features, area, points, pose.camera, pose.cam_from_local, options.localise.matching
+        )
+        if len(matches) == 0:
+            continue
+        pixels, places = pairs(features, area, matches)
+        error = pose.camera.project(pose.cam_from_local.act(places)) - pixels
+        near = np.linalg.norm(error, axis=1) < 2.0 * tolerance_px
+        if near.sum() >= options.least_inliers_of_map:
+            parts.append(_take(matches, near))
+    return Matches(
+        feature=np.concatenate([p.feature for p in parts] or [np.zeros(0, np.int64)]),
+        point=np.concatenate([p.point for p in parts] or [np.zeros(0, np.int64)]),
+        distance=np.concatenate([p.distance for p in parts] or [np.zeros(0, np.float32)]),
+    )
+
+
+def in_frame(photo: LocalisedPhoto, frame: LocalFrame) -> LocalisedPhoto:
+    """The same photo with everything metric in another local frame."""
+    if photo.frame == frame:
+        return photo
+    frame_from_old = frame.enu_from(photo.frame)
+    turn: FloatArray = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = frame_from_old.rotation
+    return replace(
+        photo,
+        frame=frame,
+        cam_from_local=photo.cam_from_local @ frame_from_old.inverse(),
+        covariance=turn @ photo.covariance @ turn.T,
+        points=frame_from_old.act(photo.points),
+        point_covariance=frame_from_old.rotation @ photo.point_covariance @ frame_from_old.rotation.T,
+    )
+
+
+def _take(matches: Matches, rows: np.ndarray) -> Matches:
+    return Matches(feature=matches.feature[rows], point=matches.point[rows], distance=matches.distance[rows])
