@@ -12,8 +12,9 @@ from featuredb.geometry.camera import Camera
 from featuredb.simworld.scene import Scene, Street
 from featuredb.simworld.shot import Device, Shot, look_pose
 
-GpsError = Literal["realistic", "none"]
+GpsError = Literal["realistic", "rtk", "none"]
 
+RTK_SIGMA_M = (0.015, 0.015, 0.025)  # east, north, up: fixed ambiguities, a station nearby
 _PHOTOS_PER_SIGHT = 5
 _START = datetime(2025, 6, 14, 9, 12, 5, tzinfo=UTC)
 
@@ -28,7 +29,8 @@ class FlightOptions:
         forward_overlap, side_overlap: shares of the footprint.
         oblique: photos from the rim, looking inward at 50 degrees below the horizon.
         width: of the photos, pixels; they are 4:3.
-        gps_error: "realistic", or "none" for truth priors.
+        gps_error: "realistic", "rtk" for a surveyor's receiver, or "none" for truth priors.
+        center_m: middle of the survey, town axes.
     """
 
     lines: int = 7
@@ -39,11 +41,12 @@ class FlightOptions:
     oblique: int = 8
     width: int = 1600
     gps_error: GpsError = "realistic"
+    center_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if self.gps_error not in ("realistic", "none"):
+        if self.gps_error not in ("realistic", "rtk", "none"):
             raise InvalidValueError(
-                f"FlightOptions.gps_error: expected realistic or none, found {self.gps_error!r}"
+                f"FlightOptions.gps_error: expected realistic, rtk or none, found {self.gps_error!r}"
             )
         if not (
             self.lines > 0
@@ -109,7 +112,10 @@ def survey(scene: Scene, options: FlightOptions, seed: int) -> list[Shot]:
         outward = np.array([np.cos(a), np.sin(a)])
         position = np.array([*(outward * ring), 0.9 * options.height_m])
         stations.append((position, float(np.degrees(np.arctan2(-outward[0], -outward[1]))), -50.0))
-    positions = np.array([scene.enu_from_town @ (p + rng.normal(0, [0.9, 0.9, 0.5])) for p, _, _ in stations])
+    middle = np.array([*options.center_m, 0.0])
+    positions = np.array(
+        [scene.enu_from_town @ (p + middle + rng.normal(0, [0.9, 0.9, 0.5])) for p, _, _ in stations]
+    )
     times = [_START + timedelta(seconds=3.1 * i) for i in range(len(stations))]
     believed = received_positions(positions, 3.1, options.gps_error, rng)
     shots = []
@@ -140,7 +146,7 @@ def visitors(scene: Scene, flight: FlightOptions, count: int, seed: int, *, widt
     for i in range(count):
         at = rng.uniform(-0.85, 0.85, 2) * [half_x, half_y]
         height = flight.height_m * float(rng.uniform(0.75, 1.25))
-        position = scene.enu_from_town @ np.array([*at, height])
+        position = scene.enu_from_town @ np.array([*(at + flight.center_m), height])
         pitch = -90.0 + float(rng.choice([0.0, 8.0, 18.0, 28.0, 35.0]) + abs(rng.normal(0, 3)))
         heading = float(rng.uniform(0, 360))
         if pitch > -80 and at @ _town_direction(scene, heading) > 0:
@@ -219,10 +225,12 @@ def received_positions(
     """What a receiver says (n, 3): truth, or truth with noise, a wandering bias and a wrong height.
 
     White noise of 0.8 m, a first-order Gauss-Markov bias of 1.2 m with a time constant of 200 s, and a
-    height off by a constant of several metres: a consumer drone without RTK.
+    height off by a constant of several metres: a consumer drone without RTK. With RTK, white noise alone.
     """
     if error == "none":
         return positions.copy()
+    if error == "rtk":
+        return np.asarray(positions + rng.normal(0, RTK_SIGMA_M, positions.shape), dtype=np.float64)
     keep = np.exp(-step_s / 200.0)
     bias = rng.normal(0, [1.2, 1.2, 1.5])
     height_bias = float(rng.choice([-1, 1]) * rng.uniform(3, 8))

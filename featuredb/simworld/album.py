@@ -1,0 +1,194 @@
+"""Albums: photos of many people as planned, taken, edited, tagged, and written with a table and the truth.
+
+An album's photos lie in a folder per owner under names that give nothing away. Beside them stand
+`table.csv`, `table.jsonl` and `table.parquet` as a photo site's programming interface would give them,
+`truth.json` with every true pose, and `facts.jsonl` with what each photo really is.
+"""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal, Protocol
+
+import cv2
+from PIL import ExifTags, Image
+
+from featuredb.errors import InvalidValueError
+from featuredb.simworld.album_files import AlbumFact, Geotag, write_facts, write_tables
+from featuredb.simworld.edits import Edit, edited, edited_camera
+from featuredb.simworld.exif import exif_of
+from featuredb.simworld.indoors import indoor_photo, portrait_photo
+from featuredb.simworld.photograph import take_photo
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.sensor import SensorOptions, jpeg_bytes
+from featuredb.simworld.shot import Shot
+from featuredb.simworld.texture import Image8
+from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
+
+Progress = Callable[[int, int], None]
+Subject = Literal["town", "indoor", "portrait"]
+ExifPolicy = Literal["full", "no_gps", "none"]
+
+
+class SceneSource(Protocol):
+    """Options of a world: hashable, picklable, and able to build its scenes."""
+
+    def __hash__(self) -> int: ...
+
+    def scene(self, key: str) -> Scene:
+        """The scene of that name."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlannedPhoto:
+    """One photo of an album.
+
+    Attributes:
+        shot: camera, pose, time, name within the album's folder. Its gps_enu is not used.
+        scene: key of the scene that it shows.
+        fact: what is true of it.
+        geotag: what it claims, or None.
+        exif: full, no_gps (the position is in the table only), or none.
+        subject: what it shows.
+        edits: what was done to it afterwards.
+        quality: of the JPEG.
+        sensor: of its camera, as this person uses it.
+        orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
+    """
+
+    shot: Shot
+    scene: str
+    fact: AlbumFact
+    geotag: Geotag | None = None
+    exif: ExifPolicy = "full"
+    subject: Subject = "town"
+    edits: tuple[Edit, ...] = ()
+    quality: int = 90
+    sensor: SensorOptions = field(default_factory=SensorOptions)
+    orientation: int = 1
+
+
+def write_album(
+    folder: Path,
+    world: SceneSource,
+    home: Scene,
+    photos: Sequence[PlannedPhoto],
+    workers: int = 0,
+    progress: Progress | None = None,
+) -> Path:
+    """Write all photos, tables and truth into `folder`; files that are there already are kept.
+
+    Args:
+        home: the scene of the truth's frame: photos whose fact says `home` get a true pose in it.
+        workers: processes; 0 takes one per core.
+        progress: called with (files done, files in all).
+
+    Raises:
+        OSError: the folder cannot be written.
+        InvalidValueError: two photos of one name.
+    """
+    folder = Path(folder)
+    names = [photo.shot.name for photo in photos]
+    if len(set(names)) < len(names):
+        raise InvalidValueError("write_album: expected names that differ, found one twice")
+    for parent in {(folder / name).parent for name in names}:
+        parent.mkdir(parents=True, exist_ok=True)
+    # The same scenes lie together, so that a process paints few of them.
+    todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
+    there = len(photos) - len(todo)
+    for done, _ in enumerate(_run(folder, world, todo, workers), start=there + 1):
+        if progress is not None:
+            progress(done, len(photos))
+    truths = {p.shot.name: true for p in photos if (true := _truth(home, p)) is not None}
+    write_tables(folder, [(p.fact, p.geotag) for p in photos])
+    write_facts(folder, [p.fact for p in photos])
+    write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
+    return folder
+
+
+def album_is_complete(folder: Path) -> bool:
+    """Whether `write_album` came to its end here."""
+    return (Path(folder) / TRUTH_FILE).exists()
+
+
+def photo_file(scene: Scene, photo: PlannedPhoto) -> bytes:
+    """The JPEG file of a planned photo."""
+    image = edited(_picture(scene, photo), photo.edits, photo.shot.seed)
+    return jpeg_bytes(image, photo.quality, _exif(photo, image))
+
+
+def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
+    if not photo.fact.home:
+        return None
+    camera = edited_camera(photo.shot.device.camera, photo.edits, photo.shot.seed)
+    if camera is None:
+        return None
+    shot = replace(photo.shot, device=replace(photo.shot.device, camera=camera), gps_enu=None)
+    return true_image(home, shot)
+
+
+def _picture(scene: Scene, photo: PlannedPhoto) -> Image8:
+    if photo.subject == "indoor":
+        return indoor_photo(scene, photo.shot.device, photo.shot.seed, photo.sensor)
+    if photo.subject == "portrait":
+        return portrait_photo(scene, photo.shot.device, photo.shot.seed, photo.sensor)
+    return take_photo(scene, photo.shot, photo.sensor)
+
+
+def _exif(photo: PlannedPhoto, image: Image8) -> Image.Exif | None:
+    """EXIF as it is after the edits: editors write the new size and keep the rest."""
+    if photo.exif == "none":
+        return None
+    tag = photo.geotag if photo.exif == "full" else None
+    position = None if tag is None else (tag.latitude_deg, tag.longitude_deg, tag.height_m or 0.0)
+    exif = exif_of(photo.shot, position)
+    exif[ExifTags.Base.Orientation.value] = photo.orientation
+    exif[ExifTags.Base.Artist.value] = photo.fact.owner
+    exif[ExifTags.Base.Copyright.value] = photo.fact.licence
+    details = exif.get_ifd(ExifTags.IFD.Exif)
+    details[ExifTags.Base.ExifImageWidth.value] = image.shape[1]
+    details[ExifTags.Base.ExifImageHeight.value] = image.shape[0]
+    if tag is not None:
+        gps = exif.get_ifd(ExifTags.IFD.GPSInfo)
+        if tag.height_m is None:
+            for key in (ExifTags.GPS.GPSAltitude, ExifTags.GPS.GPSAltitudeRef):
+                gps.pop(key.value, None)
+        if tag.accuracy_m is not None:
+            gps[ExifTags.GPS.GPSHPositioningError.value] = float(tag.accuracy_m)
+    return exif
+
+
+def _run(folder: Path, world: SceneSource, todo: list[PlannedPhoto], workers: int) -> Iterator[str]:
+    """Write each photo, in a pool of processes (or here, for one worker); names as they are done."""
+    count = min(workers or os.cpu_count() or 1, len(todo))
+    if count <= 1:
+        for photo in todo:
+            yield _write(folder, world, photo)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
+        for future in as_completed([pool.submit(_write, folder, world, photo) for photo in todo]):
+            yield future.result()
+
+
+def _one_thread() -> None:
+    cv2.setNumThreads(1)
+
+
+@lru_cache(maxsize=4)
+def _scene(world: SceneSource, key: str) -> Scene:
+    return world.scene(key)
+
+
+def _write(folder: Path, world: SceneSource, photo: PlannedPhoto) -> str:
+    """Write one file under its name by renaming, so that a file that is there is whole."""
+    target = folder / photo.shot.name
+    partial = target.with_suffix(f".{os.getpid()}.part")
+    partial.write_bytes(photo_file(_scene(world, photo.scene), photo))
+    partial.replace(target)
+    return photo.shot.name

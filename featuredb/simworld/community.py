@@ -1,0 +1,266 @@
+"""A community's photos of a town that a survey has mapped in part: twelve owners, two years, the rest.
+
+Kinds of photos (`AlbumFact.kind`): survey; street, drone (the town's own, what growth is measured on);
+other_town; copy (a re-upload by somebody else); indoor, portrait (belong nowhere).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.edits import Edit
+from featuredb.simworld.flight import FlightOptions
+from featuredb.simworld.gathering import named, plan_visits, tagged
+from featuredb.simworld.geotags import GeotagOptions, geotag_at
+from featuredb.simworld.people import Person, community
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.shot import Shot, look_pose
+from featuredb.simworld.surveyed import (
+    DAYS,
+    day_scene,
+    moment,
+    photo_ids,
+    shot_seed,
+    survey_photos,
+)
+from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+
+_OTHER_SEED = 1000
+_TAGGED_HERE, _TAGGED_THERE = (
+    0.6,
+    0.8,
+)  # of another town's photos: claimed here; at their own place; rest none
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommunityOptions:
+    """What to write. The same options give the same bytes.
+
+    Attributes:
+        seed: of everything. town_size_m: width and height of the town.
+        flight: the anchored survey; it covers the part of the town that most people visit.
+        photos: of the town, by the twelve. other_town: photos of another town.
+        copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
+        sights: places that people visit.
+        width: of the widest camera, pixels.
+        geotags: how wrong they are.
+        texel_m: resolution of the painted ground.
+    """
+
+    seed: int = 1
+    town_size_m: tuple[float, float] = (440.0, 350.0)
+    flight: FlightOptions = field(
+        default_factory=lambda: FlightOptions(
+            lines=7, per_line=11, oblique=12, gps_error="rtk", center_m=(-50.0, 15.0)
+        )
+    )
+    photos: int = 300
+    other_town: int = 100
+    copies: int = 40
+    indoor: int = 12
+    portraits: int = 12
+    sights: int = 30
+    width: int = 1600
+    geotags: GeotagOptions = field(default_factory=GeotagOptions)
+    texel_m: float = 0.06
+
+    def __post_init__(self) -> None:
+        if min(self.photos, self.other_town, self.copies, self.indoor, self.portraits) < 0:
+            raise InvalidValueError(f"CommunityOptions: expected numbers >= 0, found {self}")
+        if not (self.sights > 0 and self.width >= 64):
+            raise InvalidValueError(f"CommunityOptions: value out of range in {self}")
+
+    @classmethod
+    def short(cls, seed: int = 1) -> "CommunityOptions":
+        """A small town with a tenth of the photos, for a first look in minutes."""
+        return cls(
+            seed=seed,
+            town_size_m=(260.0, 230.0),
+            flight=FlightOptions(
+                lines=4, per_line=6, oblique=4, width=1200, gps_error="rtk", center_m=(-25.0, 10.0)
+            ),
+            photos=48,
+            other_town=12,
+            copies=6,
+            indoor=2,
+            portraits=2,
+            sights=6,
+            width=1200,
+        )
+
+    def scene(self, key: str) -> Scene:
+        """Scenes "home/light/week" and "away/light/week"."""
+        return day_scene(_base(self, key.split("/")[0]), key)
+
+
+@lru_cache(maxsize=4)
+def _base(options: CommunityOptions, town: str) -> Scene:
+    if town == "home":
+        return make_town(options.seed, size_m=options.town_size_m, texel_m=options.texel_m)
+    return make_town(
+        options.seed + _OTHER_SEED,
+        name="other town",
+        size_m=options.town_size_m,
+        place=OTHER_TOWN_PLACE,
+        texel_m=options.texel_m,
+    )
+
+
+def write_community(
+    folder: Path, options: CommunityOptions, workers: int = 0, progress: Progress | None = None
+) -> Path:
+    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    if album_is_complete(folder):
+        return Path(folder)
+    home = options.scene("home/0/000")
+    photos = survey_photos(home, options.flight, options.seed) + plan_community(options)
+    return write_album(folder, options, home, photos, workers, progress)
+
+
+def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
+    """All photos but the survey's."""
+    home, away = options.scene("home/0/000"), options.scene("away/0/000")
+    people = community(options.width)
+    center = options.flight.center_m
+    mine = plan_visits(
+        home, people, options.photos, options.seed, "home", sights=options.sights, center=center
+    )
+    theirs = plan_visits(
+        away,
+        people[:8],
+        options.other_town,
+        options.seed + 1,
+        "away",
+        sights=options.sights,
+        first_visit=10_000,
+    )
+    rng = np.random.default_rng((options.seed, 58))
+    mine = tagged(home, mine, people, options.geotags, rng)
+    theirs = _other_tags(home, away, theirs, options.geotags, rng)
+    copies = plan_copies(mine, people, options.copies, options.seed)
+    nowhere = _plan_nowhere(options, people, home)
+    return named([*mine, *theirs, *copies, *nowhere], options.seed)
+
+
+def _other_tags(
+    home: Scene, away: Scene, photos: list[PlannedPhoto], options: GeotagOptions, rng: np.random.Generator
+) -> list[PlannedPhoto]:
+    """Another town's photos: most claim to be of this one, visit by visit; some say where they are."""
+    place_of: dict[int, tuple[float, FloatArray]] = {}
+    result = []
+    for p in photos:
+        half = 0.4 * np.asarray(home.plan.size)
+        drawn = float(rng.random()), np.array([*rng.uniform(-half, half), 2.0])
+        fate, spot = place_of.setdefault(p.fact.visit, drawn)
+        accuracy = float(np.round(options.sigma_m)) if rng.random() < options.accuracy_share else None
+        jitter = np.array([*rng.normal(0, 0.5 * options.sigma_m, 2), 0.0])
+        if fate < _TAGGED_HERE:
+            tag = geotag_at(home, home.enu_from_town @ spot + jitter, 0.0, accuracy)
+            result.append(replace(p, geotag=tag, fact=replace(p.fact, geotag="far")))
+        elif fate < _TAGGED_THERE:
+            tag = geotag_at(away, p.shot.cam_from_local.center + jitter, 0.0, accuracy)
+            result.append(replace(p, geotag=tag))
+        else:
+            result.append(replace(p, fact=replace(p.fact, geotag="none")))
+    return result
+
+
+def plan_copies(
+    photos: list[PlannedPhoto], people: tuple[Person, ...], count: int, seed: int
+) -> list[PlannedPhoto]:
+    """Re-uploads of some of the photos by other people: smaller, re-encoded, marked, framed, cut."""
+    rng = np.random.default_rng((seed, 53))
+    ways: tuple[Callable[[], tuple[Edit, ...]], ...] = (
+        tuple,  # encoded again, nothing else
+        lambda: (Edit(kind="resized", amount=float(rng.uniform(0.4, 0.75))),),
+        lambda: (Edit(kind="watermarked", amount=0.4, text="repost"),),
+        lambda: (Edit(kind="bordered", amount=float(rng.uniform(0.015, 0.05))),),
+        lambda: (
+            Edit(kind="cropped", amount=float(rng.uniform(0.1, 0.3))),
+            Edit(kind="resized", amount=0.7),
+        ),
+    )
+    copies = []
+    for i, row in enumerate(rng.choice(len(photos), min(count, len(photos)), replace=False)):
+        original = photos[int(row)]
+        others = [p for p in people if p.name != original.fact.owner]
+        owner = others[int(rng.integers(len(others)))]
+        name = f"copy-{i}"
+        keeps_tag = original.geotag is not None and rng.random() < 0.4
+        copies.append(
+            replace(
+                original,
+                shot=replace(original.shot, name=name),
+                edits=original.edits + ways[i % len(ways)](),
+                quality=int(rng.integers(60, 82)),
+                exif="none",
+                geotag=original.geotag if keeps_tag else None,
+                fact=replace(
+                    original.fact,
+                    name=name,
+                    kind="copy",
+                    owner=owner.name,
+                    licence=owner.licence,
+                    copy_of=original.shot.name,
+                    geotag=original.fact.geotag if keeps_tag else "none",
+                    title="found this",
+                ),
+            )
+        )
+    return copies
+
+
+def _plan_nowhere(options: CommunityOptions, people: tuple[Person, ...], home: Scene) -> list[PlannedPhoto]:
+    """Rooms and faces, tagged with the town as everything on such a phone is."""
+    rng = np.random.default_rng((options.seed, 54))
+    walkers = [p for p in people if p.ground is not None]
+    subjects: list[Subject] = ["indoor"] * options.indoor + ["portrait"] * options.portraits  # type: ignore[assignment]
+    photos = []
+    for i, subject in enumerate(subjects):
+        person = walkers[int(rng.integers(len(walkers)))]
+        assert person.ground is not None
+        name, half = f"nowhere-{i}", 0.4 * np.asarray(home.plan.size)
+        spot = home.enu_from_town @ np.array([*rng.uniform(-half, half), 2.0])
+        has_tag = rng.random() < person.tags
+        shot = Shot(
+            name=name,
+            device=person.ground,
+            cam_from_local=look_pose(spot, 0.0, 0.0),
+            time=moment(int(rng.integers(DAYS)), float(rng.uniform(8, 22))),
+            seed=shot_seed(options.seed, 5, i),
+        )
+        fact = AlbumFact(
+            name=name,
+            photo_id="",
+            kind=subject,
+            owner=person.name,
+            licence=person.licence,
+            title="at home" if subject == "indoor" else "me",
+            time=shot.time,
+            home=False,
+            geotag="near" if has_tag else "none",
+        )
+        photos.append(
+            PlannedPhoto(
+                shot=shot,
+                scene="home/0/000",
+                fact=fact,
+                geotag=geotag_at(home, spot, 0.0, None) if has_tag else None,
+                exif=person.exif,
+                subject=subject,
+                quality=person.quality,
+                sensor=person.sensor,
+            )
+        )
+    return photos

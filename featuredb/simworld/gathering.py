@@ -1,0 +1,152 @@
+"""Photos that people take of a town: visits to sights, then geotags, numbers and file names."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.simworld.album import PlannedPhoto
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.edits import Edit
+from featuredb.simworld.geotags import GeotagOptions, Tagging, give_geotags
+from featuredb.simworld.people import Person
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.shot import Shot
+from featuredb.simworld.sights import Sight, Surroundings, find_sights
+from featuredb.simworld.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
+from featuredb.simworld.visits import drone_visit, ground_visit
+
+_VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photographed by these people
+
+
+def plan_visits(
+    scene: Scene,
+    people: tuple[Person, ...],
+    count: int,
+    seed: int,
+    town: str,
+    *,
+    sights: int,
+    center: tuple[float, float] = (0.0, 0.0),
+    first_visit: int = 0,
+) -> list[PlannedPhoto]:
+    """`count` photos of a town by these people, visit by visit; without geotags, under provisional names.
+
+    Everybody goes to the popular sights, and each has a taste of his own.
+    """
+    rng = np.random.default_rng((seed, 52))
+    places = find_sights(scene, sights, seed, center)
+    if not places:
+        raise InvalidValueError(f"plan_visits: no sight of {scene.name} can be photographed")
+    around = Surroundings(scene)
+    weights = np.array([p.weight for p in people])
+    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * [s.weight**0.7 for s in places]
+    photos: list[PlannedPhoto] = []
+    visit = first_visit
+    while len(photos) < count:
+        who = int(rng.choice(len(people), p=weights / weights.sum()))
+        where = int(rng.choice(len(places), p=taste[who] / taste[who].sum()))
+        taken = _visit(scene, people[who], places[where], around, visit, seed, town, rng)
+        photos += taken[: count - len(photos)]
+        visit += 1
+        if visit - first_visit > _VISIT_TRIES * max(count, 50):
+            raise InvalidValueError(
+                f"plan_visits: only {len(photos)} of {count} photos came of {visit} visits"
+            )
+    return photos
+
+
+def _visit(
+    scene: Scene,
+    person: Person,
+    sight: Sight,
+    around: Surroundings,
+    visit: int,
+    seed: int,
+    town: str,
+    rng: np.random.Generator,
+) -> list[PlannedPhoto]:
+    by_drone = person.drone is not None and (person.ground is None or rng.random() < person.drone_share)
+    count = int(rng.integers(4, 10)) if by_drone else int(rng.integers(1, 7))
+    views = (drone_visit if by_drone else ground_visit)(person, sight, around, count, rng)
+    day, hour = int(rng.integers(DAYS)), float(rng.uniform(8.0, 19.0))
+    photos = []
+    for i, view in enumerate(views):
+        name = f"{town}-{visit}-{i}"
+        shot = Shot(
+            name=name,
+            device=view.device,
+            cam_from_local=view.cam_from_local,
+            time=moment(day, hour + 0.01 * i),
+            seed=shot_seed(seed, 4, visit, i),
+        )
+        crop = Edit(kind="cropped", amount=float(rng.uniform(0.08, 0.25)))
+        fact = AlbumFact(
+            name=name,
+            photo_id="",
+            kind=("drone" if by_drone else "street") if town == "home" else "other_town",
+            owner=person.name,
+            licence=person.licence,
+            title=f"{sight.name.split()[0]}, {shot.time:%B %Y}",
+            time=shot.time,
+            home=town == "home",
+            visit=visit,
+            place=f"{sight.name}, {view.mode}",
+        )
+        photos.append(
+            PlannedPhoto(
+                shot=shot,
+                scene=day_key(town, day, hour),
+                fact=fact,
+                exif=person.exif,
+                edits=(*([crop] if rng.random() < person.crop_share else []), *person.edits),
+                quality=person.quality,
+                sensor=person.sensor,
+                orientation=view.orientation,
+            )
+        )
+    return photos
+
+
+def tagged(
+    scene: Scene,
+    photos: list[PlannedPhoto],
+    people: tuple[Person, ...],
+    options: GeotagOptions,
+    rng: np.random.Generator,
+) -> list[PlannedPhoto]:
+    """The photos with their geotags."""
+    by_name = {p.name: p for p in people}
+    asked = [
+        Tagging(
+            center=p.shot.cam_from_local.center,
+            visit=p.fact.visit,
+            tagged=bool(rng.random() < by_name[p.fact.owner].tags),
+            by_hand=by_name[p.fact.owner].by_hand,
+        )
+        for p in photos
+    ]
+    given = give_geotags(scene, asked, options, rng)
+    return [
+        replace(p, geotag=tag, fact=replace(p.fact, geotag=state))
+        for p, (tag, state) in zip(photos, given, strict=True)
+    ]
+
+
+def named(photos: list[PlannedPhoto], seed: int) -> list[PlannedPhoto]:
+    """The photos with numbers and file names that give nothing away; copies name their originals."""
+    ids = photo_ids(seed, len(photos))
+    names = {p.shot.name: f"photos/{p.fact.owner}/{i}.jpg" for p, i in zip(photos, ids, strict=True)}
+    return [
+        replace(
+            p,
+            shot=replace(p.shot, name=names[p.shot.name]),
+            fact=replace(
+                p.fact,
+                name=names[p.shot.name],
+                photo_id=photo_id,
+                copy_of=names.get(p.fact.copy_of, ""),
+            ),
+        )
+        for p, photo_id in zip(photos, ids, strict=True)
+    ]

@@ -1,0 +1,78 @@
+"""What worlds of contributed photos share: a town on many days, and the anchored survey of a part of it."""
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from functools import lru_cache
+
+import numpy as np
+
+from featuredb.simworld.album import PlannedPhoto
+from featuredb.simworld.album_files import AlbumFact, Geotag
+from featuredb.simworld.days import DayOptions, another_day
+from featuredb.simworld.flight import FlightOptions, survey
+from featuredb.simworld.scene import Scene
+
+# Suns by the hour, town axes; index 0 is the scene's own.
+_SUNS = (None, (0.62, -0.42, 0.62), (0.10, -0.55, 0.83), (-0.66, -0.30, 0.55))
+_SEASONS = ((1.0, 1.0, 1.0), (1.05, 1.08, 0.9), (1.35, 0.95, 0.6), (0.9, 0.95, 0.9))
+_FIRST = datetime(2024, 3, 2, 0, 0, tzinfo=UTC)
+DAYS = 730
+
+
+def day_key(town: str, day: int, hour: float) -> str:
+    """Key of the scene of a town on a day (0 to 729) at an hour; sorts by what is dear to paint.
+
+    Days of a week share their parked cars.
+    """
+    light = 1 if hour < 11 else 2 if hour < 15 else 3
+    return f"{town}/{light}/{day // 7:03d}"
+
+
+def day_scene(base: Scene, key: str) -> Scene:
+    """The scene of a key made by `day_key`; "town/0/000" is the base itself."""
+    _, light, week = key.split("/")
+    sun = _SUNS[int(light)]
+    if sun is None:
+        return base
+    season = _SEASONS[(int(week) // 13) % 4]
+    return another_day(base, DayOptions(seed=int(week) + 1, to_sun=sun, leaf_tint=season))
+
+
+def moment(day: int, hour: float) -> datetime:
+    """Time of a day of the two years."""
+    return _FIRST + timedelta(days=day, hours=hour)
+
+
+def survey_photos(
+    scene: Scene, flight: FlightOptions, seed: int, *, folder: str = "survey", town: str = "home"
+) -> list[PlannedPhoto]:
+    """An anchored survey as planned photos: full EXIF, positions as its receiver believes them."""
+    photos = []
+    for i, shot in enumerate(survey(scene, flight, seed)):
+        shot = replace(shot, name=f"{folder}/SW_{i + 1:04d}.jpg")
+        assert shot.gps_enu is not None
+        latitude, longitude, height = scene.frame.geodetic_from_enu(shot.gps_enu)
+        fact = AlbumFact(
+            name=shot.name,
+            photo_id=f"{folder}-{i + 1}",
+            kind="survey",
+            owner="survey office",
+            licence="CC-BY-4.0",
+            title=f"survey photo {i + 1}",
+            time=shot.time,
+        )
+        tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))
+        photos.append(PlannedPhoto(shot=shot, scene=f"{town}/0/000", fact=fact, geotag=tag))
+    return photos
+
+
+def shot_seed(seed: int, *what: int) -> int:
+    """Seed of one shot."""
+    return int(np.random.SeedSequence((seed, *what)).generate_state(1)[0])
+
+
+@lru_cache(maxsize=64)
+def photo_ids(seed: int, count: int) -> tuple[str, ...]:
+    """Numbers as a photo site gives them, all different."""
+    rng = np.random.default_rng((seed, 57))
+    return tuple(str(n) for n in rng.choice(900_000_000, count, replace=False) + 100_000_000)
