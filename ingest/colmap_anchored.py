@@ -190,7 +190,26 @@ def _reconstruction(
     fixed_ids = _add_points(
         reconstruction, fixed.xyz, fixed.point_of[held], fixed.photo_of[held], place[held]
     )
+    _add_onlooker(reconstruction, list(fixed_ids.values()), len(model.cameras) + 1, len(model.rows) + 1)
     return reconstruction, free_ids, list(fixed_ids.values())
+
+
+def _add_onlooker(reconstruction: Any, point_ids: list[int], camera_id: int, image_id: int) -> None:
+    """An image outside the problem that sees the points of one photo: COLMAP wants two views of each.
+
+    Point, pose and lens of these residuals are constant, so they change nothing.
+    """
+    single = [p for p in point_ids if reconstruction.point3D(p).track.length() == 1]
+    if not single:
+        return
+    lens = Camera.from_focal(100, 100, 100.0, "SIMPLE_PINHOLE")
+    reconstruction.add_camera_with_trivial_rig(lens.to_pycolmap(camera_id))
+    image = pycolmap.Image(
+        name="onlooker", keypoints=np.zeros((len(single), 2)), camera_id=camera_id, image_id=image_id
+    )
+    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for k, point_id in enumerate(single):
+        reconstruction.add_observation(point_id, pycolmap.TrackElement(image_id, k))
 
 
 def _add_points(
