@@ -35,6 +35,12 @@ def register(subparsers: Any) -> None:
     serve.add_argument("--workers", type=int, default=2, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, default=32, help="queries that may wait; default 32")
     serve.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="per query; default 8")
+    serve.add_argument(
+        "--contributions",
+        choices=("on", "off"),
+        default="on",
+        help="take photos that clients contribute, with owner and licence, into a bounded inbox; default on",
+    )
     serve.set_defaults(run=_serve)
 
     query = subparsers.add_parser(
@@ -45,6 +51,16 @@ def register(subparsers: Any) -> None:
     query.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect")
     query.add_argument("--database", metavar="NAME", help="default: the only one that is served")
     query.add_argument("--timeout", type=float, default=10.0, metavar="SECONDS", help="per image; default 10")
+    query.add_argument(
+        "--contribute",
+        action="store_true",
+        help="give the photos to the database, so that its maps can grow; needs --owner and --licence",
+    )
+    query.add_argument("--owner", metavar="NAME", help="whose photos they are")
+    query.add_argument("--licence", metavar="TERMS", help="under what terms they are given, e.g. CC-BY-4.0")
+    query.add_argument(
+        "--client-id", metavar="NAME", help="what this client calls itself; kept with the photos"
+    )
     _add_query_arguments(query)
     query.set_defaults(run=_query)
 
@@ -99,6 +115,7 @@ def _serve(args: argparse.Namespace) -> int:
         workers=args.workers,
         max_queue=args.max_queue,
         deadline_s=args.deadline,
+        contributions=args.contributions == "on",
     )
     database = open_database(args)
     log_to(sys.stderr)
@@ -121,6 +138,10 @@ def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
 
     prior, camera = _parse_prior(args.prior), _parse_camera(args.camera)
+    if args.contribute and not (args.owner and args.licence):
+        raise InvalidValueError(
+            "--contribute: expected --owner and --licence, too: whose photos they are, and under what terms"
+        )
     with Client(args.connect, args.database, config_path=args.config) as client:
 
         def ask(data: bytes) -> "LocaliseReply":
@@ -132,6 +153,10 @@ def _query(args: argparse.Namespace) -> int:
                 inliers=args.overlay is not None,
                 exif_prior=args.exif_prior,
                 maps=tuple(args.map) if args.map else None,
+                contribute=args.contribute,
+                owner=args.owner,
+                licence=args.licence,
+                client_id=args.client_id,
             )
 
         return _answer_all(args, ask)

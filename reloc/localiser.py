@@ -1,8 +1,8 @@
 """The active maps of one snapshot, indexed and ready to answer."""
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import load_or_build
+from featuredb.maps.lineage import Lineage
 from featuredb.store import Database, MapSummary, Snapshot
 from reloc.candidates import IndexedArea
 from reloc.localise import localise
@@ -38,10 +39,18 @@ class _Loaded:
 class Localiser:
     """Answers queries from one snapshot. Never changes; threads may share it."""
 
-    def __init__(self, loaded: Sequence[_Loaded], options: LocaliseOptions, snapshot: int) -> None:
+    def __init__(
+        self,
+        loaded: Sequence[_Loaded],
+        options: LocaliseOptions,
+        snapshot: int,
+        lineages: Mapping[str, Lineage],
+    ) -> None:
         self._loaded = tuple(loaded)
         self._options = options
         self._snapshot = snapshot
+        # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
+        self._lineages = dict(lineages)
 
     @classmethod
     def open(
@@ -52,6 +61,7 @@ class Localiser:
         *,
         previous: "Localiser | None" = None,
         cache: Path | None = None,
+        also: Collection[str] = (),
     ) -> "Localiser":
         """Load and index the active maps of a snapshot.
 
@@ -59,19 +69,21 @@ class Localiser:
             as_of: snapshot number or time; None: the newest.
             previous: areas that have not changed since are taken over from it.
             cache: folder for index files of large areas; None: indexes live in memory only.
+            also: quarantined maps that take part as if they were active: a trial before they are.
 
         Raises:
             StoreError: the database cannot be read.
         """
         options = options or LocaliseOptions()
         snapshot = database.snapshot(as_of)
-        active = [m for m in snapshot.maps() if m.status == "active" and m.descriptors and m.box]
+        taken = [m for m in snapshot.maps() if m.status == "active" or m.map_id in also]
+        active = [m for m in taken if m.descriptors and m.box]
         known = {loaded.key: loaded for loaded in previous._loaded} if previous else {}
         loaded = []
         for group in _group(active):
             key = tuple(sorted(m.write_id for m in group))
             loaded.append(known[key] if key in known else _load(snapshot, group, key, cache))
-        return cls(loaded, options, snapshot.version)
+        return cls(loaded, options, snapshot.version, snapshot.lineages())
 
     @property
     def snapshot(self) -> int:
@@ -82,6 +94,14 @@ class Localiser:
     def areas(self) -> tuple[IndexedArea, ...]:
         """All areas, of whatever extractor."""
         return tuple(loaded.indexed for loaded in self._loaded)
+
+    def areas_of(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
+        """All areas, or areas of the named maps only.
+
+        Raises:
+            MapNotFoundError: the snapshot serves no such map.
+        """
+        return self._chosen(map_ids)
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         """Pose of the image (h, w) uint8, or the reason why there is none.
@@ -100,7 +120,25 @@ class Localiser:
                 f"the maps were made by extractor {found}, queries here use {fingerprint}: descriptors "
                 "cannot be compared; start the server with the extractor options of the ingest"
             )
-        return localise(gray, request, matching, self._options, self._snapshot)
+        return self.with_lineage(localise(gray, request, matching, self._options, self._snapshot))
+
+    def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
+        """The result of one of the areas, with the chain to its anchors for each map that answered."""
+        if result.pose is None:
+            return result
+        told = []
+        for entry in result.pose.lineage:
+            lineage = self._lineages[entry["map_id"]]
+            told.append(
+                {
+                    **entry,
+                    "steps": lineage.steps,
+                    "anchors": list(lineage.anchors),
+                    "drift_m": lineage.drift_m,
+                    "budget_m": lineage.budget_m,
+                }
+            )
+        return replace(result, pose=replace(result.pose, lineage=tuple(told)))
 
     def _chosen(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
         """The areas, or new ones of the named maps only."""

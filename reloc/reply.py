@@ -104,6 +104,10 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
                 method=str(entry["method"]),
                 generation=int(entry["generation"]),
                 parents=tuple(entry["parents"]),
+                steps=entry.get("steps"),
+                anchors=tuple(entry.get("anchors", ())),
+                drift_m=entry.get("drift_m"),
+                budget_m=entry.get("budget_m"),
             )
             for map_id, entry in zip(pose.map_ids, pose.lineage, strict=True)
         ),

@@ -88,7 +88,8 @@ class LocalisedPose:
         height_datum: datum of the heights, as the maps have it.
         horizontal_68_m, vertical_68_m, orientation_68_deg: radii that hold 68 % of the errors.
         map_ids: maps whose points are among the inliers, most inliers first.
-        lineage: for each of map_ids, what placed it: method, generation, parents.
+        lineage: for each of map_ids, what placed it: method, generation, parents; from a `Localiser`, which
+            knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
         residual_rms_px: of the inliers, in full-size pixels.
     """
 

@@ -1,4 +1,4 @@
-"""The messages on the wire: request attachment, reply, error, status, maps and events.
+"""The messages of a query on the wire: request attachment, reply, error.
 
 Models check untrusted text; `schemas/wire/*.json` says the same for other languages, and a test holds
 both together. A request refuses unknown fields, so that a misspelt option is not ignored silently. A
@@ -43,11 +43,15 @@ class _Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-class _Answer(BaseModel):
+class Answer(BaseModel):
+    """Base of what a server sends."""
+
     model_config = ConfigDict(extra="ignore", frozen=True, strict=True, allow_inf_nan=False)
 
 
 RequestId = Annotated[str, Field(pattern=r"^[A-Za-z0-9._:-]{1,128}$")]
+# Names of people and terms: no control characters, since terminals and logs show them.
+Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]{0,199}$")]
 # Wide enough for any camera; a value outside is a unit mistake or nonsense.
 CameraParam = Annotated[float, Field(ge=-1e6, le=1e6)]
 Side = Annotated[int, Field(ge=1, le=65_535)]
@@ -103,10 +107,23 @@ class LocaliseWireRequest(_Request):
     camera: CameraRequest | None = None
     prior: PriorRequest | None = None
     contribute: bool = False
+    owner: Name | None = None
+    licence: Name | None = None
+    client_id: Name | None = None
     options: RequestOptions = RequestOptions()
 
+    @model_validator(mode="after")
+    def _terms_of_a_gift(self) -> "LocaliseWireRequest":
+        missing = [name for name in ("owner", "licence") if getattr(self, name) is None]
+        if self.contribute and missing:
+            raise ValueError(
+                f"contribute: expected {' and '.join(missing)}, too: whose photo it is, and under what terms "
+                "it is given"
+            )
+        return self
 
-class Position(_Answer):
+
+class Position(Answer):
     """OGC GeoPose position: WGS84 degrees, metres."""
 
     lat: Annotated[float, Field(ge=-90, le=90)]
@@ -114,7 +131,7 @@ class Position(_Answer):
     h: float
 
 
-class Quaternion(_Answer):
+class Quaternion(Answer):
     """OGC GeoPose orientation: body axes to local east-north-up at the position."""
 
     x: float
@@ -123,7 +140,7 @@ class Quaternion(_Answer):
     w: float
 
 
-class UtmPose(_Answer):
+class UtmPose(Answer):
     """Camera centre in UTM metres and rotation of grid axes (east, north, up) into camera axes."""
 
     epsg: int
@@ -133,7 +150,7 @@ class UtmPose(_Answer):
     cam_from_utm_xyzw: Quaternion4
 
 
-class Accuracy(_Answer):
+class Accuracy(Answer):
     """Radii that hold 68 % of the errors."""
 
     horizontal_68_m: NotNegative
@@ -141,7 +158,7 @@ class Accuracy(_Answer):
     orientation_68_deg: NotNegative
 
 
-class CameraUsed(_Answer):
+class CameraUsed(Answer):
     """Intrinsics that the pose was computed with, and where they came from."""
 
     model: str
@@ -151,16 +168,23 @@ class CameraUsed(_Answer):
     source: Literal["request", "map", "exif", "estimated"]
 
 
-class Lineage(_Answer):
-    """What placed a map on Earth."""
+class Lineage(Answer):
+    """What placed a map on Earth.
+
+    `steps` placements lie between it and the nearest of its `anchors`, which measured their own place.
+    """
 
     map_id: str
     method: str
     generation: Count
     parents: tuple[str, ...]
+    steps: Count | None = None
+    anchors: tuple[str, ...] = ()
+    drift_m: NotNegative | None = None
+    budget_m: NotNegative | None = None
 
 
-class RunnerUpPose(_Answer):
+class RunnerUpPose(Answer):
     """The best pose elsewhere, which did not win."""
 
     inliers: Count
@@ -170,12 +194,24 @@ class RunnerUpPose(_Answer):
     lon: float
 
 
-class InlierPoints(_Answer):
+class InlierPoints(Answer):
     """Evidence, on request: k pixels of the query, the UTM points they saw, and the row in `maps` of each."""
 
     pixels: tuple[Pair, ...]
     utm: tuple[Triple, ...]
     map_rows: tuple[Count, ...]
+
+
+ContributionReason = Literal["QUEUE_FULL", "OWNER_LIMIT", "INBOX_FULL", "STORE_FAILED"]
+
+
+class ContributionReply(Answer):
+    """What became of a contributed photo: queued for the inbox, or not taken and why."""
+
+    accepted: bool
+    candidate_id: str | None
+    reason: ContributionReason | None
+    detail: str
 
 
 ReasonText = Literal[
@@ -188,7 +224,7 @@ ReasonText = Literal[
 ]
 
 
-class LocaliseReply(_Answer):
+class LocaliseReply(Answer):
     """The answer to a localise query; the pose's fields are null when it is not localised."""
 
     status: Literal["localised", "not_localised"]
@@ -214,6 +250,7 @@ class LocaliseReply(_Answer):
     snapshot: Count
     timings_ms: dict[str, NotNegative]
     request_id: str
+    contribution: ContributionReply | None = None
 
     @model_validator(mode="after")
     def _pose_or_reason(self) -> "LocaliseReply":
@@ -225,114 +262,12 @@ class LocaliseReply(_Answer):
         return self
 
 
-class ErrorReply(_Answer):
+class ErrorReply(Answer):
     """Payload of `reply_err`."""
 
     code: str
     message: str
     request_id: str | None
-
-
-class QueueStatus(_Answer):
-    length: Count
-    capacity: Count
-    workers: Count
-    busy: Count
-
-
-class Latency(_Answer):
-    """Milliseconds from receipt to reply over the latest answered queries; null before the first."""
-
-    count: Count
-    p50: NotNegative | None
-    p90: NotNegative | None
-    p99: NotNegative | None
-    max: NotNegative | None
-
-
-class QueryCounts(_Answer):
-    received: Count
-    localised: Count
-    not_localised: dict[str, Count]
-    errors: dict[str, Count]
-
-
-class ReloadStatus(_Answer):
-    """Hot reloads since the start; `error` is the latest failure while it lasts."""
-
-    count: Count
-    error: str | None
-
-
-class Limits(_Answer):
-    max_payload_bytes: Count
-    max_pixels: Count
-    deadline_s: NotNegative
-
-
-class StatusReply(_Answer):
-    """Answer of `.../status`."""
-
-    database: str
-    server_id: str
-    version: str
-    wire_version: str
-    snapshot: Count
-    maps: Count
-    uptime_s: NotNegative
-    queue: QueueStatus
-    queries: QueryCounts
-    latency_ms: Latency
-    reload: ReloadStatus
-    limits: Limits
-
-
-class BoundingBox(_Answer):
-    """WGS84 degrees."""
-
-    west: float
-    south: float
-    east: float
-    north: float
-
-
-class MapInfo(_Answer):
-    """One map that the server answers from."""
-
-    map_id: str
-    content_digest: str
-    name: str
-    epsg: int
-    height_datum: str
-    method: str
-    generation: Count
-    images: Count
-    points: Count
-    bounds: BoundingBox | None
-    tiles: tuple[str, ...]
-
-
-class MapsReply(_Answer):
-    """Answer of `.../maps`."""
-
-    database: str
-    snapshot: Count
-    maps: tuple[MapInfo, ...]
-
-
-EventType = Literal["map_committed", "map_retired", "reloaded", "reload_failed", "stopping"]
-
-
-class Event(_Answer):
-    """Publication on `.../events`."""
-
-    type: EventType
-    database: str
-    server_id: str
-    snapshot: Count
-    map_id: str | None
-    detail: str
-    time: str
 
 
 def parse_request(attachment: bytes | None) -> LocaliseWireRequest:

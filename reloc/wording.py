@@ -1,5 +1,6 @@
 """Answers in words for people."""
 
+from featuredb.maps.lineage import lineage_text
 from reloc.wire import LocaliseReply
 
 # What a person can do about each reason.
@@ -24,6 +25,7 @@ def describe(name: str, reply: LocaliseReply) -> str:
         return (
             f"{name}: not localised: {reply.reason} ({reply.detail})\n"
             f"  {reply.inliers} inliers, {reply.matches} matches, {reply.features} features, {total:.0f} ms\n"
+            f"{_contribution(reply)}"
             f"  try: {advice}\n"
         )
     utm, position, accuracy = reply.utm, reply.position, reply.accuracy
@@ -37,5 +39,25 @@ def describe(name: str, reply: LocaliseReply) -> str:
         f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
         f"{reply.residual_rms_px or 0.0:.2f} px, camera from {reply.camera.source}, "
         f"maps {', '.join(reply.maps)}\n"
+        f"{_lineage(reply)}"
+        f"{_contribution(reply)}"
         f"  time      {total:.0f} ms, snapshot {reply.snapshot}\n"
     )
+
+
+def _lineage(reply: LocaliseReply) -> str:
+    """What the first map, which most inliers lie on, stands on; nothing for an anchor of known place."""
+    first = reply.lineage[0] if reply.lineage else None
+    if first is None or (not first.steps and first.drift_m is None):
+        return ""
+    text = lineage_text(first.steps, first.anchors, first.drift_m, first.budget_m)
+    return f"  lineage   {text}\n"
+
+
+def _contribution(reply: LocaliseReply) -> str:
+    said = reply.contribution
+    if said is None:
+        return ""
+    if said.accepted:
+        return f"  given     candidate {said.candidate_id}\n"
+    return f"  not taken {said.reason}: {said.detail}\n"

@@ -37,7 +37,8 @@ def register(subparsers: Any) -> None:
         subparsers,
         "sql",
         run_sql,
-        "read by SQL (DuckDB): maps, images, cameras, points, observations, lidar, lidar_points",
+        "read by SQL (DuckDB): maps, images, cameras, points, observations, lidar, lidar_points, candidates, "
+        "canaries",
         epilog='example: featuredb sql DB "select tile, count(*) from points group by tile"; see docs/sql.md',
     )
     sql.add_argument("query", metavar="SELECT", help="one reading statement")
@@ -109,6 +110,8 @@ def run_verify(args: argparse.Namespace) -> int:
                 "version": report.version,
                 "maps": report.maps,
                 "scans": report.scans,
+                "candidates": report.candidates,
+                "canaries": report.canaries,
                 "files": report.files,
                 "rows": report.rows,
                 "problems": [{"where": p.where, "what": p.what} for p in report.problems],
@@ -122,7 +125,8 @@ def run_verify(args: argparse.Namespace) -> int:
         sys.stdout.write(f"orphan rows of write {orphan}: harmless, `featuredb vacuum` removes them\n")
     verdict = "sound" if report.ok else f"{len(report.problems)} problems"
     sys.stdout.write(
-        f"version {report.version}: {report.maps} maps, {report.scans} scans, {report.files} files, "
+        f"version {report.version}: {report.maps} maps, {report.scans} scans, "
+        f"{report.candidates} candidates, {report.canaries} canaries, {report.files} files, "
         f"{report.rows} rows: {verdict}\n"
     )
     return 0 if report.ok else 1

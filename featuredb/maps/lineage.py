@@ -7,7 +7,7 @@ evidence, under "growth", as the growth that made it has computed it.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -73,16 +73,23 @@ def trace(map_id: str, maps: Mapping[str, Described]) -> Lineage:
 
 def describe_lineage(lineage: Lineage) -> str:
     """In words: "3 steps from anchor A12, 0.31 of 0.50 m"."""
-    if lineage.steps is None:
+    return lineage_text(lineage.steps, lineage.anchors, lineage.drift_m, lineage.budget_m)
+
+
+def lineage_text(
+    steps: int | None, anchors: Sequence[str], drift_m: float | None, budget_m: float | None
+) -> str:
+    """As `describe_lineage`, from the figures of an answer."""
+    if steps is None or not anchors:
         text = "no chain to an anchor"
-    elif lineage.steps == 0:
+    elif steps == 0:
         text = "anchor"
     else:
-        text = f"{lineage.steps} step{'s' if lineage.steps > 1 else ''} from anchor {lineage.anchors[0]}"
-    if lineage.drift_m is None:
+        text = f"{steps} step{'s' if steps > 1 else ''} from anchor {anchors[0]}"
+    if drift_m is None:
         return text
-    of = "" if lineage.budget_m is None else f" of {lineage.budget_m:.2f}"
-    return f"{text}, {lineage.drift_m:.2f}{of} m"
+    of = "" if budget_m is None else f" of {budget_m:.2f}"
+    return f"{text}, {drift_m:.2f}{of} m"
 
 
 def drift_and_budget(evidence: Mapping[str, Any]) -> tuple[float | None, float | None]:

@@ -144,7 +144,7 @@ def standing_of(events: Sequence[Row], live_maps: Collection[str]) -> Standing:
     """The state that a candidate's events add up to.
 
     The latest refusal, withdrawal or opening decides, unless it was used after it: then it is used while one
-    of those maps lives, and waits again when none does. Whoever gives a withdrawn photo again opens it.
+    of those maps lives, and waits again when none does. Only giving a withdrawn photo again opens it.
 
     Args:
         events: of one candidate, in order.
@@ -155,7 +155,8 @@ def standing_of(events: Sequence[Row], live_maps: Collection[str]) -> Standing:
     for event in events:
         kind = event["event"]
         if kind == USED:
-            used.append(event["map_id"])
+            if latest is None or latest["event"] != WITHDRAWN:  # noted too late, the bytes are gone
+                used.append(event["map_id"])
         elif kind in (REFUSED, REOPENED, WITHDRAWN) or (latest is not None and latest["event"] == WITHDRAWN):
             latest, used = event, []
     if used:

@@ -7,12 +7,14 @@ from datetime import UTC, datetime, timedelta
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
+from featuredb.store.candidate_events import has_candidates
+from featuredb.store.candidate_upkeep import growth_tables, named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows, write_time
 from featuredb.store.database import Database
 from featuredb.store.delta import Commit, Table, retry_stale
 from featuredb.store.scans import has_scans, retired_since, scan_rows
-from featuredb.store.tables import CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
+from featuredb.store.tables import CANDIDATE_IMAGES, CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,7 +23,8 @@ class VacuumOptions:
 
     Attributes:
         history_h: snapshots that were newest within this time stay readable. 30 days: long enough to notice
-            that a merge was wrong and to roll it back.
+            that a merge was wrong and to roll it back. Images of contributed photos that were refused stay as
+            long, for those who ask why.
         orphan_grace_h: child rows without a map stay this long, since a running commit may be about to name
             them. A day; commits give up after six hours. Take less only where nobody else writes.
         file_grace_h: files that no snapshot uses stay this long for readers that have opened them. A day.
@@ -39,11 +42,13 @@ class VacuumReport:
     Attributes:
         kept_from: oldest version that stays readable.
         write_ids: of child rows that no kept version names.
+        candidate_images: ids of contributed photos whose bytes went: refused ones.
         files: paths of data files; with `dry_run` without those that only the removal of rows sets free.
     """
 
     kept_from: int
     write_ids: tuple[str, ...]
+    candidate_images: tuple[str, ...]
     files: tuple[str, ...]
     dry_run: bool
 
@@ -51,7 +56,8 @@ class VacuumReport:
 def compact(database: Database) -> dict[str, int]:
     """Merge small files; returns for each table how many files it has less. Snapshots do not change."""
     saved = {}
-    for name in (*CHILD_TABLES, *((LIDAR_POINTS,) if has_scans(database) else ())):
+    scans = (LIDAR_POINTS,) if has_scans(database) else ()
+    for name in (*CHILD_TABLES, *scans, *growth_tables(database)):
         saved[name] = database.table(name).compact()
     saved[MAPS] = retry_stale("compact maps", lambda: _compact_maps(database))
     return saved
@@ -81,9 +87,12 @@ def vacuum(
             table.delete_writes(found)
         orphans |= found
     orphans |= _vacuum_scans(database, options, now, dry_run)
+    unnamed, refused = _vacuum_candidates(database, options, now, dry_run)
+    orphans |= unnamed
     return VacuumReport(
         kept_from=kept_from,
         write_ids=tuple(sorted(orphans)),
+        candidate_images=tuple(sorted(refused)),
         files=tuple(_vacuum_files(database, options, kept_from, dry_run)),
         dry_run=dry_run,
     )
@@ -173,9 +182,28 @@ def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry
     return found
 
 
+def _vacuum_candidates(
+    database: Database, options: VacuumOptions, now: datetime, dry_run: bool
+) -> tuple[set[str], set[str]]:
+    """Remove images that no event names, and those of photos that were refused long ago."""
+    if not has_candidates(database):
+        return set(), set()
+    table = database.table(CANDIDATE_IMAGES)
+    named = named_writes(database)
+    grace = timedelta(hours=options.orphan_grace_h)
+    orphans = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
+    refused = superfluous_images(database, now, timedelta(hours=options.history_h))
+    if orphans and not dry_run:
+        table.delete_writes(orphans)
+    if refused and not dry_run:
+        table.delete_rows("candidate_id", refused)
+    return orphans, refused
+
+
 def _vacuum_files(database: Database, options: VacuumOptions, kept_from: int, dry_run: bool) -> list[str]:
     files = []
-    for name in (*TABLES, *((LIDAR_POINTS,) if has_scans(database) else ())):
+    scans = (LIDAR_POINTS,) if has_scans(database) else ()
+    for name in (*TABLES, *scans, *growth_tables(database)):
         table = database.table(name)
         # Versions of `maps` are kept by number; the newest child table serves all of them.
         keep = range(kept_from, table.version + 1) if name == MAPS else ()

@@ -13,13 +13,23 @@ import duckdb
 import pyarrow as pa
 
 from featuredb.errors import StoreError
+from featuredb.store.candidate_upkeep import growth_tables
 from featuredb.store.database import Database
 from featuredb.store.encode import map_rows_table
 from featuredb.store.scans import points_dataset, scan_rows, scan_rows_table
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import CHILD_TABLES, LIDAR, LIDAR_POINTS, LIDAR_TABLES, MAPS, SPECS
+from featuredb.store.tables import (
+    CANARIES,
+    CANDIDATES,
+    CHILD_TABLES,
+    LIDAR,
+    LIDAR_POINTS,
+    LIDAR_TABLES,
+    MAPS,
+    SPECS,
+)
 
-VIEWS = (MAPS, *CHILD_TABLES, "cameras", *LIDAR_TABLES)
+VIEWS = (MAPS, *CHILD_TABLES, "cameras", *LIDAR_TABLES, CANDIDATES, CANARIES)
 _BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
 _ALLOWED = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 
@@ -50,7 +60,8 @@ class SqlSession:
 
     Views: `maps` (retired ones included, see its column `status`); `images`, `points`, `observations` and
     `cameras` of the maps that are not retired. With the database also its scans as they are now: `lidar`
-    (retired ones included) and `lidar_points` of those that are not retired.
+    (retired ones included) and `lidar_points` of those that are not retired; `candidates` (events of
+    contributed photos) and `canaries`, both without images.
     """
 
     def __init__(self, snapshot: Snapshot, database: Database | None = None) -> None:
@@ -59,6 +70,7 @@ class SqlSession:
         self._register()
         if database is not None:
             self._register_scans(database)
+            self._register_growth(database)
         self._connection.execute("SET enable_external_access = false")
         self._connection.execute("SET lock_configuration = true")
 
@@ -108,6 +120,16 @@ class SqlSession:
         self._connection.execute(_LIDAR_VIEW)
         self._connection.execute(_LIDAR_POINTS_VIEW)
 
+    def _register_growth(self, database: Database) -> None:
+        there = growth_tables(database)
+        for name, time, hidden in ((CANDIDATES, "at", "event_index"), (CANARIES, "created_at", "image")):
+            columns = [field.name for field in SPECS[name].schema if field.name not in (hidden, "write_id")]
+            if name in there:
+                rows = database.table(name).dataset().to_table(columns)
+            else:
+                rows = SPECS[name].schema.empty_table().select(columns)
+            self._connection.register(name, _without_zone(rows, time))
+
     def _fetch(self) -> Iterator[tuple[Any, ...]]:
         try:
             while rows := self._connection.fetchmany(_BATCH_ROWS):
@@ -116,7 +138,7 @@ class SqlSession:
             raise StoreError(f"SQL: {error}") from error
 
 
-def _without_zone(maps: pa.Table) -> pa.Table:
-    """`created_at` as a plain UTC timestamp: DuckDB needs pytz to hand out one with a zone."""
-    index = maps.schema.get_field_index("created_at")
-    return maps.set_column(index, "created_at", maps["created_at"].cast(pa.timestamp("us")))
+def _without_zone(rows: pa.Table, time: str = "created_at") -> pa.Table:
+    """A column as plain UTC timestamps: DuckDB needs pytz to hand out one with a zone."""
+    index = rows.schema.get_field_index(time)
+    return rows.set_column(index, time, rows[time].cast(pa.timestamp("us")))

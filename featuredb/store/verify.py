@@ -11,6 +11,10 @@ import pyarrow.dataset as ds
 from featuredb.errors import FeatureDbError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
+from featuredb.store.canaries import list_canaries
+from featuredb.store.candidate_events import has_candidates
+from featuredb.store.candidate_upkeep import check_canaries, check_candidates, growth_tables, named_writes
+from featuredb.store.candidates import count_candidates
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
@@ -27,6 +31,7 @@ from featuredb.store.scans import (
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import (
     BOUNDS,
+    CANDIDATE_IMAGES,
     CHILD_TABLES,
     IMAGES,
     LIDAR_POINTS,
@@ -59,7 +64,7 @@ class VerifyReport:
 
     Attributes:
         version: of the snapshot that was checked.
-        maps, scans, files, rows: how many of each were checked.
+        maps, scans, candidates, canaries, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
             commit under way. No damage: nobody reads them, and `vacuum` removes them.
@@ -68,6 +73,8 @@ class VerifyReport:
     version: int
     maps: int
     scans: int
+    candidates: int
+    canaries: int
     files: int
     rows: int
     problems: tuple[Problem, ...]
@@ -79,7 +86,7 @@ class VerifyReport:
 
 
 def verify(database: Database) -> VerifyReport:
-    """Check the newest snapshot and the scans; reads every file and every row of them once.
+    """Check the newest snapshot, scans, contributed photos and known queries; reads all of them once.
 
     Raises:
         StoreError: the table `maps` itself, without which nothing can be said, is not readable.
@@ -88,7 +95,8 @@ def verify(database: Database) -> VerifyReport:
     problems: list[Problem] = []
     files = rows = 0
     scans = list_scans(database)
-    for name in (*TABLES, *(LIDAR_TABLES if has_scans(database) else ())):
+    lidar = LIDAR_TABLES if has_scans(database) else ()
+    for name in (*TABLES, *lidar, *growth_tables(database)):
         table = database.table(name)
         live = table.files()
         files += len(live)
@@ -98,11 +106,15 @@ def verify(database: Database) -> VerifyReport:
         problems += check_map(snapshot, row)
     for scan in scans:
         problems += check_scan(database, scan)
+    for where, what in (*check_candidates(database), *check_canaries(database)):
+        problems.append(Problem(where=where, what=what))
     orphans = [] if problems else _orphans(database)
     return VerifyReport(
         version=snapshot.version,
         maps=len(snapshot.rows()),
         scans=len(scans),
+        candidates=0 if problems else sum(count_candidates(database).by_state.values()),
+        canaries=0 if problems else len(list_canaries(database)),
         files=files,
         rows=rows,
         problems=tuple(problems),
@@ -251,6 +263,8 @@ def _orphans(database: Database) -> list[str]:
     orphans = present - write_ids_of_history(database, first)
     if has_scans(database):
         orphans |= write_ids_in(database.table(LIDAR_POINTS)) - {r["write_id"] for r in scan_rows(database)}
+    if has_candidates(database):
+        orphans |= write_ids_in(database.table(CANDIDATE_IMAGES)) - named_writes(database)
     return sorted(orphans)
 
 

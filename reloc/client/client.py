@@ -16,15 +16,13 @@ from featuredb.errors import InvalidValueError, ServiceError
 from reloc.wire import (
     CameraRequest,
     ErrorReply,
-    Event,
     LocaliseReply,
     LocaliseWireRequest,
-    MapsReply,
     PriorRequest,
     RequestOptions,
-    StatusReply,
     encode,
 )
+from reloc.wire_server import Event, MapsReply, StatusReply
 
 _Message = TypeVar("_Message", bound=BaseModel)
 
@@ -121,6 +119,10 @@ class Client:
         inliers: bool = False,
         exif_prior: bool = False,
         maps: tuple[str, ...] | None = None,
+        contribute: bool = False,
+        owner: str | None = None,
+        licence: str | None = None,
+        client_id: str | None = None,
     ) -> LocaliseReply:
         """Where was this photo taken?
 
@@ -133,9 +135,14 @@ class Client:
             inliers: the reply carries pixels and UTM points of the matches that agree.
             exif_prior: the photo's own GPS serves as prior where `prior` is None.
             maps: ask only these maps.
+            contribute: give the photo to the database, so that its maps can grow; needs `owner` and
+                `licence`. The reply's `contribution` says whether it was taken.
+            owner: whose photo it is. licence: the terms under which it is given, such as CC-BY-4.0.
+            client_id: what this client calls itself, kept with the photo.
 
         Raises:
             ServiceError: see the class.
+            InvalidValueError: arguments that no server takes.
         """
         data = image if isinstance(image, bytes) else Path(image).read_bytes()
         deadline_s = max(timeout_s - _DEADLINE_MARGIN_S, 0.5 * timeout_s)
@@ -144,6 +151,10 @@ class Client:
                 request_id=request_id,
                 prior=prior,
                 camera=camera,
+                contribute=contribute,
+                owner=owner,
+                licence=licence,
+                client_id=client_id,
                 options=RequestOptions(
                     inliers=inliers, exif_prior=exif_prior, maps=maps, deadline_ms=deadline_s * 1e3
                 ),

@@ -9,7 +9,7 @@ from featuredb.store import Database, MapSummary
 from reloc.localiser import Localiser
 from reloc.options import LocaliseOptions
 from reloc.service.source import ServedArea
-from reloc.wire import BoundingBox, MapInfo
+from reloc.wire_server import BoundingBox, MapInfo
 
 
 class DatabaseSource:

@@ -89,11 +89,6 @@ def answer_query(
     Raises:
         RequestError: bad image, bad request, too large, or maps of another extractor.
     """
-    if wire_request.contribute:
-        raise RequestError(
-            ErrorCode.UNSUPPORTED,
-            "contribute: this server takes no contributions; send false or leave it out",
-        )
     gray = _decode(data, limits)
     clock.end("decode")
     request = localise_request(wire_request, data, gray)

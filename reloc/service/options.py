@@ -7,6 +7,7 @@ from pathlib import Path
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
+from reloc.service.inbox import InboxOptions
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -31,6 +32,10 @@ class ServeOptions:
         poll_interval_s: how often the store is asked for a newer version; also the delay of a hot reload.
         shutdown_grace_s: how long queries in hand may take when the server stops.
         limits: bytes and pixels of a query image.
+        contributions: take photos that clients contribute. On: only photos whose senders say whose they are
+            and under what terms are kept, in a bounded inbox, and nothing of them answers queries before
+            growth has checked them.
+        inbox: its bounds.
     """
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
@@ -44,6 +49,8 @@ class ServeOptions:
     poll_interval_s: float = 1.0
     shutdown_grace_s: float = 10.0
     limits: DecodeLimits = field(default_factory=DecodeLimits)
+    contributions: bool = True
+    inbox: InboxOptions = field(default_factory=InboxOptions)
 
     def __post_init__(self) -> None:
         for name, value in (

@@ -6,7 +6,9 @@ from collections.abc import Callable
 
 from featuredb.store import Database
 from reloc.options import LocaliseOptions
+from reloc.service.database_inbox import DatabaseInbox
 from reloc.service.database_source import DatabaseSource
+from reloc.service.inbox import Inbox
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
 
@@ -22,7 +24,8 @@ def start_server(
     """
     options = options or ServeOptions()
     name = options.name or wire_name_of(database.url)
-    return Server.start(DatabaseSource(database, localise_options), options, name)
+    inbox = Inbox(DatabaseInbox(database), options.inbox) if options.contributions else None
+    return Server.start(DatabaseSource(database, localise_options), options, name, inbox)
 
 
 def serve(

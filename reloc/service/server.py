@@ -10,6 +10,7 @@ from typing import Self
 
 import zenoh
 
+from reloc.service.inbox import Inbox
 from reloc.service.metrics import Metrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
@@ -18,18 +19,15 @@ from reloc.service.session import Keys, ServiceStartError, bind_free_port, open_
 from reloc.service.source import AreaSource, ServedArea
 from reloc.service.watcher import AreaWatcher
 from reloc.service.worker import WorkerPool
-from reloc.wire import (
-    WIRE_VERSION,
-    ErrorCode,
+from reloc.wire import WIRE_VERSION, ErrorCode, RequestError, encode
+from reloc.wire_server import (
     Event,
     EventType,
     Limits,
     MapsReply,
     QueueStatus,
     ReloadStatus,
-    RequestError,
     StatusReply,
-    encode,
 )
 
 logger = logging.getLogger(__name__)
@@ -57,6 +55,7 @@ class Server:
         endpoints: tuple[str, ...],
         database: str,
         options: ServeOptions,
+        inbox: Inbox | None,
     ) -> None:
         self.database = database
         self.endpoints = endpoints
@@ -71,7 +70,8 @@ class Server:
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
         self._watch = DeadlineWatch()
-        self._workers = WorkerPool(self._queue, self._watch, lambda: self._area, options)
+        self._inbox = inbox
+        self._workers = WorkerPool(self._queue, self._watch, lambda: self._area, options, inbox)
         self._watcher = AreaWatcher(
             source,
             served_version=area.snapshot,
@@ -85,8 +85,13 @@ class Server:
         self._closed = False
 
     @classmethod
-    def start(cls, source: AreaSource, options: ServeOptions, database: str) -> Self:
+    def start(
+        cls, source: AreaSource, options: ServeOptions, database: str, inbox: Inbox | None = None
+    ) -> Self:
         """Load the area, then listen; when this returns, queries are answered.
+
+        Args:
+            inbox: takes contributed photos, and is started and closed by the server; None: it takes none.
 
         Raises:
             ServiceStartError: cannot listen.
@@ -104,6 +109,7 @@ class Server:
             endpoints=endpoints,
             database=database,
             options=options,
+            inbox=inbox,
         )
         try:
             server._declare()
@@ -113,6 +119,8 @@ class Server:
         return server
 
     def _declare(self) -> None:
+        if self._inbox is not None:
+            self._inbox.start()
         self._watch.start()
         self._workers.start()
         # `complete`: of several servers of one database the nearest answers, not all of them.
@@ -155,6 +163,8 @@ class Server:
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
         for queryable in self._queryables:
             queryable.undeclare()
+        if self._inbox is not None:
+            self._inbox.close(self._options.shutdown_grace_s)
         self._watch.close()
         self._watcher.close(timeout_s=self._options.shutdown_grace_s)
         self._session.close()
@@ -185,6 +195,7 @@ class Server:
                 max_pixels=options.limits.max_pixels,
                 deadline_s=options.deadline_s,
             ),
+            contributions=None if self._inbox is None else self._inbox.status(),
         )
 
     # Zenoh calls these in threads of its own; they must return at once.

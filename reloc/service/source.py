@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reloc.result import LocaliseRequest, LocaliseResult
-from reloc.wire import MapInfo
+from reloc.wire_server import MapInfo
 
 
 class LocaliserLike(Protocol):

@@ -5,14 +5,25 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from datetime import UTC, datetime
 
+from featuredb.store.candidate_states import candidate_id_of
+from reloc.service.database_inbox import contribution_of
 from reloc.service.handler import StageClock, answer_query
+from reloc.service.inbox import Inbox, InboxRefusal
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.source import ServedArea
 from reloc.service.threads import capped_process, capped_thread
-from reloc.wire import ErrorCode, RequestError, parse_request
+from reloc.wire import (
+    ContributionReply,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    RequestError,
+    parse_request,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -26,11 +37,13 @@ class WorkerPool:
         watch: DeadlineWatch,
         area: Callable[[], ServedArea],
         options: ServeOptions,
+        inbox: Inbox | None = None,
     ) -> None:
         self._queue = queue
         self._watch = watch
         self._area = area
         self._options = options
+        self._inbox = inbox
         self._busy: set[PendingQuery] = set()
         self._lock = threading.Lock()
         self._caps = ExitStack()
@@ -90,6 +103,12 @@ class WorkerPool:
         clock.end("queue")
         request = parse_request(item.attachment())
         item.request_id = request.request_id or item.request_id
+        if request.contribute and self._inbox is None:
+            raise RequestError(
+                ErrorCode.UNSUPPORTED,
+                "contribute: this server takes no contributions; leave it out, or start the server with "
+                "--contributions on",
+            )
         if request.options.deadline_ms is not None:
             wished = item.received + request.options.deadline_ms / 1e3
             if wished < item.deadline:
@@ -110,7 +129,43 @@ class WorkerPool:
             before_localising=lambda: _check_deadline(item),
         )
         _check_deadline(item)
-        item.answer(reply)
+        if request.contribute and self._inbox is not None:
+            _answer_and_keep(item, data, request, reply, clock, self._inbox)
+        else:
+            item.answer(reply)
+
+
+def _answer_and_keep(
+    item: PendingQuery,
+    data: bytes,
+    request: LocaliseWireRequest,
+    reply: LocaliseReply,
+    clock: StageClock,
+    inbox: Inbox,
+) -> None:
+    """Answer, and hand the photo to the inbox if it has a place; what is said in the answer is then done."""
+    received_at = datetime.now(UTC)
+    place = inbox.reserve(request.owner or "", len(data))
+    if isinstance(place, InboxRefusal):
+        said = ContributionReply(accepted=False, candidate_id=None, reason=place.reason, detail=place.detail)
+        item.answer(_with_contribution(reply, said, clock))
+        return
+    answered = False
+    try:
+        said = ContributionReply(
+            accepted=True, candidate_id=candidate_id_of(data), reason=None, detail="queued for the inbox"
+        )
+        answered = item.answer(_with_contribution(reply, said, clock))
+    finally:
+        if not answered:
+            place.cancel()
+    if answered:
+        place.submit(lambda: contribution_of(data, request, reply, received_at))
+
+
+def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:
+    clock.end("contribution")
+    return reply.model_copy(update={"contribution": said, "timings_ms": clock.finished()})
 
 
 def _check_deadline(item: PendingQuery) -> None:

@@ -7,18 +7,19 @@ import pytest
 from pydantic import ValidationError
 
 from featuredb.features.decode import DecodeLimits
+from reloc.service.inbox import Inbox, InboxOptions
 from reloc.service.options import ServeOptions
 from reloc.wire import (
     ErrorCode,
     LocaliseReply,
     LocaliseWireRequest,
-    MapsReply,
     RequestError,
-    StatusReply,
     parse_request,
 )
+from reloc.wire_server import MapsReply, StatusReply
 from schemas import load_schema
 from tests.support.service import (
+    MemoryInbox,
     MemorySource,
     ScriptedLocaliser,
     area_of,
@@ -48,7 +49,7 @@ def raw(session, leaf: str, **kwargs) -> bytes:
 @pytest.fixture(scope="module")
 def messages():
     """One of each message, as bytes off the wire: name -> list."""
-    reasons = iter([False, False, True])
+    reasons = iter([False, False, True, False, False])
 
     def answer(gray, request):
         if next(reasons):
@@ -64,7 +65,8 @@ def messages():
     source = MemorySource(area_of(Mixed(1)))
     options = ServeOptions(poll_interval_s=0.05, limits=DecodeLimits(max_bytes=100_000))
     found: dict[str, list[bytes]] = {name: [] for name in NAMES}
-    with running_server(source, options) as server, client_of(server) as client:
+    inbox = Inbox(MemoryInbox(), InboxOptions(max_owner_photos=1))
+    with running_server(source, options, inbox=inbox) as server, client_of(server) as client:
         session = client._session()
         with session.declare_subscriber(
             "featuredb/town/events", lambda s: found["event"].append(s.payload.to_bytes())
@@ -72,6 +74,11 @@ def messages():
             for attachment in (b"", b'{"options": {"inliers": true}}', b'{"request_id": "r1"}'):
                 found["localise_reply"].append(
                     raw(session, "localise", payload=photo(), attachment=attachment)
+                )
+            gift = b'{"contribute": true, "owner": "A", "licence": "CC0-1.0"}'
+            for seed in (1, 2):
+                found["localise_reply"].append(
+                    raw(session, "localise", payload=photo(seed=seed), attachment=gift)
                 )
             for payload, attachment in ((b"x", b""), (photo(), b"{"), (bytes(200_000), b"")):
                 found["error"].append(raw(session, "localise", payload=payload, attachment=attachment))
@@ -94,8 +101,16 @@ def test_every_message_off_the_wire_is_valid_by_its_schema(messages, name):
 
 def test_the_messages_cover_the_kinds(messages):
     replies = [json.loads(m) for m in messages["localise_reply"]]
-    assert [r["status"] for r in replies] == ["localised", "localised", "not_localised"]
-    assert [r["inlier_points"] is None for r in replies] == [True, False, True]
+    assert [r["status"] for r in replies[:3]] == ["localised", "localised", "not_localised"]
+    assert [r["inlier_points"] is None for r in replies[:3]] == [True, False, True]
+    assert [r["contribution"] and r["contribution"]["reason"] for r in replies[2:]] == [
+        None,
+        None,
+        "OWNER_LIMIT",
+    ]
+    assert [r["contribution"] and r["contribution"]["accepted"] for r in replies[2:]] == [None, True, False]
+    status = json.loads(messages["status"][0])["contributions"]
+    assert (status["accepted"], status["refused"]) == (1, {"OWNER_LIMIT": 1})
     assert {json.loads(m)["code"] for m in messages["error"]} == {"BAD_IMAGE", "BAD_REQUEST", "TOO_LARGE"}
     assert {json.loads(m)["type"] for m in messages["event"]} == {"map_committed", "map_retired", "reloaded"}
 
@@ -121,7 +136,7 @@ def test_schema_and_reader_both_refuse_a_localised_reply_without(messages, field
 
 
 def test_schema_and_reader_both_refuse_a_fallback_pose(messages):
-    localised, _, failed = (json.loads(m) for m in messages["localise_reply"])
+    localised, _, failed = (json.loads(m) for m in messages["localise_reply"][:3])
     for field in ("position", "utm", "accuracy"):
         broken = {**failed, field: localised[field]}
         assert not validator("localise_reply").is_valid(broken)
@@ -150,7 +165,10 @@ GOOD_REQUESTS = [
             "params": [3000, 2000, 1500, -0.01],
         }
     },
-    {"camera": None, "prior": None, "request_id": None, "contribute": True, "options": {}},
+    {"camera": None, "prior": None, "request_id": None, "contribute": False, "options": {}},
+    {"contribute": True, "owner": "A. Person", "licence": "CC-BY-4.0", "client_id": "phone 7"},
+    {"contribute": True, "owner": "Ä" * 200, "licence": "x", "client_id": None},
+    {"contribute": False, "owner": None, "licence": "CC0-1.0"},
     {"options": {"inliers": True, "exif_prior": False, "maps": ["a", "b"], "deadline_ms": 250}},
 ]
 BAD_REQUESTS = [
@@ -177,6 +195,18 @@ BAD_REQUESTS = [
     {"camera": {"model": "PINHOLE", "width": 1, "height": 1}},
     {"contribute": "yes"},
     {"contribute": 1},
+    {"contribute": True},
+    {"contribute": True, "owner": "A"},
+    {"contribute": True, "licence": "CC0-1.0"},
+    {"contribute": True, "owner": None, "licence": "CC0-1.0"},
+    {"contribute": True, "owner": "", "licence": "CC0-1.0"},
+    {"contribute": True, "owner": " A", "licence": "CC0-1.0"},
+    {"contribute": True, "owner": "A" * 201, "licence": "CC0-1.0"},
+    {"contribute": True, "owner": "A\nB", "licence": "CC0-1.0"},
+    {"contribute": True, "owner": "A\x1b[2J", "licence": "CC0-1.0"},
+    {"contribute": True, "owner": "A\x9b2J", "licence": "CC0-1.0"},
+    {"contribute": True, "owner": ["A"], "licence": "CC0-1.0"},
+    {"client_id": "\t"},
     {"options": None},
     {"options": {"inlier": True}},
     {"options": {"maps": [""]}},

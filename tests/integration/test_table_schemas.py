@@ -11,13 +11,16 @@ from deltalake import DeltaTable
 
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
-from featuredb.store.tables import LIDAR_TABLES
+from featuredb.store.canaries import add_canary
+from featuredb.store.candidates import contribute, mark_used, refuse
+from featuredb.store.tables import CANARIES, CANDIDATE_TABLES, LIDAR_TABLES
 from featuredb.store.tables import TABLES as MAP_TABLES
 from schemas import load_schema, schema_names
+from tests.support.contributions import contribution, known_pose
 from tests.support.las_files import grid_points, write_scan
 from tests.support.maps import random_map
 
-TABLES = (*MAP_TABLES, *LIDAR_TABLES)
+TABLES = (*MAP_TABLES, *LIDAR_TABLES, *CANDIDATE_TABLES, CANARIES)
 
 
 @pytest.fixture(scope="module")
@@ -29,6 +32,11 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Database:
     folder = tmp_path_factory.mktemp("scans")
     add_scan(database, [write_scan(folder / "a.laz", grid_points(200), red=np.full(200, 9))])
     add_scan(database, [write_scan(folder / "b.laz", grid_points(200), point_format=6)])
+    ids = contribute(database, [contribution(1), contribution(2)])
+    mark_used(database, ids[:1], "map-2")
+    refuse(database, {ids[1]: ("NO_OVERLAP", "shares nothing with any other photo")})
+    add_canary(database, "gate", b"photo", known_pose(), origin="answer", snapshot=1)
+    add_canary(database, "other town", b"elsewhere", None, origin="person")
     return database
 
 

@@ -15,12 +15,15 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidates import InboxCounts
 from reloc.client import Client
 from reloc.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult, RunnerUp
+from reloc.service.inbox import Inbox
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.source import ServedArea
-from reloc.wire import BoundingBox, MapInfo
+from reloc.wire_server import BoundingBox, MapInfo
 
 EPSG = 32632
 EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0
@@ -146,6 +149,30 @@ class MemorySource:
         self.newest = area.snapshot
 
 
+class MemoryInbox:
+    """Where contributions go in tests that need no database; may be held up or made to fail."""
+
+    def __init__(self) -> None:
+        self.written: list[Contribution] = []
+        self.stored = InboxCounts(by_state={}, waiting_by_owner={}, stored_bytes=0)
+        self.failure: Exception | None = None
+        self.gate: Gate | None = None
+        self.attempts = 0
+        self.counted = 0
+
+    def write(self, contributions: list[Contribution]) -> None:
+        self.attempts += 1
+        if self.gate is not None:
+            self.gate.wait()
+        if self.failure is not None:
+            raise self.failure
+        self.written += contributions
+
+    def counts(self) -> InboxCounts:
+        self.counted += 1
+        return self.stored
+
+
 def map_info(map_id: str = "map-a", digest: str = "d0") -> MapInfo:
     return MapInfo(
         map_id=map_id,
@@ -171,13 +198,14 @@ def running_server(
     localiser_or_source: ScriptedLocaliser | MemorySource,
     options: ServeOptions | None = None,
     name: str = "town",
+    inbox: Inbox | None = None,
 ) -> Iterator[Server]:
     """A server on a free loopback port."""
     source = localiser_or_source
     if isinstance(source, ScriptedLocaliser):
         source = MemorySource(area_of(source))
     options = replace(options or ServeOptions(), listen=("tcp/127.0.0.1:0",))
-    with Server.start(source, options, name) as server:
+    with Server.start(source, options, name, inbox) as server:
         yield server
 
 
