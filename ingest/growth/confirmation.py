@@ -1,0 +1,263 @@
+"""Confirmation of a quarantined map by independent sources: photos of different people see the same of it.
+
+A map is the claim of those whose photos made it. Its parents vouch for its place, and only where it overlaps
+them; what it adds beyond is believed when photos of someone else show it, too. Sources are told apart by
+owner, and where the owner is unknown by camera and day. One person with several accounts is several sources
+here; who an owner is, is not for this system to know (docs/growth.md).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from ingest.growth.gates import Gate
+
+Independence = Literal["owner", "any"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Where a photo comes from; "" and None are unknown, and never tell two sources apart.
+
+    Attributes:
+        owner: who gave it. camera: its EXIF key. day: of capture, by the camera's own clock.
+    """
+
+    owner: str = ""
+    camera: str = ""
+    day: date | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "owner": self.owner,
+            "camera": self.camera,
+            "day": None if self.day is None else self.day.isoformat(),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfirmationOptions:
+    """When a map counts as confirmed.
+
+    Attributes:
+        independent_by: "owner": photos of different owners are independent, and photos without an owner by
+            another camera or day; the same owner never confirms himself. "any": another owner, camera or
+            day is enough, which a contributor who means harm can make up.
+        trusted_owners: whose photos need nobody else: surveys of those who keep the database.
+        min_shared_points: two photos confirm each other from so many common points of the map on. An
+            accepted pose has at least so many inliers (reloc.options), and chance gives a few.
+        min_confirmed_share: of the map's photos. Photos at the rim of a map often share less with others;
+            a map of which most photos hang on one source alone is that source's claim.
+        min_confirmed_photos: fewer are no map.
+        min_parallax: distance of two cameras over their distance from what both see. The same picture given
+            by two people, cut or compressed anew, shows no parallax; poses of one place are good to some
+            thousandths.
+    """
+
+    independent_by: Independence = "owner"
+    trusted_owners: tuple[str, ...] = ()
+    min_shared_points: int = 15
+    min_confirmed_share: float = 0.5
+    min_confirmed_photos: int = 2
+    min_parallax: float = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Witness:
+    """A photo that is not the map's own, and localised in it.
+
+    Attributes:
+        name: for people.
+        center: (3,) of its camera in the map's frame, metres.
+        points: (k,) rows of the map's points that are its inliers.
+    """
+
+    name: str
+    source: Source
+    center: FloatArray
+    points: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Confirmation:
+    """How far a map is confirmed.
+
+    Attributes:
+        gates: "sources", "confirmed_photos", "confirmed_share"; the map is confirmed when all pass.
+        sources: those among the photos that confirm each other, or are trusted.
+        confirmed, unconfirmed: image ids of the map.
+        witnesses: names of witnesses that confirm a photo of the map.
+    """
+
+    gates: tuple[Gate, ...]
+    sources: tuple[Source, ...]
+    confirmed: tuple[int, ...]
+    unconfirmed: tuple[int, ...]
+    witnesses: tuple[str, ...] = ()
+
+    @property
+    def confirmed_by_others(self) -> bool:
+        return all(gate.passes for gate in self.gates)
+
+    @property
+    def message(self) -> str:
+        """The first gate that refuses, or how it was confirmed; for people."""
+        for gate in self.gates:
+            if not gate.passes:
+                return gate.message
+        return f"{len(self.confirmed)} photos confirmed by {len(self.sources)} sources"
+
+
+def source_of(image: MapImage, camera_keys: Sequence[str]) -> Source:
+    """Where a map's image comes from."""
+    return Source(
+        owner=image.owner,
+        camera=camera_keys[image.camera_id] if camera_keys else "",
+        day=None if image.capture_time is None else image.capture_time.date(),
+    )
+
+
+def independent(a: Source, b: Source, by: Independence = "owner") -> bool:
+    """Whether two photos come from sources that do not know of each other."""
+    other_owner = bool(a.owner and b.owner and a.owner != b.owner)
+    other_camera = bool(a.camera and b.camera and a.camera != b.camera)
+    other_day = a.day is not None and b.day is not None and a.day != b.day
+    if by == "owner" and a.owner and b.owner:
+        return other_owner
+    return other_owner or other_camera or other_day
+
+
+def confirm(
+    feature_map: FeatureMap, options: ConfirmationOptions, witnesses: Sequence[Witness] = ()
+) -> Confirmation:
+    """How far independent sources confirm a map.
+
+    A photo of the map is confirmed when it shares enough of the map's points with a photo of an independent
+    source, the map's own or a witness, or when its owner is trusted.
+    """
+    sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
+    own = len(sources)
+    everyone = [*sources, *(w.source for w in witnesses)]
+    shared = _shared_points(feature_map, witnesses)
+    agree = np.zeros_like(shared, dtype=np.bool_)
+    enough = (shared >= options.min_shared_points) & (
+        _parallax(feature_map, witnesses) >= options.min_parallax
+    )
+    for i, j in np.argwhere(np.triu(enough, 1)).tolist():
+        agree[i, j] = agree[j, i] = independent(everyone[i], everyone[j], options.independent_by)
+    trusted = np.array([bool(s.owner) and s.owner in options.trusted_owners for s in everyone], dtype=bool)
+    confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | trusted, dtype=np.bool_)
+    groups = _groups(everyone, confirmed, agree, options.independent_by)
+    gates = _gates(confirmed[:own], groups, bool((confirmed & trusted)[:own].any()), options)
+    ids = [image.image_id for image in feature_map.images]
+    vouching: list[bool] = [bool(row.any()) for row in agree[own:, :own]]
+    return Confirmation(
+        gates=gates,
+        sources=tuple(groups),
+        confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
+        unconfirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if not yes),
+        witnesses=tuple(w.name for w, yes in zip(witnesses, vouching, strict=True) if yes),
+    )
+
+
+def _gates(
+    confirmed: NDArray[np.bool_], sources: Sequence[Source], trusted: bool, options: ConfirmationOptions
+) -> tuple[Gate, ...]:
+    count, share = int(confirmed.sum()), float(confirmed.mean()) if len(confirmed) else 0.0
+    needed = 1 if trusted else 2
+    return (
+        Gate(
+            name="sources",
+            reason="ONE_SOURCE",
+            figure=len(sources),
+            limit=needed,
+            passes=len(sources) >= needed,
+            message=f"{len(sources)} independent sources see the same of it, {needed} are needed",
+        ),
+        Gate(
+            name="confirmed_photos",
+            reason="FEW_CONFIRMED",
+            figure=count,
+            limit=options.min_confirmed_photos,
+            passes=count >= options.min_confirmed_photos,
+            message=f"{count} of its photos are confirmed by another source, "
+            f"{options.min_confirmed_photos} are needed",
+        ),
+        Gate(
+            name="confirmed_share",
+            reason="MOSTLY_ONE_SOURCE",
+            figure=share,
+            limit=options.min_confirmed_share,
+            passes=share >= options.min_confirmed_share,
+            message=f"{share:.0%} of its photos are confirmed by another source, "
+            f"{options.min_confirmed_share:.0%} are needed",
+        ),
+    )
+
+
+def _shared_points(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> NDArray[np.int64]:
+    """Numbers of common points of the map's images and the witnesses, (n, n)."""
+    row = {image.image_id: i for i, image in enumerate(feature_map.images)}
+    seen = feature_map.observations
+    images = np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)
+    points = seen.point_index
+    for k, witness in enumerate(witnesses, start=len(row)):
+        images = np.concatenate([images, np.full(len(witness.points), k)])
+        points = np.concatenate([points, witness.points])
+    count = len(row) + len(witnesses)
+    sees = sparse.csr_array(
+        (np.ones(len(images), dtype=np.int64), (images, points)),
+        shape=(count, max(len(feature_map.points), 1)),
+    )
+    sees.sum_duplicates()
+    sees.data[:] = 1
+    return np.asarray((sees @ sees.T).toarray(), dtype=np.int64)
+
+
+def _parallax(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> FloatArray:
+    """Distances of the cameras from each other over those from what they see, (n, n)."""
+    points = feature_map.points_local()
+    seen = feature_map.observations
+    rows = [seen.point_index[seen.image_id == image.image_id] for image in feature_map.images]
+    rows += [w.points for w in witnesses]
+    centers = np.array(
+        [image.cam_from_local.center for image in feature_map.images] + [w.center for w in witnesses]
+    ).reshape(-1, 3)
+    reach = np.array(
+        [
+            np.median(np.linalg.norm(points[r] - c, axis=1)) if len(r) else np.inf
+            for r, c in zip(rows, centers, strict=True)
+        ]
+    )
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
+    return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
+
+
+def _groups(
+    sources: Sequence[Source], confirmed: NDArray[np.bool_], agree: NDArray[np.bool_], by: Independence
+) -> list[Source]:
+    """One source of each group of photos that are not independent of each other, among those confirmed."""
+    distinct = list(dict.fromkeys(sources[i] for i in np.flatnonzero(confirmed).tolist()))
+    if not distinct:
+        return []
+    same = [[not independent(a, b, by) for b in distinct] for a in distinct]
+    _, label = connected_components(sparse.csr_array(np.array(same, dtype=np.int8)), directed=False)
+    found = {int(k): source for k, source in zip(label[::-1], distinct[::-1], strict=True)}
+    # Photos of unknown source join groups to one; where two of them confirm each other all the same, by what
+    # is known of them, there are two.
+    groups = [found[k] for k in sorted(found)]
+    if len(groups) == 1 and agree.any():
+        return [sources[k] for k in np.argwhere(agree)[0].tolist()]
+    return groups
+
+
+def sources_json(confirmation: Confirmation) -> list[Mapping[str, Any]]:
+    return [source.as_json() for source in confirmation.sources]
