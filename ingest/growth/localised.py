@@ -9,6 +9,7 @@ import numpy as np
 from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
@@ -73,9 +74,18 @@ def localise_photos(
 
 
 def localise_photo(
-    photo: Photo, row: int, features: Features, areas: Sequence[IndexedArea], options: LocaliseEachOptions
+    photo: Photo,
+    row: int,
+    features: Features,
+    areas: Sequence[IndexedArea],
+    options: LocaliseEachOptions,
+    camera: Camera | None = None,
 ) -> LocalisedPhoto | str:
-    """One photo, or the reason why it is not localised."""
+    """One photo, or the reason why it is not localised.
+
+    Args:
+        camera: known intrinsics, of an image that a map holds for example; None: as the photo tells.
+    """
     usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
     if not usable:
         return "NO_COVERAGE: no active map has descriptors of this extractor"
@@ -84,7 +94,7 @@ def localise_photo(
     )
     few = features.take(np.arange(min(options.max_features, len(features))))
     request = LocaliseRequest(
-        camera_key=photo.camera_key or None, exif_focal_px=photo.focal_px, prior=photo.gps
+        camera=camera, camera_key=photo.camera_key or None, exif_focal_px=photo.focal_px, prior=photo.gps
     )
     outcome = localise_features(few, request, usable, settings)
     by_prior = photo.gps is not None and outcome.best is not None
