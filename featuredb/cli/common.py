@@ -1,9 +1,12 @@
 """What subcommands share: the database argument and plain tables for people."""
 
 import argparse
+import json
+import sys
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from decimal import Decimal
+from typing import Any
 
 from featuredb.errors import InvalidValueError
 from featuredb.store import Database
@@ -58,6 +61,16 @@ def version_or_time(text: str) -> int | datetime:
     return time if time.tzinfo else time.replace(tzinfo=UTC)
 
 
+def add_as_of_argument(parser: argparse.ArgumentParser) -> None:
+    """Add --as-of, an earlier version to look at."""
+    parser.add_argument(
+        "--as-of",
+        type=version_or_time,
+        metavar="VERSION",
+        help="an earlier version, by number or ISO 8601 time (UTC unless it says otherwise)",
+    )
+
+
 def hours(text: str) -> float:
     """A number of hours, >= 0."""
     try:
@@ -98,3 +111,28 @@ def _cell(value: object) -> str:
     text = value.hex() if isinstance(value, bytes) else str(value)
     text = text.replace("\n", " ")
     return text if len(text) <= LONGEST_CELL else text[: LONGEST_CELL - 1] + "…"
+
+
+def write_json(value: Any) -> None:
+    """Write a value to stdout as JSON."""
+    sys.stdout.write(json_text(value, indent=2) + "\n")
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """A value as JSON; see `_plain`."""
+    return json.dumps(_plain(value), indent=indent, allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    """What JSON can hold: times as ISO 8601, bytes as hex, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, datetime | date):
+        return value.isoformat()
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, float):
+        return value if abs(value) < float("inf") else None
+    return value if isinstance(value, bool | int | str | None) else str(value)

@@ -1,20 +1,25 @@
-"""The commands that keep a database: init, maps, history, sql, verify, retire, rollback, compact, vacuum."""
+"""The commands that keep a database: init, maps, history, sql, verify, retire, rollback, compact, vacuum.
+
+`lineage` and `candidates` are in modules of their own and are registered here.
+"""
 
 import argparse
 import csv
-import json
 import sys
 from collections.abc import Callable
-from datetime import date, datetime
 from typing import Any
 
+from featuredb.cli import candidates, lineage
 from featuredb.cli.common import (
+    add_as_of_argument,
     add_database_argument,
     format_table,
     hours,
+    json_text,
     open_database,
     storage_options,
     version_or_time,
+    write_json,
 )
 from featuredb.store import Database
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
@@ -30,7 +35,7 @@ def register(subparsers: Any) -> None:
     _command(subparsers, "init", run_init, "make an empty database")
     maps = _command(subparsers, "maps", run_maps, "list the maps")
     maps.add_argument("--all", action="store_true", help="retired maps, too")
-    _add_as_of(maps)
+    add_as_of_argument(maps)
     maps.add_argument("--json", action="store_true", help="everything that is known, as JSON")
     _command(subparsers, "history", run_history, "list the versions of the database")
     sql = _command(
@@ -43,7 +48,7 @@ def register(subparsers: Any) -> None:
     )
     sql.add_argument("query", metavar="SELECT", help="one reading statement")
     sql.add_argument("--format", choices=("table", "csv", "json"), default="table", help="default: table")
-    _add_as_of(sql)
+    add_as_of_argument(sql)
     check = _command(
         subparsers, "verify", run_verify, "check every file, row and reference; exit 1 if broken"
     )
@@ -55,6 +60,8 @@ def register(subparsers: Any) -> None:
     retire.add_argument("--reason", required=True, help="kept with the map or scan")
     rollback = _command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
+    lineage.register(subparsers)
+    candidates.register(subparsers)
     _command(subparsers, "compact", run_compact, "merge small files")
     _register_vacuum(subparsers)
 
@@ -71,12 +78,16 @@ def run_maps(args: argparse.Namespace) -> int:
     if args.json:
         wanted = {m.map_id for m in maps}
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
-        _write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
+        write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0
-    header = ("map", "name", "status", "method", "gen", "epsg", "images", "points", "residual_m", "committed")
+    header = (
+        "map", "name", "status", "method", "gen", "drift_m", "epsg", "images", "points", "residual_m",
+        "committed",
+    )  # fmt: skip
     rows_ = [
         (
-            m.map_id, m.name, m.status, m.method, m.generation, m.epsg, m.images, m.points,
+            m.map_id, m.name, m.status, m.method, m.generation,
+            None if m.drift_m is None else round(m.drift_m, 3), m.epsg, m.images, m.points,
             round(m.residual_rms_m, 3), m.created_at,
         )
         for m in maps
@@ -104,7 +115,7 @@ def run_sql(args: argparse.Namespace) -> int:
 def run_verify(args: argparse.Namespace) -> int:
     report = verify(open_database(args))
     if args.json:
-        _write_json(
+        write_json(
             {
                 "ok": report.ok,
                 "version": report.version,
@@ -162,9 +173,10 @@ def run_vacuum(args: argparse.Namespace) -> int:
     )
     report = vacuum(open_database(args), options, dry_run=args.dry_run)
     would = "would remove" if report.dry_run else "removed"
+    images = f", and {len(report.candidate_images)} refused photos" if report.candidate_images else ""
     sys.stdout.write(
         f"{would} {len(report.files)} files and the rows of {len(report.write_ids)} writes that no map "
-        f"names; versions from {report.kept_from} on stay readable\n"
+        f"names{images}; versions from {report.kept_from} on stay readable\n"
     )
     return 0
 
@@ -182,7 +194,7 @@ def write_result(result: SqlResult, output: str) -> None:
         sys.stdout.write("[")
         for count, row in enumerate(result.rows):
             sys.stdout.write(",\n" if count else "\n")
-            sys.stdout.write(_json_text(dict(zip(result.columns, row, strict=True))))
+            sys.stdout.write(json_text(dict(zip(result.columns, row, strict=True))))
         sys.stdout.write("\n]\n")
 
 
@@ -216,35 +228,3 @@ def _register_vacuum(subparsers: Any) -> None:
         help="unused files stay this long for running readers (default: %(default)s)",
     )
     parser.add_argument("--dry-run", action="store_true", help="only say what would be removed")
-
-
-def _add_as_of(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--as-of",
-        type=version_or_time,
-        metavar="VERSION",
-        help="an earlier version, by number or ISO 8601 time (UTC unless it says otherwise)",
-    )
-
-
-def _write_json(value: Any) -> None:
-    sys.stdout.write(_json_text(value, indent=2) + "\n")
-
-
-def _json_text(value: Any, indent: int | None = None) -> str:
-    return json.dumps(_plain(value), indent=indent, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: times as ISO 8601, bytes as hex, NaN and infinity as null."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, datetime | date):
-        return value.isoformat()
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    return value if isinstance(value, bool | int | str | None) else str(value)

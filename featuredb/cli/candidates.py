@@ -1,0 +1,131 @@
+"""`featuredb candidates`: the inbox of contributed photos, and the withdrawal of some of them."""
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
+from featuredb.errors import CandidateNotFoundError, InvalidValueError
+from featuredb.store.candidate_states import CANDIDATE_STATES, Candidate
+from featuredb.store.candidates import list_candidates, withdraw
+
+_SHOWN_ID = 12  # hex digits of an id in a table: enough to tell some millions of photos apart
+_SHORTEST_ID = 8
+
+
+def register(subparsers: Any) -> None:
+    """Add `candidates` to the parser of `featuredb`."""
+    parser = subparsers.add_parser(
+        "candidates",
+        help="list contributed photos, or withdraw some",
+        description="List the photos that clients contributed: waiting for growth, used by a map, refused "
+        "or withdrawn. With --withdraw or --withdraw-owner their images are deleted, at once and for good.",
+    )
+    add_database_argument(parser)
+    parser.add_argument("--state", choices=CANDIDATE_STATES, help="only those in this state")
+    parser.add_argument("--owner", metavar="NAME", help="only those of this owner")
+    parser.add_argument("--json", action="store_true", help="everything that is known, as JSON")
+    parser.add_argument(
+        "--withdraw",
+        metavar="ID",
+        action="append",
+        default=[],
+        help="delete the image of this photo, by its id or the beginning of it; may be repeated",
+    )
+    parser.add_argument("--withdraw-owner", metavar="NAME", help="delete all images that this owner gave")
+    parser.add_argument("--reason", default="", help="kept with a withdrawal, which needs one")
+    parser.set_defaults(run=run_candidates)
+
+
+def run_candidates(args: argparse.Namespace) -> int:
+    """List the inbox, or withdraw."""
+    database = open_database(args)
+    candidates = list_candidates(database)
+    if args.withdraw or args.withdraw_owner:
+        wanted = _to_withdraw(candidates, args.withdraw, args.withdraw_owner)
+        if not args.reason.strip():
+            raise InvalidValueError("expected --reason with a withdrawal, for those who will ask later")
+        report = withdraw(database, wanted, args.reason)
+        sys.stdout.write(f"withdrawn: {len(report.candidates)} photos, {len(report.files)} files deleted\n")
+        if report.used_by:
+            sys.stdout.write(
+                f"maps {', '.join(report.used_by)} were built with them and keep their features (no pixels); "
+                "`featuredb retire` removes a map\n"
+            )
+        return 0
+    shown = [
+        c
+        for c in candidates
+        if (args.state is None or c.state == args.state)
+        and (args.owner is None or args.owner in {giver.owner for giver in c.contributors})
+    ]
+    if args.json:
+        write_json({"candidates": [_as_json(c) for c in shown]})
+        return 0
+    counts = Counter(c.state for c in candidates)
+    sys.stdout.write(", ".join(f"{counts[state]} {state}" for state in CANDIDATE_STATES) + "\n")
+    if shown:
+        header = ("candidate", "state", "owner", "licence", "received", "answer", "kB", "about")
+        shown.sort(key=lambda c: CANDIDATE_STATES.index(c.state))  # stable: oldest first within a state
+        sys.stdout.write("\n" + format_table(header, map(_row, shown)))
+    return 0
+
+
+def _to_withdraw(candidates: Sequence[Candidate], beginnings: Sequence[str], owner: str | None) -> list[str]:
+    wanted = []
+    for beginning in beginnings:
+        found = [c.candidate_id for c in candidates if c.candidate_id.startswith(beginning)]
+        if len(beginning) < _SHORTEST_ID or len(found) != 1:
+            raise CandidateNotFoundError(
+                f"expected at least {_SHORTEST_ID} digits of the id of one photo, found {beginning!r}, which "
+                f"{len(found)} photos begin with; `featuredb candidates` lists them"
+            )
+        wanted += found
+    if owner is not None:
+        theirs = [c.candidate_id for c in candidates if owner in {giver.owner for giver in c.contributors}]
+        if not theirs:
+            raise CandidateNotFoundError(f"no photo of owner {owner!r}; `featuredb candidates` lists them")
+        wanted += theirs
+    return wanted
+
+
+def _row(candidate: Candidate) -> tuple[object, ...]:
+    about = candidate.reason and f"{candidate.reason_code}: {candidate.reason}".removeprefix(": ")
+    others = [giver.owner for giver in candidate.contributors[1:]]
+    if candidate.used_by:
+        about = f"used by {', '.join(candidate.used_by)}"
+    if others:
+        about = f"{about}; also given by {', '.join(others)}".removeprefix("; ")
+    return (
+        candidate.candidate_id[:_SHOWN_ID],
+        candidate.state,
+        candidate.owner,
+        candidate.licence,
+        candidate.received_at,
+        str(candidate.answer.get("status", "")),
+        round(candidate.size_bytes / 1000),
+        about,
+    )
+
+
+def _as_json(candidate: Candidate) -> dict[str, Any]:
+    return {
+        "candidate_id": candidate.candidate_id,
+        "sha256": candidate.sha256,
+        "state": candidate.state,
+        "used_by": candidate.used_by,
+        "reason_code": candidate.reason_code,
+        "reason": candidate.reason,
+        "size_bytes": candidate.size_bytes,
+        "width": candidate.width,
+        "height": candidate.height,
+        "contributors": [
+            {"owner": c.owner, "licence": c.licence, "client_id": c.client_id, "at": c.at}
+            for c in candidate.contributors
+        ],
+        "snapshot": candidate.snapshot,
+        "request": candidate.request,
+        "answer": candidate.answer,
+    }

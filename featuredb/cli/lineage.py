@@ -1,0 +1,139 @@
+"""`featuredb lineage`: which map stands on which, how far from its anchors, and why some do not count."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from featuredb.cli.common import add_as_of_argument, add_database_argument, open_database, write_json
+from featuredb.maps.lineage import Lineage, describe_lineage, family_of
+from featuredb.store import MapSummary, Snapshot
+
+_DOT_STYLE = {"active": "solid", "quarantined": "dashed", "retired": "dotted"}
+
+
+def register(subparsers: Any) -> None:
+    """Add `lineage` to the parser of `featuredb`."""
+    parser = subparsers.add_parser(
+        "lineage",
+        help="draw which map stands on which",
+        description="Draw the tree of maps: which one placed which, how many steps each is from its anchor, "
+        "how far it may have drifted of what growth allows (95 %), and why some are not active.",
+    )
+    add_database_argument(parser)
+    parser.add_argument(
+        "map_id", metavar="MAP", nargs="?", help="only this map, what it stands on and what stands on it"
+    )
+    parser.add_argument("--all", action="store_true", help="retired maps, too (with MAP they always show)")
+    add_as_of_argument(parser)
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="as JSON")
+    form.add_argument("--dot", action="store_true", help="as a graph for Graphviz: ... --dot | dot -Tsvg")
+    parser.set_defaults(run=run_lineage)
+
+
+def run_lineage(args: argparse.Namespace) -> int:
+    """Draw the tree."""
+    snapshot = open_database(args).snapshot(args.as_of)
+    lineages = snapshot.lineages()
+    maps = _wanted(snapshot, args.map_id, include_retired=args.all)
+    if args.json:
+        told = [_as_json(summary, lineages[map_id]) for map_id, summary in maps.items()]
+        write_json({"snapshot": snapshot.version, "maps": told})
+    elif args.dot:
+        sys.stdout.writelines(f"{line}\n" for line in draw_dot(maps, lineages))
+    else:
+        sys.stdout.writelines(f"{line}\n" for line in draw_tree(maps, lineages, args.map_id))
+    return 0
+
+
+def draw_tree(
+    maps: Mapping[str, MapSummary], lineages: Mapping[str, Lineage], marked: str | None = None
+) -> Iterator[str]:
+    """Lines of ASCII: each map once, under the parent on its shortest chain to an anchor.
+
+    Args:
+        maps: to be drawn, oldest first.
+        lineages: of at least these maps.
+        marked: a map that gets an asterisk.
+    """
+    parent_of = {map_id: _drawn_under(map_id, maps, lineages) for map_id in maps}
+    children: dict[str, list[str]] = {}
+    for map_id, parent in parent_of.items():
+        if parent is not None:
+            children.setdefault(parent, []).append(map_id)
+    roots = [map_id for map_id, parent in parent_of.items() if parent is None]
+    stack = [(map_id, "", "") for map_id in reversed(roots)]
+    while stack:
+        map_id, lead, under = stack.pop()
+        star = "* " if map_id == marked else ""
+        yield f"{lead}{star}{_line(maps[map_id], lineages[map_id], parent_of[map_id])}"
+        below = children.get(map_id, [])
+        for child in reversed(below):
+            last = child == below[-1]
+            stack.append((child, under + ("`- " if last else "|- "), under + ("   " if last else "|  ")))
+
+
+def draw_dot(maps: Mapping[str, MapSummary], lineages: Mapping[str, Lineage]) -> Iterator[str]:
+    """Lines of a Graphviz digraph, parents above the maps that they placed."""
+    yield "digraph lineage {"
+    yield "  node [shape=box, fontname=sans];"
+    for map_id, summary in maps.items():
+        label = f"{map_id}\n{summary.name}\n{describe_lineage(lineages[map_id])}"
+        yield f"  {_quoted(map_id)} [label={_quoted(label)}, style={_DOT_STYLE[summary.status]}];"
+    for map_id, summary in maps.items():
+        for parent in dict.fromkeys(summary.parents):
+            if parent in maps:
+                yield f"  {_quoted(parent)} -> {_quoted(map_id)};"
+    yield "}"
+
+
+def _wanted(snapshot: Snapshot, map_id: str | None, *, include_retired: bool) -> dict[str, MapSummary]:
+    every = {m.map_id: m for m in snapshot.maps(include_retired=True)}
+    if map_id is not None:
+        family = family_of(snapshot.get(map_id).map_id, every)
+        return {m: summary for m, summary in every.items() if m in family}
+    return {m: summary for m, summary in every.items() if include_retired or summary.status != "retired"}
+
+
+def _drawn_under(map_id: str, maps: Mapping[str, MapSummary], lineages: Mapping[str, Lineage]) -> str | None:
+    """The parent under which a map is drawn: that on its chain. None: it is a root here.
+
+    Chains lead to anchors, so nothing can be drawn under itself.
+    """
+    chain = lineages[map_id].chain
+    return chain[1] if len(chain) > 1 and chain[1] in maps else None
+
+
+def _line(summary: MapSummary, lineage: Lineage, drawn_under: str | None) -> str:
+    parts = [f"{summary.map_id}  {summary.name}", f"{summary.method}, generation {summary.generation}"]
+    parts.append(describe_lineage(lineage))
+    others = [parent for parent in dict.fromkeys(summary.parents) if parent != drawn_under]
+    if others:
+        parts.append(f"{'also ' if drawn_under else ''}from {', '.join(others)}")
+    if summary.status != "active":
+        parts.append(summary.status + (f": {summary.status_reason}" if summary.status_reason else ""))
+    return "; ".join(parts)
+
+
+def _as_json(summary: MapSummary, lineage: Lineage) -> dict[str, Any]:
+    return {
+        "map_id": summary.map_id,
+        "name": summary.name,
+        "status": summary.status,
+        "status_reason": summary.status_reason,
+        "method": summary.method,
+        "generation": summary.generation,
+        "parents": summary.parents,
+        "steps": lineage.steps,
+        "anchors": lineage.anchors,
+        "chain": lineage.chain,
+        "drift_m": lineage.drift_m,
+        "budget_m": lineage.budget_m,
+    }
+
+
+def _quoted(text: str) -> str:
+    """A string of the DOT language, which JSON's strings are as far as quotes and backslashes go."""
+    return json.dumps(text, ensure_ascii=False)
