@@ -1,7 +1,7 @@
 """The least squares behind a pose graph over maps: solution, marginal covariances, tests of measurements."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -24,12 +24,14 @@ class GraphNode:
     """A map.
 
     Attributes:
-        prior: (7, 7) covariance of its present placement, left perturbation in the graph's frame, where it
-            is an anchor; None for a map that others placed.
+        prior: (7, 7) covariance of its own placement, left perturbation in the graph's frame, where it is an
+            anchor; None for a map that others placed.
+        present_from_own: where an earlier graph has moved the anchor, from where its own placement has it.
     """
 
     map_id: str
     prior: FloatArray | None = None
+    present_from_own: Sim3 = field(default_factory=Sim3.identity)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -164,7 +166,9 @@ class _Problem:
     ) -> None:
         self._count = len(nodes)
         self._edges = [(rows[e.a], rows[e.b], e.b_from_a.inverse(), _whitening(e.covariance)) for e in edges]
-        self._priors = [(i, _whitening(n.prior)) for i, n in enumerate(nodes) if n.prior is not None]
+        self._priors = [
+            (i, n.present_from_own, _whitening(n.prior)) for i, n in enumerate(nodes) if n.prior is not None
+        ]
 
     def solve(self) -> list[Sim3]:
         """Corrections; started from the present places, then once more from where that ends."""
@@ -198,8 +202,8 @@ class _Problem:
             along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
             residuals.append(white @ miss)
             blocks += [(k, a, along), (k, b, -along)]
-        for k, (i, white) in enumerate(self._priors, start=len(self._edges)):
-            miss = places[i].log()
+        for k, (i, present_from_own, white) in enumerate(self._priors, start=len(self._edges)):
+            miss = (places[i] @ present_from_own).log()
             residuals.append(white @ miss)
             blocks.append((k, i, white @ np.linalg.inv(left_jacobian(miss))))
         return np.concatenate(residuals), _assemble(blocks, len(residuals), self._count)

@@ -204,6 +204,24 @@ def test_anchors_give_way_within_their_own_covariance() -> None:
     assert abs(found.corrections["lidar"].log()[4]) < 0.01
 
 
+def test_an_anchor_that_was_moved_remembers_its_own_placement() -> None:
+    """Moved 2 m by an earlier graph; with the same overlap again nothing moves, and nothing is counted twice."""
+    loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
+    firm = np.diag(np.repeat([1e-5, 0.03], [4, 3]) ** 2)
+    first = solve_pose_graph(
+        [GraphNode(map_id="gps", prior=loose), GraphNode(map_id="lidar", prior=firm)],
+        [_edge("gps", "lidar", _east(2.0), _TIGHT)],
+    )
+    nodes = [
+        GraphNode(map_id=m, prior=prior, present_from_own=first.corrections[m])
+        for m, prior in (("gps", loose), ("lidar", firm))
+    ]
+    measured = first.corrections["lidar"] @ Sim3.exp(_east(2.0)) @ first.corrections["gps"].inverse()
+    again = solve_pose_graph(nodes, [GraphEdge(a="gps", b="lidar", b_from_a=measured, covariance=_TIGHT)])
+    np.testing.assert_allclose(again.corrections["gps"].matrix(), np.eye(4), atol=1e-6)
+    np.testing.assert_allclose(again.covariance["gps"], first.covariance["gps"], rtol=1e-3, atol=1e-9)
+
+
 def test_a_large_graph_takes_the_sparse_way_to_the_same_answer() -> None:
     count = 200
     nodes = [GraphNode(map_id="A", prior=_TIGHT), GraphNode(map_id="B", prior=_TIGHT)]
