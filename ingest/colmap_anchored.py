@@ -3,8 +3,10 @@
 Like ingest.colmap_bridge and ingest.colmap_adjust this module knows pycolmap's reconstructions.
 """
 
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_bridge import Model, quiet
+from ingest.colmap_bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -271,3 +273,46 @@ def _only(model: Model, observation: NDArray[np.bool_]) -> Model:
         photo_of=model.photo_of[observation],
         keypoint_of=model.keypoint_of[observation],
     )
+
+
+def triangulate_posed(
+    cameras: Sequence[Camera],
+    photos: Sequence[SfmPhoto],
+    poses: Sequence[Rigid3],
+    geometries: Mapping[tuple[int, int], TwoView],
+) -> Model:
+    """Points from the verified matches of photos whose poses and lenses are known, and stay as they are.
+
+    Args:
+        photos: their camera_row names the camera. poses: cam_from_sfm of each.
+        geometries: of pairs of rows.
+    """
+    with quiet(), tempfile.TemporaryDirectory(prefix="featuredb-points-") as scratch:
+        database = Path(scratch) / "colmap.db"
+        write_database(database, [(camera, True) for camera in cameras], photos, geometries)
+        reconstruction = pycolmap.Reconstruction()
+        for c, camera in enumerate(cameras):
+            reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
+        for k, (photo, pose) in enumerate(zip(photos, poses, strict=True)):
+            image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=k + 1)
+            reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
+        settings = pycolmap.IncrementalPipelineOptions()
+        settings.extract_colors = False
+        settings.triangulation.ignore_two_view_tracks = False
+        settings.num_threads = 1
+        settings.random_seed = 0
+        side = max(max(camera.width, camera.height) for camera in cameras)
+        error_px = 4.0 * max(1.0, side / AnchoredOptions().error_reference_side_px)
+        settings.triangulation.create_max_angle_error = 2.0
+        settings.mapper.filter_max_reproj_error = error_px
+        settings.triangulation.complete_max_reproj_error = error_px
+        settings.triangulation.merge_max_reproj_error = error_px
+        settings.ba_refine_focal_length = False
+        settings.ba_refine_extra_params = False
+        output = Path(scratch) / "points"
+        output.mkdir()
+        found = pycolmap.triangulate_points(
+            reconstruction, str(database), scratch, str(output), clear_points=True, options=settings
+        )
+        found.write(str(output))
+        return read_model(output)

@@ -1,9 +1,19 @@
-"""Gates of growth: each compares one figure with its limit and says so. Pure functions."""
+"""Gates of growth: each compares one figure with its limit and says so. Pure functions.
+
+docs/growth.md shows the distributions behind the limits, and the commands that print them.
+"""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from featuredb.geometry.arrays import FloatArray
+
+# Chi-square with two degrees of freedom is above this once in 10,000 honest positions (as in reloc.prior).
+GPS_LIMIT = 18.42
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,3 +40,164 @@ class Gate:
         """Plain values."""
         figure = None if not np.isfinite(self.figure) else round(float(self.figure), 6)
         return {"figure": figure, "limit": self.limit, "passes": self.passes}
+
+
+def sigmas_limit(sigmas: float, degrees: int) -> float:
+    """Chi-square that is exceeded as seldom as a single normal figure exceeds so many sigmas."""
+    return float(chi2.isf(chi2.sf(sigmas**2, 1), degrees))
+
+
+def agreeing_photos(agreeing: int, limit: int) -> Gate:
+    """Photos whose own localisation agrees with the placement; one alone proves nothing."""
+    return Gate(
+        name="agreeing_photos",
+        reason="TOO_FEW_AGREE",
+        figure=agreeing,
+        limit=limit,
+        passes=agreeing >= limit,
+        message=f"{agreeing} photos localised by themselves agree with the placement, {limit} are needed",
+    )
+
+
+def disagreeing_share(agreeing: int, disagreeing: int, limit: float) -> Gate:
+    """Share of the localised photos that contradict the placement."""
+    total = agreeing + disagreeing
+    share = disagreeing / total if total else 0.0
+    return Gate(
+        name="disagreeing_share",
+        reason="PHOTOS_DISAGREE",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"{disagreeing} of {total} localised photos contradict the placement, "
+        f"{limit:.0%} are allowed",
+    )
+
+
+def shared_points(count: int, limit: int) -> Gate:
+    """Points of existing maps that the new photos see where they should."""
+    return Gate(
+        name="shared_points",
+        reason="TOO_FEW_SHARED_POINTS",
+        figure=count,
+        limit=limit,
+        passes=count >= limit,
+        message=f"{count} points of existing maps hold the new photos, {limit} are needed",
+    )
+
+
+def spread(sigma_m: float, distance_m: float, limit: float) -> Gate:
+    """How far the placement may be off at the rim of the new map, over the distance that photos look.
+
+    Few photos, or many close together, leave scale and tilt open; the rim moves most.
+    """
+    share = sigma_m / distance_m if distance_m > 0 else np.inf
+    return Gate(
+        name="spread",
+        reason="POORLY_HELD",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"at its rim the new map is held to {sigma_m:.2f} m, {share:.2%} of the viewing distance; "
+        f"{limit:.1%} is allowed",
+    )
+
+
+def residuals(offset_m: float, distance_m: float, limit: float) -> Gate:
+    """Typical distance of localised camera centres from the placed ones, over the viewing distance.
+
+    What is larger than poses are uncertain is the bending of one of the two reconstructions.
+    """
+    share = offset_m / distance_m if distance_m > 0 else np.inf
+    return Gate(
+        name="residuals",
+        reason="RESIDUALS",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"localised cameras lie {offset_m:.2f} m from the placed ones, {share:.2%} of the viewing "
+        f"distance; {limit:.1%} is allowed",
+    )
+
+
+def runner_up(rival_photos: int, agreeing: int, limit: float) -> Gate:
+    """Photos that agree with the best placement elsewhere, over those that agree with this one."""
+    share = rival_photos / agreeing if agreeing else np.inf
+    return Gate(
+        name="runner_up",
+        reason="AMBIGUOUS",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"{rival_photos} photos agree with another placement, {agreeing} with this one; a share of "
+        f"{limit:.0%} is allowed",
+    )
+
+
+def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, least: int = 2) -> Gate:
+    """Share of the photos with a position that their place contradicts.
+
+    Most of them must contradict before it counts, and at least `least`: a photo may lie about its place.
+
+    Args:
+        offsets_m: (n, 2) placed centre minus position, east and north.
+        covariances: (n, 2, 2) of both together.
+    """
+    against = 0
+    if len(offsets_m):
+        solved = np.linalg.solve(covariances, offsets_m[:, :, None])[:, :, 0]
+        against = int((np.einsum("ni,ni->n", offsets_m, solved) > GPS_LIMIT).sum())
+    share = against / len(offsets_m) if len(offsets_m) else 0.0
+    return Gate(
+        name="geotags",
+        reason="CONTRADICTS_GPS",
+        figure=share,
+        limit=limit,
+        passes=against < least or share <= limit,
+        message=f"{against} of {len(offsets_m)} positions contradict the placement (chi-square above "
+        f"{GPS_LIMIT}), a share of {limit:.0%} is allowed",
+    )
+
+
+def visibility(agreements: FloatArray, least: float, limit: float) -> Gate:
+    """Share of the photos that do not show what the existing maps say they should.
+
+    Args:
+        agreements: (n,) for each photo that should see parts of existing maps: share of these parts in which
+            it does.
+        least: what a photo must reach. limit: share of photos that may stay below.
+    """
+    blind = int((agreements < least).sum())
+    share = blind / len(agreements) if len(agreements) else 0.0
+    return Gate(
+        name="visibility",
+        reason="NOT_VISIBLE",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"{blind} of {len(agreements)} photos show less than {least:.0%} of what they should see of "
+        f"existing maps, a share of {limit:.0%} is allowed",
+    )
+
+
+def held_share(kept: NDArray[np.bool_], limit: float) -> Gate:
+    """Share of the anchors that the adjusted reconstruction still fits.
+
+    Args:
+        kept: (m,) for each anchor whether it fits.
+    """
+    share = float(kept.mean()) if len(kept) else 0.0
+    return Gate(
+        name="held_share",
+        reason="REFINEMENT",
+        figure=share,
+        limit=limit,
+        passes=share >= limit,
+        message=f"{share:.0%} of the existing points that hold the new photos fit after adjustment, "
+        f"{limit:.0%} are needed",
+    )
+
+
+def first_refusal(gates: tuple[Gate, ...]) -> Gate | None:
+    """The first gate that does not pass."""
+    return next((gate for gate in gates if not gate.passes), None)

@@ -1,0 +1,264 @@
+"""From a reconstruction of new photos to a map that existing maps have placed, or to the reason why not."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from featuredb.index.area import Area
+from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.lineage import GROWTH
+from ingest.colmap_anchored import Anchored, FixedPoints
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.anchors import Anchors, find_anchors
+from ingest.growth.localised import in_frame
+from ingest.growth.placement import (
+    Held,
+    PlacementOptions,
+    covariance_in,
+    largest_sigma_m,
+    map_agreements,
+    place_by_maps,
+)
+from ingest.growth.refine import RefineOptions, adopt_lenses, refine_with_maps
+from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
+from ingest.map_builder import MapIdentity, MapOptions, build_map
+from ingest.photo import Photo
+from reloc.candidates import IndexedArea
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowOptions:
+    """From a reconstruction to a map.
+
+    Attributes:
+        min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
+            lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
+            reconstruction cannot be bent to what the existing maps say.
+        maps: what goes into the map; the height datum is that of the parents.
+    """
+
+    placement: PlacementOptions = field(default_factory=PlacementOptions)
+    refine: RefineOptions = field(default_factory=RefineOptions)
+    min_held_share: float = 0.5
+    maps: MapOptions = field(default_factory=MapOptions)
+
+
+def grow_component(
+    model: Model,
+    photos: Sequence[Photo],
+    features_of: FeaturesOf,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
+    identity: MapIdentity,
+    options: GrowOptions | None = None,
+) -> GrownMap | Refused:
+    """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
+
+    Args:
+        model: a connected reconstruction; its rows are rows of `photos`.
+        localised: new photos that the maps localise, by row; others than the model's are ignored.
+        areas: of the active maps, as `localised` had them.
+        identity: of the new map.
+    """
+    options = options or GrowOptions()
+    rows = tuple(int(r) for r in model.rows)
+    mine = {r: localised[r] for r in rows if r in localised}
+    if not mine:
+        return Refused(
+            reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map", rows=rows
+        )
+    frame, near = _meeting_place(mine, areas)
+    mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
+    keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
+    model, constant = adopt_lenses(model, mine, keypoints, options.refine)
+    anchors = find_anchors(model, mine, dict(zip(rows, keypoints, strict=True)))
+    held = place_by_maps(model, mine, anchors, photos, near, frame, options.placement)
+    placement = held.placement
+    if placement.reason is not None or placement.local_from_sfm is None:
+        return Refused(
+            reason=placement.reason or "", message=placement.message, rows=rows, gates=placement.gates
+        )
+    good = anchors.take(np.flatnonzero(held.used))
+    adjusted, fixed, sharp = refine_with_maps(
+        model, placement.local_from_sfm, good, constant, keypoints, options.refine
+    )
+    gate = gates.held_share(adjusted.fixed_kept, options.min_held_share)
+    placement = replace(placement, gates=(*placement.gates, gate))
+    if not gate.passes:
+        return Refused(reason=gate.reason, message=gate.message, rows=rows, gates=placement.gates)
+    complete = with_existing(adjusted, fixed, good.take(sharp), placement.parents)
+    return assemble(complete, placement, held, photos, features_of, near, identity, options)
+
+
+def _meeting_place(
+    localised: Mapping[int, LocalisedPhoto], areas: Sequence[IndexedArea]
+) -> tuple[LocalFrame, list[Area]]:
+    """The frame of the area with most inliers, and the areas whose heights have the same datum."""
+    inliers: dict[LocalFrame, int] = {}
+    for photo in localised.values():
+        inliers[photo.frame] = inliers.get(photo.frame, 0) + len(photo.pixels)
+    frame = max(inliers, key=lambda f: inliers[f])
+    main = next(a.area for a in areas if a.area.frame == frame)
+    datum = main.maps[0].height_datum
+    return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
+
+
+def with_existing(adjusted: Anchored, fixed: FixedPoints, anchors: Anchors, parents: Sequence[str]) -> Model:
+    """The adjusted model with the existing points that at least two of its photos see as points of its own.
+
+    A map holds its points itself: a copy of an existing point is where the new photos were held.
+
+    Args:
+        anchors: (m,) of the observations of `fixed`.
+        parents: where a feature is held by points of two maps, the one that comes first here counts.
+    """
+    rank = np.array([parents.index(m) if m in parents else len(parents) for m in anchors.map_ids])
+    rows = np.flatnonzero(adjusted.fixed_kept)
+    order = rows[np.argsort(rank[anchors.map_of[rows]], kind="stable")]
+    feature = np.stack([fixed.photo_of[order], anchors.feature[order]], axis=1)
+    _, first = np.unique(feature, axis=0, return_index=True)
+    rows = np.sort(order[first])
+    pair = np.unique(np.stack([fixed.point_of[rows], fixed.photo_of[rows]], axis=1), axis=0)
+    views = np.bincount(pair[:, 0], minlength=len(fixed.xyz))
+    rows = rows[views[fixed.point_of[rows]] >= 2]
+    points, point_of = np.unique(fixed.point_of[rows], return_inverse=True)
+    model = adjusted.model
+    joined = (
+        np.concatenate([model.point_of, point_of.reshape(-1) + len(model.xyz)]),
+        np.concatenate([model.photo_of, fixed.photo_of[rows]]),
+        np.concatenate([model.keypoint_of, anchors.feature[rows]]),
+    )
+    by_point = np.lexsort((joined[1], joined[0]))
+    return replace(
+        model,
+        xyz=np.concatenate([model.xyz, fixed.xyz[points]]),
+        point_of=joined[0][by_point],
+        photo_of=joined[1][by_point],
+        keypoint_of=joined[2][by_point],
+    )
+
+
+def assemble(
+    model: Model,
+    placement: MapsPlacement,
+    held: Held,
+    photos: Sequence[Photo],
+    features_of: FeaturesOf,
+    areas: Sequence[Area],
+    identity: MapIdentity,
+    options: GrowOptions,
+    more: Mapping[str, Any] | None = None,
+) -> GrownMap | Refused:
+    """The map of a refined model, with what growth knows about it as evidence.
+
+    Args:
+        model: in metres, in the placement's frame.
+        more: further evidence of growth.
+    """
+    maps = {m.map_id: m for area in areas for m in area.maps}
+    parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
+    assert placement.covariance is not None
+    assert placement.covariance_relative is not None
+    to_anchors = placement.covariance_relative + drift_covariance(parents, placement.frame)
+    rows = tuple(int(r) for r in model.rows)
+    chosen = [photos[r] for r in rows]
+    feature_map = build_map(
+        model,
+        Placement(
+            method="map",
+            local_from_sfm=Sim3.identity(),  # the model is in metres, in the frame, since its refinement
+            covariance=placement.covariance,
+            residual_rms_m=placement.residual_rms_m,
+        ),
+        placement.frame,
+        chosen,
+        [features_of(r) for r in rows],
+        identity,
+        replace(options.maps, height_datum=parents[0][0].height_datum),
+    )
+    if feature_map is None:
+        return Refused(
+            reason="NO_POINTS",
+            message="no point is placed well enough: the photos' rays are parallel",
+            rows=rows,
+            gates=placement.gates,
+        )
+    agreements = map_agreements(placement, held.anchors.take(np.flatnonzero(held.used)))
+    growth = {
+        "drift_m": 1.96 * largest_sigma_m(to_anchors, _box_corners(feature_map)),
+        "steps": 1 + max(_steps(m) for m, _ in parents),
+        "anchors": sorted({a for m, _ in parents for a in _anchors_of(m)}),
+        "covariance_relative": to_anchors.ravel().tolist(),
+        "edges": [
+            {
+                "map_id": e.map_id,
+                "parent_from_new": e.parent_from_new.log().tolist(),
+                "covariance": e.covariance.ravel().tolist(),
+                "shared_points": e.shared_points,
+                "photos": e.photos,
+            }
+            for e in placement.edges
+        ],
+        "agreeing_photos": [photos[r].name for r in placement.agreeing],
+        "disagreeing_photos": [photos[r].name for r in placement.disagreeing],
+        "agreements": [
+            {
+                "maps": [a.map_a, a.map_b],
+                "distance_m": a.distance_m,
+                "sigma_m": a.sigma_m,
+                "sigmas": a.sigmas,
+                "text": str(a),
+            }
+            for a in agreements
+        ],
+        "gates": placement.figures(),
+        **(more or {}),
+    }
+    grown = replace(
+        feature_map,
+        status="quarantined",
+        generation=1 + max(m.generation for m, _ in parents),
+        parents=placement.parents,
+        placement=replace(feature_map.placement, evidence={GROWTH: growth}),
+    )
+    return GrownMap(feature_map=grown, placement=placement, model=model, agreements=agreements)
+
+
+def drift_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFrame) -> FloatArray:
+    """(7, 7) of the parents relative to their anchors, weighted by shared points; nothing for anchors.
+
+    As for `parents_covariance`, the mean of covariances is a bound from above.
+    """
+    total = sum(weight for _, weight in parents)
+    covariance = np.zeros((7, 7))
+    for feature_map, weight in parents:
+        flat = feature_map.placement.evidence.get(GROWTH, {}).get("covariance_relative")
+        if flat is not None:
+            own: FloatArray = np.asarray(flat, dtype=np.float64).reshape(7, 7)
+            covariance += weight / total * covariance_in(own, feature_map.frame, frame)
+    return covariance
+
+
+def _steps(feature_map: FeatureMap) -> int:
+    return int(feature_map.placement.evidence.get(GROWTH, {}).get("steps", 0))
+
+
+def _anchors_of(feature_map: FeatureMap) -> list[str]:
+    named = feature_map.placement.evidence.get(GROWTH, {}).get("anchors")
+    return list(named) if named else [feature_map.map_id]
+
+
+def _box_corners(feature_map: FeatureMap) -> FloatArray:
+    """(8, 3) corners, in the map's frame, of the box that holds 98 % of its points along each axis."""
+    low, high = np.quantile(feature_map.points_local(), (0.01, 0.99), axis=0)
+    corners: NDArray[np.float64] = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+    return corners

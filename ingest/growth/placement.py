@@ -1,0 +1,426 @@
+"""Step: a reconstruction without a place of its own is placed by the existing maps, or refused.
+
+Photos localise by themselves; the similarity that most of them agree with is fitted to all pixels in which
+they see existing points; then gates ask whether to believe it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import so3_log
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.index.area import Area
+from featuredb.maps.feature_map import FeatureMap
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.anchors import Anchors
+from ingest.growth.gates import Gate
+from ingest.growth.similarity_fit import (
+    Fit,
+    FitOptions,
+    agreeing_photos,
+    fit_similarity,
+    proposals,
+    rank_proposals,
+    tolerances_px,
+)
+from ingest.growth.values import Edge, LocalisedPhoto, MapAgreement, MapsPlacement
+from ingest.photo import Photo
+from reloc.acceptance import agreement
+from reloc.matching import visible_points
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacementOptions:
+    """When a placement is believed. `tools/growth_portions.py` prints the figures of real sets.
+
+    Attributes:
+        fit: how the similarity is found.
+        min_agreeing: photos; one alone proves nothing.
+        photo_sigmas: a photo agrees up to so many sigmas between its localised and its placed pose. The
+            sigmas are those of the localisation times the fit's spread and neighbours factor: poses from
+            the same map points share these points' errors.
+        max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
+            above 0.95; a third wrong means that the model is bent, or the place repeats itself.
+        min_shared_points: distinct points of the parents; twice what a single pose needs.
+        max_rim_sigma: at the rim of the model, over the viewing distance.
+        max_residual: root mean square of centres, over the viewing distance. Models of few photos, bent
+            and with a lens not their own, reached 0.4 %; a placement by a look-alike place shows in pixels
+            long before.
+        max_rival: share of photos that agree with another placement.
+        rival_views: placements count as different if they move the model's photos by more than this share
+            of the viewing distance.
+        max_against_gps: share of the photos with a position.
+        min_visible: least share of the parts of a photo where existing points should be seen that shows
+            some: as for a query (reloc.acceptance).
+        min_visible_points: a photo that should see fewer existing points says nothing about visibility.
+        max_blind: share of photos below `min_visible`.
+        min_map_points, min_map_photos: an existing map with fewer shared points, seen by fewer photos, is
+            not a parent: alone it would not hold the new one.
+    """
+
+    fit: FitOptions = field(default_factory=FitOptions)
+    min_agreeing: int = 2
+    photo_sigmas: float = 3.0
+    max_disagreeing: float = 0.34
+    min_shared_points: int = 30
+    max_rim_sigma: float = 0.02
+    max_residual: float = 0.01
+    max_rival: float = 0.5
+    rival_views: float = 0.05
+    max_against_gps: float = 0.5
+    min_visible: float = 0.2
+    min_visible_points: int = 30
+    max_blind: float = 0.34
+    min_map_points: int = 30
+    min_map_photos: int = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Held:
+    """A placement with what it rests on.
+
+    Attributes:
+        anchors: all of the model's. fit: over those that agree; None where nothing fits.
+        used: (m,) anchors that agree with the placement.
+    """
+
+    placement: MapsPlacement
+    anchors: Anchors
+    fit: Fit | None
+    used: NDArray[np.bool_]
+
+
+def place_by_maps(
+    model: Model,
+    localised: Mapping[int, LocalisedPhoto],
+    anchors: Anchors,
+    photos: Sequence[Photo],
+    areas: Sequence[Area],
+    frame: LocalFrame,
+    options: PlacementOptions,
+) -> Held:
+    """Place a model by the localisations of its photos.
+
+    Args:
+        model: with the lenses that it keeps.
+        localised: by row of the photos, in `frame`. Rows that are not in the model are ignored.
+        anchors: of the model, in `frame`.
+        photos: all new photos, for their positions.
+        areas: that hold the existing maps.
+    """
+    own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
+    ranked = rank_proposals(model, proposals(model, localised, anchors, options.fit), anchors, options.fit)
+    found = None
+    if ranked and len(ranked[0][1]) >= 1:
+        found = _settled(model, ranked[0][0], ranked[0][1], own, anchors, options)
+    if found is None:
+        gate = gates.agreeing_photos(0 if not ranked else len(ranked[0][1]), options.min_agreeing)
+        placement = MapsPlacement(
+            reason=gate.reason,
+            message=f"no placement: {gate.message}",
+            frame=frame,
+            disagreeing=tuple(localised_rows(model, own)),
+            gates=(gate,),
+        )
+        return Held(
+            placement=placement, anchors=anchors, fit=None, used=np.zeros(len(anchors), dtype=np.bool_)
+        )
+    fit, agree = found
+    used = np.isin(anchors.photo_of, list(agree)) | anchors.carried
+    used &= fit.errors_px < tolerances_px(model, anchors, options.fit.tolerance_rel)
+    maps = {m.map_id: m for area in areas for m in area.maps}
+    edges = _edges(model, fit, anchors, used, options)
+    on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
+    asked = _ask(
+        model, fit, agree, own, anchors, used, edges, photos, areas, frame, on_earth, ranked, options
+    )
+    refusal = gates.first_refusal(asked)
+    offsets = [_offset(model, fit.local_from_sfm, k, own[k])[3:] for k in sorted(agree)]
+    placement = MapsPlacement(
+        reason=refusal.reason if refusal else None,
+        message=refusal.message if refusal else f"placed by {', '.join(e.map_id for e in edges)}",
+        frame=frame,
+        local_from_sfm=fit.local_from_sfm,
+        covariance_relative=fit.covariance,
+        covariance=fit.covariance + on_earth,
+        agreeing=tuple(int(model.rows[k]) for k in sorted(agree)),
+        disagreeing=tuple(int(model.rows[k]) for k in sorted(set(own) - agree)),
+        edges=edges,
+        residual_rms_m=_rms(np.array(offsets).reshape(-1, 3)),
+        gates=asked,
+    )
+    return Held(placement=placement, anchors=anchors, fit=fit, used=used)
+
+
+def localised_rows(model: Model, own: Mapping[int, LocalisedPhoto]) -> list[int]:
+    """Rows of the photos of the model's photos."""
+    return [int(model.rows[k]) for k in sorted(own)]
+
+
+def _settled(
+    model: Model,
+    start: Sim3,
+    agree: NDArray[np.int64],
+    own: Mapping[int, LocalisedPhoto],
+    anchors: Anchors,
+    options: PlacementOptions,
+) -> tuple[Fit, set[int]] | None:
+    """The fit to the photos that agree with it, and these; None where no photo does."""
+    tolerance = tolerances_px(model, anchors, options.fit.tolerance_rel)
+    chosen: set[int] = {int(k) for k in agree}
+    sim, fit = start, None
+    for _ in range(5):  # the set of photos settles in two or three rounds
+        near = np.isin(anchors.photo_of, list(chosen)) | anchors.carried
+        if fit is not None:
+            near &= fit.errors_px < 2.0 * tolerance
+        if near.sum() < 4:
+            return None
+        fit = fit_similarity(model, sim, anchors, near, options.fit)
+        sim = fit.local_from_sfm
+        by_pixels = agreeing_photos(fit.errors_px, tolerance, anchors, options.fit.least_share)
+        again = {int(k) for k in by_pixels if _chi_square(model, fit, int(k), own[int(k)]) <= _limit(options)}
+        if not again:
+            return None
+        if again == chosen:
+            break
+        chosen = again
+    assert fit is not None
+    return fit, chosen
+
+
+def _limit(options: PlacementOptions) -> float:
+    return gates.sigmas_limit(options.photo_sigmas, 6)
+
+
+def _offset(model: Model, sim: Sim3, k: int, photo: LocalisedPhoto) -> FloatArray:
+    """(6,) small rotation (rad) and displacement (m) from the placed to the localised pose, local axes."""
+    placed = sim.act_on_pose(model.cam_from_sfm[k])
+    turn = so3_log(photo.cam_from_local.rotation.T @ placed.rotation)
+    return np.concatenate([turn, photo.cam_from_local.center - placed.center])
+
+
+def _chi_square(model: Model, fit: Fit, k: int, photo: LocalisedPhoto) -> float:
+    """Squared Mahalanobis length of `_offset`; the localisation's sigma is diluted as in the fit."""
+    center = fit.local_from_sfm.act(model.cam_from_sfm[k].center)
+    by_placement = np.zeros((6, 7))
+    by_placement[:3, 1:4] = np.eye(3)
+    by_placement[3:] = point_jacobian(center)
+    dilution = max(fit.spread, 1.0) ** 2 * fit.neighbours_factor
+    spread = photo.covariance * dilution + by_placement @ fit.covariance @ by_placement.T
+    offset = _offset(model, fit.local_from_sfm, k, photo)
+    return float(offset @ np.linalg.solve(spread, offset))
+
+
+def _ask(
+    model: Model,
+    fit: Fit,
+    agree: set[int],
+    own: Mapping[int, LocalisedPhoto],
+    anchors: Anchors,
+    used: NDArray[np.bool_],
+    edges: Sequence[Edge],
+    photos: Sequence[Photo],
+    areas: Sequence[Area],
+    frame: LocalFrame,
+    on_earth: FloatArray,
+    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
+    options: PlacementOptions,
+) -> tuple[Gate, ...]:
+    sim = fit.local_from_sfm
+    held = anchors.take(np.flatnonzero(used))
+    centers = sim.act(model.centers())
+    reach = (
+        float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
+    )
+    offsets = np.array([_offset(model, sim, k, own[k])[3:] for k in sorted(agree)]).reshape(-1, 3)
+    rim = np.concatenate([centers, sim.act(_corners(model.xyz))]) if len(model.xyz) else centers
+    rivals = _rival_photos(model, sim, ranked, agree, reach, options)
+    offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
+    return (
+        gates.agreeing_photos(len(agree), options.min_agreeing),
+        gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
+        gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
+        gates.spread(largest_sigma_m(fit.covariance, rim), reach, options.max_rim_sigma),
+        gates.residuals(_rms(offsets), reach, options.max_residual),
+        gates.runner_up(rivals, len(agree), options.max_rival),
+        gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
+        gates.visibility(
+            visible_parts(model, sim, held, areas, frame, options), options.min_visible, options.max_blind
+        ),
+    )
+
+
+def _rival_photos(
+    model: Model,
+    sim: Sim3,
+    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
+    agree: set[int],
+    reach_m: float,
+    options: PlacementOptions,
+) -> int:
+    """Most photos, not agreeing with the placement, that agree with a proposal elsewhere."""
+    here = sim.act(model.centers())
+    most = 0
+    for other, photos in ranked:
+        beside = [int(k) for k in photos if int(k) not in agree]
+        apart = float(np.median(np.linalg.norm(other.act(model.centers()) - here, axis=1)))
+        if len(beside) > most and apart > options.rival_views * reach_m:
+            most = len(beside)
+    return most
+
+
+def _against_positions(
+    model: Model, centers: FloatArray, photos: Sequence[Photo], frame: LocalFrame, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Horizontal offsets (n, 2) of the placed centres from the photos' positions, covariances (n, 2, 2).
+
+    Heights of photos are rarely in a known datum.
+    """
+    offsets, spreads = [], []
+    for center, row in zip(centers, model.rows.tolist(), strict=True):
+        gps = photos[row].gps
+        if gps is None:
+            continue
+        height = float(frame.geodetic_from_enu(center)[2])
+        place = frame.enu_from_geodetic([gps.latitude_deg, gps.longitude_deg, height])
+        jacobian = point_jacobian(center)[:2]
+        offsets.append((center - place)[:2])
+        spreads.append(jacobian @ covariance @ jacobian.T + np.eye(2) * gps.sigma_horizontal_m**2)
+    return np.array(offsets).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)
+
+
+def visible_parts(
+    model: Model,
+    sim: Sim3,
+    held: Anchors,
+    areas: Sequence[Area],
+    frame: LocalFrame,
+    options: PlacementOptions,
+) -> FloatArray:
+    """For each photo that should see existing points: share of the image's parts where it does so.
+
+    The other direction of localisation: what the existing maps say the placed photo must show. Photos that
+    no map localised are asked as well.
+    """
+    found: list[float] = []
+    for k in range(len(model.rows)):
+        camera = model.cameras[int(model.camera_of[k])]
+        pose = sim.act_on_pose(model.cam_from_sfm[k])
+        pixels = []
+        for area in areas:
+            in_area = pose @ frame.enu_from(area.frame)
+            rows = visible_points(area, np.arange(len(area.points), dtype=np.int64), camera, in_area)
+            pixels.append(camera.project(in_area.act(area.points[rows])))
+        expected = np.concatenate(pixels) if pixels else np.zeros((0, 2))
+        if len(expected) >= options.min_visible_points:
+            seen = held.pixels[held.photo_of == k]
+            found.append(agreement(seen, expected, camera.width, camera.height))
+    return np.array(found)
+
+
+def _edges(
+    model: Model, fit: Fit, anchors: Anchors, used: NDArray[np.bool_], options: PlacementOptions
+) -> tuple[Edge, ...]:
+    """How each existing map holds the model, by its own points alone where they suffice."""
+    found: list[Edge] = []
+    for m, map_id in enumerate(anchors.map_ids):
+        mine = used & (anchors.map_of == m)
+        points = len(np.unique(anchors.point_of[mine]))
+        photos = len(np.unique(anchors.photo_of[mine]))
+        if points < options.min_map_points or photos < options.min_map_photos:
+            continue
+        alone = fit_similarity(model, fit.local_from_sfm, anchors, mine, options.fit)
+        found.append(
+            Edge(
+                map_id=map_id,
+                parent_from_new=alone.local_from_sfm @ fit.local_from_sfm.inverse(),
+                covariance=alone.covariance,
+                shared_points=points,
+                photos=photos,
+            )
+        )
+    return tuple(sorted(found, key=lambda e: (-e.shared_points, e.map_id)))
+
+
+def parents_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFrame) -> FloatArray:
+    """(7, 7) of the parents' placements on Earth in `frame`, weighted by shared points.
+
+    The mean of covariances bounds that of a mean from above however the parents' errors are correlated:
+    parents that came of one anchor err alike.
+    """
+    total = sum(weight for _, weight in parents)
+    covariance = np.zeros((7, 7))
+    for feature_map, weight in parents:
+        moved = covariance_in(feature_map.placement.covariance, feature_map.frame, frame)
+        covariance += weight / total * moved
+    return covariance
+
+
+def covariance_in(covariance: FloatArray, old: LocalFrame, new: LocalFrame) -> FloatArray:
+    """Covariance (7, 7) of a left perturbation in one local frame, for another."""
+    if old == new:
+        return np.asarray(covariance)
+    adjoint = Sim3.from_rigid3(new.enu_from(old)).adjoint()
+    return np.asarray(adjoint @ covariance @ adjoint.T)
+
+
+def map_agreements(placement: MapsPlacement, held: Anchors) -> tuple[MapAgreement, ...]:
+    """How well each pair of parents agrees, as the new map that overlaps both sees it.
+
+    Args:
+        held: anchors that agree with the placement.
+    """
+    found: list[MapAgreement] = []
+    edges = placement.edges
+    for i, a in enumerate(edges):
+        for b in edges[i + 1 :]:
+            a_from_b = a.parent_from_new @ b.parent_from_new.inverse()
+            adjoint = a_from_b.adjoint()
+            covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
+            both = np.isin(held.map_of, [held.map_ids.index(a.map_id), held.map_ids.index(b.map_id)])
+            middle = held.points[both].mean(axis=0)
+            offset = a_from_b.act(middle) - middle
+            distance = float(np.linalg.norm(offset))
+            jacobian = point_jacobian(middle)
+            spread = jacobian @ covariance @ jacobian.T
+            axis = offset / distance if distance > 0 else np.array([1.0, 0.0, 0.0])
+            sigma = float(np.sqrt(axis @ spread @ axis))
+            found.append(
+                MapAgreement(
+                    map_a=a.map_id,
+                    map_b=b.map_id,
+                    a_from_b=a_from_b,
+                    covariance=np.asarray((covariance + covariance.T) / 2),
+                    distance_m=distance,
+                    sigma_m=sigma,
+                    sigmas=float(np.sqrt(offset @ np.linalg.solve(spread, offset))),
+                    photos=(a.photos, b.photos),
+                )
+            )
+    return tuple(found)
+
+
+def largest_sigma_m(covariance: FloatArray, points: FloatArray) -> float:
+    """Largest standard deviation, over points (n, 3), of where a similarity of that covariance puts them."""
+    jacobian = point_jacobian(points)
+    spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    return float(np.sqrt(np.linalg.eigvalsh(spread)[:, -1].max()))
+
+
+def _corners(points: FloatArray) -> FloatArray:
+    """(8, 3) corners of the box that holds 98 % of the points along each axis."""
+    low, high = np.quantile(points, (0.01, 0.99), axis=0)
+    return np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+
+
+def _rms(offsets: FloatArray) -> float:
+    """Root mean square length of (n, 3)."""
+    return float(np.sqrt((offsets**2).sum(axis=1).mean())) if len(offsets) else float("nan")
