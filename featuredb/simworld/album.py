@@ -18,6 +18,7 @@ import cv2
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.album_files import AlbumFact, Geotag, write_facts, write_tables
 from featuredb.simworld.edits import Edit, edited, edited_camera
 from featuredb.simworld.exif import exif_of
@@ -59,6 +60,7 @@ class PlannedPhoto:
         quality: of the JPEG.
         sensor: of its camera, as this person uses it.
         orientation: EXIF orientation, 6 or 8 for a phone held upright that stores landscape pictures.
+        scene_from_home: where the scene has a local frame of its own, that frame from the truth's.
     """
 
     shot: Shot
@@ -71,6 +73,7 @@ class PlannedPhoto:
     quality: int = 90
     sensor: SensorOptions = field(default_factory=SensorOptions)
     orientation: int = 1
+    scene_from_home: Rigid3 | None = None
 
 
 def write_album(
@@ -128,7 +131,11 @@ def _truth(home: Scene, photo: PlannedPhoto) -> TrueImage | None:
     camera = edited_camera(photo.shot.device.camera, photo.edits, photo.shot.seed)
     if camera is None:
         return None
-    shot = replace(photo.shot, device=replace(photo.shot.device, camera=camera), gps_enu=None)
+    pose = photo.shot.cam_from_local
+    if photo.scene_from_home is not None:
+        pose = pose @ photo.scene_from_home
+    device = replace(photo.shot.device, camera=camera)
+    shot = replace(photo.shot, device=device, cam_from_local=pose, gps_enu=None)
     return true_image(home, shot)
 
 

@@ -22,11 +22,11 @@ from featuredb.simworld.geotags import GeotagOptions, geotag_at
 from featuredb.simworld.people import Person, community
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import Shot, look_pose
+from featuredb.simworld.sights import find_sights
 from featuredb.simworld.surveyed import (
     DAYS,
     day_scene,
     moment,
-    photo_ids,
     shot_seed,
     survey_photos,
 )
@@ -132,18 +132,18 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     """All photos but the survey's."""
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
-    center = options.flight.center_m
-    mine = plan_visits(
-        home, people, options.photos, options.seed, "home", sights=options.sights, center=center
-    )
+    places = find_sights(home, options.sights, options.seed, options.flight.center_m)
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home")
+    places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
         people[:8],
+        places,
         options.other_town,
         options.seed + 1,
         "away",
-        sights=options.sights,
         first_visit=10_000,
+        kind="other_town",
     )
     rng = np.random.default_rng((options.seed, 58))
     mine = tagged(home, mine, people, options.geotags, rng)

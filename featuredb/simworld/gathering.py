@@ -1,5 +1,6 @@
 """Photos that people take of a town: visits to sights, then geotags, numbers and file names."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from featuredb.simworld.geotags import GeotagOptions, Tagging, give_geotags
 from featuredb.simworld.people import Person
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import Shot
-from featuredb.simworld.sights import Sight, Surroundings, find_sights
+from featuredb.simworld.sights import Sight, Surroundings
 from featuredb.simworld.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
 from featuredb.simworld.visits import drone_visit, ground_visit
 
@@ -22,20 +23,24 @@ _VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photograp
 def plan_visits(
     scene: Scene,
     people: tuple[Person, ...],
+    places: Sequence[Sight],
     count: int,
     seed: int,
     town: str,
     *,
-    sights: int,
-    center: tuple[float, float] = (0.0, 0.0),
     first_visit: int = 0,
+    kind: str = "",
 ) -> list[PlannedPhoto]:
     """`count` photos of a town by these people, visit by visit; without geotags, under provisional names.
 
     Everybody goes to the popular sights, and each has a taste of his own.
+
+    Args:
+        town: first part of the scenes' keys; only photos of "home" have a place in the truth.
+        first_visit: number of the first visit; visits of one album differ.
+        kind: of the facts; by default street or drone.
     """
     rng = np.random.default_rng((seed, 52))
-    places = find_sights(scene, sights, seed, center)
     if not places:
         raise InvalidValueError(f"plan_visits: no sight of {scene.name} can be photographed")
     around = Surroundings(scene)
@@ -46,7 +51,7 @@ def plan_visits(
     while len(photos) < count:
         who = int(rng.choice(len(people), p=weights / weights.sum()))
         where = int(rng.choice(len(places), p=taste[who] / taste[who].sum()))
-        taken = _visit(scene, people[who], places[where], around, visit, seed, town, rng)
+        taken = _visit(people[who], places[where], around, visit, seed, town, kind, rng)
         photos += taken[: count - len(photos)]
         visit += 1
         if visit - first_visit > _VISIT_TRIES * max(count, 50):
@@ -57,13 +62,13 @@ def plan_visits(
 
 
 def _visit(
-    scene: Scene,
     person: Person,
     sight: Sight,
     around: Surroundings,
     visit: int,
     seed: int,
     town: str,
+    kind: str,
     rng: np.random.Generator,
 ) -> list[PlannedPhoto]:
     by_drone = person.drone is not None and (person.ground is None or rng.random() < person.drone_share)
@@ -84,7 +89,7 @@ def _visit(
         fact = AlbumFact(
             name=name,
             photo_id="",
-            kind=("drone" if by_drone else "street") if town == "home" else "other_town",
+            kind=kind or ("drone" if by_drone else "street"),
             owner=person.name,
             licence=person.licence,
             title=f"{sight.name.split()[0]}, {shot.time:%B %Y}",

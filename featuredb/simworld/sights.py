@@ -11,6 +11,8 @@ from featuredb.simworld.photograph import render_depth
 from featuredb.simworld.scene import Building, Scene
 from featuredb.simworld.shot import look_pose
 
+Rect = tuple[float, float, float, float]
+
 _PROBE_WIDTH_PX = 72
 _CLASSIC_STANDS = 3  # most people photograph a sight from the same few places
 _STAND_TRIES = 150
@@ -82,16 +84,20 @@ class Surroundings:
 
 
 def find_sights(
-    scene: Scene, count: int, seed: int, center_m: tuple[float, float] = (0.0, 0.0)
+    scene: Scene,
+    count: int,
+    seed: int,
+    center_m: tuple[float, float] = (0.0, 0.0),
+    within: Rect | None = None,
 ) -> list[Sight]:
     """Sights of a town, most popular first; the same for the same arguments.
 
     Churches and squares are looked at most, then the park, halls and bridges, then ordinary houses; all the
-    more the nearer to `center_m` (town axes) they lie.
+    more the nearer to `center_m` (town axes) they lie. With `within`, only those in that rectangle.
     """
     rng = np.random.default_rng((seed, 51))
     around = Surroundings(scene)
-    candidates = _named_targets(scene, rng)
+    candidates = _named_targets(scene, within, rng)
     spread = 0.35 * max(scene.plan.size)
     scored = []
     for name, target, radius, weight in candidates:
@@ -108,10 +114,14 @@ def find_sights(
     return sights
 
 
+def _inside(point: tuple[float, float, float], rect: Rect) -> bool:
+    return rect[0] <= point[0] <= rect[2] and rect[1] <= point[1] <= rect[3]
+
+
 Target = tuple[str, tuple[float, float, float], float, float]
 
 
-def _named_targets(scene: Scene, rng: np.random.Generator) -> list[Target]:
+def _named_targets(scene: Scene, within: Rect | None, rng: np.random.Generator) -> list[Target]:
     targets: list[Target] = []
     houses: list[Target] = []
     for i, b in enumerate(scene.plan.buildings):
@@ -125,6 +135,8 @@ def _named_targets(scene: Scene, rng: np.random.Generator) -> list[Target]:
         if s.along == "y":
             y = 0.5 * sum(scene.plan.river)
             targets.append((f"bridge {s.at:.0f}", (s.at, y, 0.8), 8.0, 3.0))
+    if within is not None:
+        targets, houses = ([t for t in those if _inside(t[1], within)] for those in (targets, houses))
     picked = rng.permutation(len(houses))[: max(8, len(houses) // 10)]
     return targets + [houses[int(i)] for i in picked]
 

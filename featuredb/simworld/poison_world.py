@@ -1,0 +1,281 @@
+"""A town with traps: look-alike blocks, mirrors, liars, forgers; and honest people beside them.
+
+The survey covers the west of the town. One of its blocks stands a second time in the east, another one
+stands there mirrored. Kinds of photos:
+
+- survey, honest, canary (held out, of the mapped area), late (honest photos that arrive after the poison);
+- lookalike, mirror_block: honest photos of the two copies, where they truly stand; of the first a part says
+  to have been taken at the original;
+- mirrored: photos of the mapped area, left and right exchanged: no camera in the town can see it so;
+- liar: true photos whose owner shifts all positions by the same 150 m, or by kilometres;
+- liar_other: photos of another town, tagged with this one, by the same person;
+- altered: pieces pasted, moved, painted over, or the picture warped;
+- forged: photos of a town as it is not, in which buildings have moved or changed their facades: they agree
+  with each other.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.simworld.album import PlannedPhoto, Progress, album_is_complete, write_album
+from featuredb.simworld.album_files import Geotag
+from featuredb.simworld.edits import Edit
+from featuredb.simworld.flight import FlightOptions, survey_half_extent
+from featuredb.simworld.gathering import named, plan_visits, tagged
+from featuredb.simworld.geotags import GeotagOptions, geotag_at
+from featuredb.simworld.lookalike import Rect, blocks_of, forged, with_copied_block
+from featuredb.simworld.people import Person, community
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.sights import Sight, find_sights
+from featuredb.simworld.surveyed import day_scene, survey_photos
+from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+
+POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
+_OTHER_SEED = 1000
+_LIE_M = (130.0, 75.0)  # shift of the liar's positions, east and north: another block
+_EDITS = (
+    Edit(kind="pasted", amount=0.3),
+    Edit(kind="moved", amount=0.25),
+    Edit(kind="painted_over", amount=0.3),
+    Edit(kind="warped", amount=0.02),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoisonOptions:
+    """What to write. The same options give the same bytes.
+
+    Attributes:
+        seed: of everything. town_size_m: width and height; the survey is in the west.
+        flight: of the survey.
+        honest, late: photos of honest people before and after the poison. canaries: held-out photos.
+        per_poison: photos of each of POISONS.
+        sights: places that honest people visit. width: of the widest camera, pixels.
+        geotags: of those who do not lie. texel_m: resolution of the painted ground.
+    """
+
+    seed: int = 4
+    town_size_m: tuple[float, float] = (560.0, 260.0)
+    flight: FlightOptions = field(
+        default_factory=lambda: FlightOptions(
+            lines=6, per_line=12, oblique=8, gps_error="rtk", center_m=(-130.0, 0.0)
+        )
+    )
+    honest: int = 60
+    late: int = 40
+    canaries: int = 20
+    per_poison: int = 30
+    sights: int = 14
+    width: int = 1440
+    geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
+    texel_m: float = 0.06
+
+    def __post_init__(self) -> None:
+        if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
+            raise InvalidValueError(f"PoisonOptions: value out of range in {self}")
+
+    @classmethod
+    def short(cls, seed: int = 4) -> "PoisonOptions":
+        """A smaller town and a third of the photos, for a first look in minutes."""
+        return cls(
+            seed=seed,
+            town_size_m=(400.0, 200.0),
+            flight=FlightOptions(
+                lines=4, per_line=8, oblique=4, width=1200, gps_error="rtk", center_m=(-100.0, 10.0)
+            ),
+            honest=20,
+            late=12,
+            canaries=6,
+            per_poison=10,
+            sights=6,
+            width=1200,
+        )
+
+    def scene(self, key: str) -> Scene:
+        """Scenes "home/...", "forged/..." and "away/light/week"."""
+        return day_scene(_base(self, key.split("/")[0]), key)
+
+
+class Places(NamedTuple):
+    """Where the traps are, town axes: what the survey covers, the originals, the places of their copies."""
+
+    mapped: Rect
+    source: Rect
+    target: Rect
+    mirror_source: Rect
+    mirror_target: Rect
+
+
+@lru_cache(maxsize=4)
+def _base(options: PoisonOptions, town: str) -> Scene:
+    if town == "away":
+        return make_town(
+            options.seed + _OTHER_SEED,
+            name="other town",
+            size_m=options.town_size_m,
+            place=OTHER_TOWN_PLACE,
+            texel_m=options.texel_m,
+        )
+    places = poison_places(options)
+    scene = _plain(options)
+    scene = with_copied_block(scene, places.source, places.target)
+    scene = with_copied_block(scene, places.mirror_source, places.mirror_target, mirrored=True)
+    return scene if town == "home" else forged(scene, places.mapped, options.seed)
+
+
+@lru_cache(maxsize=2)
+def _plain(options: PoisonOptions) -> Scene:
+    return make_town(
+        options.seed, name="town with traps", size_m=options.town_size_m, texel_m=options.texel_m
+    )
+
+
+def poison_places(options: PoisonOptions) -> Places:
+    """The blocks: copies stand in the rows of their originals, as far from the mapped area as possible.
+
+    Raises:
+        InvalidValueError: a town with fewer than two rows of blocks, or without blocks on both sides.
+    """
+    half_x, half_y = survey_half_extent(options.flight)
+    cx, cy = options.flight.center_m
+    mapped = (cx - half_x, cy - half_y, cx + half_x, cy + half_y)
+    rows: dict[float, list[Rect]] = {}
+    for block in blocks_of(_plain(options).plan):
+        rows.setdefault(block[1], []).append(block)
+    pairs = []
+    for row in rows.values():
+        row.sort()
+        inside = [b for b in row if _covers(mapped, b)]
+        outside = [b for b in row if b[0] > mapped[2] + 25.0]
+        if inside and outside:
+            pairs.append(min((_unfit(options, a, b), a, b) for a in inside for b in outside[-2:])[1:])
+    if len(pairs) < 2:
+        raise InvalidValueError(
+            f"PoisonOptions: expected a town with two rows of blocks inside and outside of the survey, "
+            f"found {len(pairs)} in {options.town_size_m}"
+        )
+    (source, target), (mirror_source, mirror_target) = pairs[0], pairs[1]
+    return Places(mapped, source, target, mirror_source, mirror_target)
+
+
+def _unfit(options: PoisonOptions, source: Rect, target: Rect) -> float:
+    """How badly a copy would do as a trap: it should fit between its streets, and its houses should differ,
+    or its mirror image would be itself."""
+    wider = (source[2] - source[0]) - (target[2] - target[0])
+    x0, y0, x1, y1 = source
+    looks = {b.detail_u for b in _plain(options).plan.buildings if x0 < b.x < x1 and y0 < b.y < y1}
+    return (100.0 if wider > 4.0 else abs(wider)) - 4.0 * min(len(looks), 6)
+
+
+def _covers(outer: Rect, block: Rect) -> bool:
+    """Whether the middle of a block lies in the survey."""
+    x, y = 0.5 * (block[0] + block[2]), 0.5 * (block[1] + block[3])
+    return outer[0] <= x <= outer[2] and outer[1] <= y <= outer[3]
+
+
+def write_poison(
+    folder: Path, options: PoisonOptions, workers: int = 0, progress: Progress | None = None
+) -> Path:
+    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    if album_is_complete(folder):
+        return Path(folder)
+    home = options.scene("home/0/000")
+    photos = survey_photos(home, options.flight, options.seed) + plan_poison(options)
+    return write_album(folder, options, home, photos, workers, progress)
+
+
+def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:
+    """All photos but the survey's. `AlbumFact.batch` is 0 for honest ones and canaries, 1 for the poison,
+    2 for honest ones that come late."""
+    home, away = options.scene("home/0/000"), options.scene("away/0/000")
+    places = poison_places(options)
+    people = {p.name: p for p in community(options.width)}
+    good = tuple(people[n] for n in ("anna", "bert", "carla", "jonas", "lena"))
+    towns = _sights_of(options, home, places)
+    n = options.per_poison
+    plans = (
+        ("honest", "home", "town", good, options.honest, 0),
+        ("canary", "home", "mapped", good, options.canaries, 0),
+        ("late", "home", "town", good, options.late, 2),
+        ("lookalike", "home", "target", (people["carla"], people["greta"]), n, 1),
+        ("mirror_block", "home", "mirror_target", (people["jonas"], people["elif"]), n, 1),
+        ("mirrored", "home", "mapped", (_as(people["bert"], "mira"),), n, 1),
+        ("liar", "home", "town", (_as(people["carla"], "loki"),), n, 1),
+        ("liar_other", "away", "away", (_as(people["carla"], "loki"),), n, 1),
+        ("altered", "home", "mapped", (_as(people["jonas"], "alter"),), n, 1),
+        ("forged", "forged", "mapped", (_as(people["jonas"], "forge"), _as(people["bert"], "forge")), n, 1),
+    )
+    photos: list[PlannedPhoto] = []
+    for i, (kind, town, sights, owners, count, batch) in enumerate(plans):
+        scene = away if town == "away" else home
+        seed = options.seed + 10 * i
+        taken = plan_visits(scene, owners, towns[sights], count, seed, town, first_visit=1000 * i, kind=kind)
+        rng = np.random.default_rng((seed, 58))
+        taken = tagged(scene, taken, owners, options.geotags, rng)
+        taken = [_poisoned(p, home, places, rng) for p in taken]
+        photos += [_renamed(p, kind, batch) for p in taken]
+    return named(photos, options.seed)
+
+
+def _sights_of(options: PoisonOptions, home: Scene, places: Places) -> dict[str, Sequence[Sight]]:
+    center, seed, n = options.flight.center_m, options.seed, options.sights
+    return {
+        "town": find_sights(home, n, seed, center, _wider(places.mapped, 45.0)),
+        "mapped": find_sights(home, n, seed, center, places.mapped),
+        "target": find_sights(home, 4, seed, center, places.target),
+        "mirror_target": find_sights(home, 4, seed, center, places.mirror_target),
+        "away": find_sights(options.scene("away/0/000"), n, seed),
+    }
+
+
+def _wider(rect: Rect, margin: float) -> Rect:
+    return rect[0] - margin, rect[1] - margin, rect[2] + margin, rect[3] + margin
+
+
+def _as(person: Person, name: str) -> Person:
+    """The same cameras in other hands, who leave all their positions in their files."""
+    return replace(person, name=name, exif="full", tags=1.0, by_hand=False, edits=())
+
+
+def _renamed(photo: PlannedPhoto, kind: str, batch: int) -> PlannedPhoto:
+    """Provisional names of the plans differ; a forged or mirrored view has a true pose or none."""
+    name = f"{kind}-{photo.shot.name}"
+    home = kind != "liar_other"
+    fact = replace(photo.fact, name=name, kind=kind, batch=batch, home=home)
+    return replace(photo, shot=replace(photo.shot, name=name), fact=fact)
+
+
+def _poisoned(photo: PlannedPhoto, home: Scene, places: Places, rng: np.random.Generator) -> PlannedPhoto:
+    """What its owner does to a photo before it is sent."""
+    kind, center = photo.fact.kind, photo.shot.cam_from_local.center
+    if kind == "mirrored":
+        return replace(photo, edits=(Edit(kind="mirrored"),))
+    if kind == "altered":
+        return replace(photo, edits=(_EDITS[int(rng.integers(len(_EDITS)))],))
+    if kind == "lookalike" and photo.fact.visit % 2 == 0:
+        shift = [0.5 * (a + b - c - d) for a, b, c, d in [(*places.source[::2], *places.target[::2])]]
+        at = center + home.enu_from_town @ np.array([shift[0], 0.0, 0.0])
+        return _claiming(photo, geotag_at(home, at, 0.0, 8.0))
+    if kind == "liar":
+        far = photo.fact.visit % 3 == 2
+        at = center + np.array([*_LIE_M, 0.0]) * (30.0 if far else 1.0)
+        return _claiming(photo, geotag_at(home, at, 0.0, 5.0))
+    if kind == "liar_other":
+        spot = rng.uniform(places.mapped[:2], places.mapped[2:])
+        at = home.enu_from_town @ np.array([*spot, 40.0])
+        return _claiming(photo, geotag_at(home, at, 0.0, 5.0))
+    return photo
+
+
+def _claiming(photo: PlannedPhoto, tag: Geotag) -> PlannedPhoto:
+    return replace(photo, geotag=tag, exif="full", fact=replace(photo.fact, geotag="far"))

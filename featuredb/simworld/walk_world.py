@@ -1,0 +1,247 @@
+"""A long town: an anchor at one end, people who walk and fly away from it, and an anchor at the far end.
+
+Folders: survey/ (first anchor), photos/<owner>/ (contributed, `AlbumFact.batch` says in which step they
+arrive), probes/ (never contributed: what coverage and error are measured on, of the same steps) and
+survey_far/. Kinds: survey, survey_far, walk, probe.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.album import PlannedPhoto, Progress, album_is_complete, write_album
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.flight import FlightOptions
+from featuredb.simworld.geotags import geotag_at
+from featuredb.simworld.people import Person, community
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.shot import Shot
+from featuredb.simworld.sights import Surroundings, look_at
+from featuredb.simworld.surveyed import day_key, day_scene, moment, photo_ids, shot_seed, survey_photos
+from featuredb.simworld.town import make_town
+
+_PROBE = "probe"
+_TRIES = 8
+_VERTICAL_M = 4.0  # what a drone's height is off by
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Walker:
+    """One of those who go along: whose camera, how high (metres over ground), how far down the camera looks
+    (degrees below the horizon), how far apart across the way, and the error of the receiver, 0 for none."""
+
+    owner: str
+    heights_m: tuple[float, float]
+    down_deg: tuple[float, float]
+    across_m: float
+    gps_sigma_m: float
+
+
+WALKERS = (
+    Walker(owner="bert", heights_m=(45.0, 60.0), down_deg=(60.0, 90.0), across_m=25.0, gps_sigma_m=3.0),
+    Walker(owner="carla", heights_m=(25.0, 45.0), down_deg=(35.0, 75.0), across_m=25.0, gps_sigma_m=6.0),
+    Walker(owner="jonas", heights_m=(12.0, 28.0), down_deg=(25.0, 60.0), across_m=18.0, gps_sigma_m=0.0),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WalkOptions:
+    """What to write. The same options give the same bytes.
+
+    Attributes:
+        seed: of everything. town_size_m: width and height; people walk along the width.
+        flight: both surveys; `start_m` and `end_m` are where they stand along the town's x axis.
+        step_m: how far the people get from one step to the next; they start at the edge of the first survey
+            and arrive in the second.
+        per_step: photos of each walker in a step. probes: photos of a step that nobody contributes.
+        width: of the widest camera, pixels. texel_m: resolution of the painted ground.
+    """
+
+    seed: int = 2
+    town_size_m: tuple[float, float] = (1020.0, 210.0)
+    flight: FlightOptions = field(
+        default_factory=lambda: FlightOptions(lines=5, per_line=8, oblique=6, gps_error="rtk")
+    )
+    start_m: float = -430.0
+    end_m: float = 410.0
+    step_m: float = 35.0
+    per_step: int = 4
+    probes: int = 2
+    width: int = 1440
+    texel_m: float = 0.08
+
+    def __post_init__(self) -> None:
+        if not (self.start_m < self.end_m and self.step_m > 0 and self.per_step > 0 and self.probes >= 0):
+            raise InvalidValueError(f"WalkOptions: value out of range in {self}")
+
+    @classmethod
+    def short(cls, seed: int = 2) -> "WalkOptions":
+        """A walk of about 150 m, for a first look in minutes."""
+        return cls(
+            seed=seed,
+            town_size_m=(420.0, 200.0),
+            flight=FlightOptions(lines=3, per_line=5, oblique=4, width=1200, gps_error="rtk"),
+            start_m=-140.0,
+            end_m=130.0,
+            per_step=4,
+            probes=2,
+            width=1200,
+        )
+
+    @property
+    def steps(self) -> int:
+        """Number of steps from one survey to the other."""
+        return int(np.ceil((self.end_m - self.start_m) / self.step_m)) + 1
+
+    def scene(self, key: str) -> Scene:
+        """Scenes "home/light/week"."""
+        return day_scene(_base(self), key)
+
+
+@lru_cache(maxsize=2)
+def _base(options: WalkOptions) -> Scene:
+    return make_town(options.seed, name="long town", size_m=options.town_size_m, texel_m=options.texel_m)
+
+
+def write_walk(
+    folder: Path, options: WalkOptions, workers: int = 0, progress: Progress | None = None
+) -> Path:
+    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    if album_is_complete(folder):
+        return Path(folder)
+    return write_album(folder, options, options.scene("home/0/000"), plan_walk(options), workers, progress)
+
+
+def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:
+    """All photos: both surveys, contributed photos and probes, in the order of the steps."""
+    home = options.scene("home/0/000")
+    photos = []
+    for folder, at, seed in (("survey", options.start_m, 0), ("survey_far", options.end_m, 500)):
+        flight = replace(options.flight, center_m=(at, _middle(options)))
+        for p in survey_photos(home, flight, options.seed + seed, folder=folder):
+            photos.append(replace(p, fact=replace(p.fact, kind=folder)))
+    around = Surroundings(home)
+    people = {p.name: p for p in community(options.width)}
+    ids = iter(photo_ids(options.seed, 4 * options.steps * (options.per_step + options.probes)))
+    for step in range(options.steps):
+        rng = np.random.default_rng((options.seed, 81, step))
+        for who, walker in enumerate(WALKERS):
+            looks = _step(around, walker, people[walker.owner], options, step, options.per_step, rng)
+            photos += _photos(options, home, walker, people[walker.owner], looks, step, who, ids, "walk")
+        walker = WALKERS[step % len(WALKERS)]
+        looks = _step(around, walker, people[walker.owner], options, step, options.probes, rng)
+        photos += _photos(options, home, walker, people[walker.owner], looks, step, 9, ids, _PROBE)
+    return photos
+
+
+def _middle(options: WalkOptions) -> float:
+    """The y of the way: the middle of the town north of the river."""
+    return 0.5 * (0.5 * options.town_size_m[1] + max(_base(options).plan.river))
+
+
+Aim = tuple[FloatArray, FloatArray]
+
+
+def _step(
+    around: Surroundings,
+    walker: Walker,
+    person: Person,
+    options: WalkOptions,
+    step: int,
+    count: int,
+    rng: np.random.Generator,
+) -> list[Aim]:
+    """Eyes and targets (town axes) of one person in one step: spread over the step and a little before it,
+    looking ahead, back or aside, as free of obstacles as a drone has to be."""
+    assert person.drone is not None
+    start = options.start_m + options.step_m * step
+    found: list[Aim] = []
+    for i in range(count):
+        for _ in range(_TRIES):
+            x = start + options.step_m * ((i + rng.random()) / count * 1.4 - 0.4)
+            y = _middle(options) + float(rng.normal(0, walker.across_m))
+            above = walker.heights_m[0] + float(rng.random()) * (walker.heights_m[1] - walker.heights_m[0])
+            down = np.radians(rng.uniform(*walker.down_deg))
+            turn = float(rng.choice([0.0, 180.0, 90.0, -90.0], p=[0.5, 0.2, 0.15, 0.15]))
+            heading = np.radians(turn) + rng.normal(0, 0.2)
+            eye = np.array([x, y, around.ground(y) + above])
+            reach = above / np.tan(down)
+            target = eye + np.array([reach * np.cos(heading), reach * np.sin(heading), -above])
+            pose = look_at(around.scene, eye, target)
+            if around.free(eye) and around.worth_taking(person.drone.camera, pose, 3.0):
+                found.append((eye, target))
+                break
+    return found
+
+
+def _photos(
+    options: WalkOptions,
+    home: Scene,
+    walker: Walker,
+    person: Person,
+    aims: list[Aim],
+    step: int,
+    who: int,
+    ids: Iterator[str],
+    kind: str,
+) -> list[PlannedPhoto]:
+    """The planned photos of one person's step; a step is a day, and nobody flies at the same hour."""
+    assert person.drone is not None
+    rng = np.random.default_rng((options.seed, 82, step, who))
+    day, hour = 9 * step + who, float(rng.uniform(9.0, 18.0))
+    centers = [home.enu_from_town @ eye for eye, _ in aims]
+    photos = []
+    for i, (eye, target) in enumerate(aims):
+        photo_id = next(ids)
+        owner = person.name if kind == "walk" else _PROBE
+        name = f"{'photos/' + owner if kind == 'walk' else 'probes'}/{photo_id}.jpg"
+        wobble = rng.normal(0, [1.5, 1.0, 0.8])
+        shot = Shot(
+            name=name,
+            device=person.drone,
+            cam_from_local=look_at(home, eye, target, (wobble[0], wobble[1], wobble[2])),
+            time=moment(day, hour + 0.005 * i),
+            seed=shot_seed(options.seed, 7, step, who, i),
+        )
+        error = rng.normal(0, [walker.gps_sigma_m, walker.gps_sigma_m])
+        tag = None
+        if walker.gps_sigma_m > 0:
+            tag = geotag_at(
+                home,
+                centers[i] + np.append(error, 0.0),
+                float(rng.normal(0, _VERTICAL_M)),
+                walker.gps_sigma_m,
+            )
+        fact = AlbumFact(
+            name=name,
+            photo_id=photo_id,
+            kind=kind,
+            owner=owner,
+            licence=person.licence,
+            title=f"step {step + 1}",
+            time=shot.time,
+            geotag="near" if tag else "none",
+            visit=10 * step + who,
+            batch=step,
+            place=f"step {step + 1}",
+        )
+        photos.append(
+            PlannedPhoto(
+                shot=shot,
+                scene=day_key("home", day, hour),
+                fact=fact,
+                geotag=tag,
+                quality=person.quality,
+                sensor=person.sensor,
+            )
+        )
+    return photos
