@@ -141,7 +141,7 @@ def _placed(row: Row) -> PlacedMap:
         parents=tuple(row["parents"]),
         frame=frame,
         covariance=np.asarray(row["placement_covariance"], dtype=np.float64).reshape(7, 7),
-        place=place_key(frame, placed_at),
+        place=place_key(frame, placed_at, row["placement_covariance"]),
         corners=_corners(row, frame),
         edges=tuple(StoredEdge.from_json(edge) for edge in growth.get("edges", ())),
         evidence=evidence,
@@ -156,16 +156,17 @@ def _corners(row: Row, frame: LocalFrame) -> FloatArray:
     return frame.enu_from_utm(np.stack([box[picks[:, k], k] for k in range(3)], axis=1), row["epsg"])
 
 
-def place_key(frame: LocalFrame, local_from_sfm: Sim3) -> str:
-    """A digest of where a map lies: 16 hex digits."""
+def place_key(frame: LocalFrame, local_from_sfm: Sim3, covariance: Iterable[float]) -> str:
+    """A digest of where a map lies, and how surely: 16 hex digits, others once the map is placed anew."""
     numbers = [frame.latitude_deg, frame.longitude_deg, frame.height_m, local_from_sfm.scale]
-    numbers += [*local_from_sfm.rotation.ravel().tolist(), *local_from_sfm.translation.tolist()]
+    numbers += [*local_from_sfm.rotation.ravel().tolist(), *local_from_sfm.translation.tolist(), *covariance]
     return hashlib.sha256(np.array(numbers, dtype="<f8").tobytes()).hexdigest()[:16]
 
 
 def place_of(feature_map: FeatureMap) -> str:
     """`place_key` of a loaded map."""
-    return place_key(feature_map.frame, feature_map.placement.local_from_sfm)
+    placement = feature_map.placement
+    return place_key(feature_map.frame, placement.local_from_sfm, placement.covariance.ravel().tolist())
 
 
 def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:

@@ -265,7 +265,8 @@ def _commit(
         if maps[map_id].is_anchor and ways[map_id] < options.min_move_m:
             own = Sim3.identity()
         else:
-            moved[map_id] = move_map(snapshot.load_map(map_id), own)
+            covariance = covariance_in_frame(solution.covariance[map_id], frame, maps[map_id].frame)
+            moved[map_id] = move_map(snapshot.load_map(map_id), own, covariance=covariance)
         corrections[map_id] = own
     places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
     contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}
@@ -329,7 +330,6 @@ def _with_evidence(
 ) -> tuple[FeatureMap, float]:
     """The moved map with its new covariance, drift and overlaps; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
-    covariance = covariance_in_frame(solution.covariance[map_id], frame, own)
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
     drift = drift_m(relative, corners_of(feature_map))
     growth = growth_of(feature_map.placement.evidence)
@@ -348,7 +348,6 @@ def _with_evidence(
         }
     placement = replace(
         feature_map.placement,
-        covariance=covariance,
         evidence={**feature_map.placement.evidence, GROWTH: growth},
     )
     parents = before.parents

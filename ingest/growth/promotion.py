@@ -1,0 +1,241 @@
+"""Quarantined maps are promoted once independent sources confirm them and no canary regresses."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from featuredb.errors import ConflictError
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store import Database, MapSummary, Snapshot
+from ingest.growth.canaries import CanaryOptions, CanaryRun, run_canaries
+from ingest.growth.confirmation import Confirmation, ConfirmationOptions, confirm
+from ingest.growth.gates import Gate
+from ingest.growth.witnesses import Heard, NewPhotos, WitnessOptions, hear_witnesses
+from reloc.localiser import Localiser
+
+_LOG = logging.getLogger(__name__)
+_AROUND_M = 100.0  # boxes of maps that come this close may show the same
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PromotionOptions:
+    """What a promotion needs.
+
+    Attributes:
+        max_contradictions: share of the outside photos found in a map that may have their known place
+            elsewhere; one look-alike among many is no proof against it.
+    """
+
+    max_contradictions: float = 0.25
+    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
+    witnesses: WitnessOptions = field(default_factory=WitnessOptions)
+    canaries: CanaryOptions = field(default_factory=CanaryOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Promotion:
+    """What became of one quarantined map.
+
+    Attributes:
+        promoted: whether it is active now.
+        reason_code, reason: why it stays in quarantine; the reason of the promotion otherwise.
+        gates: of confirmation, witnesses and canaries.
+    """
+
+    map_id: str
+    promoted: bool
+    reason_code: str
+    reason: str
+    gates: tuple[Gate, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "map_id": self.map_id,
+            "promoted": self.promoted,
+            "reason_code": self.reason_code,
+            "reason": self.reason,
+            "gates": {gate.name: gate.as_json() for gate in self.gates},
+        }
+
+
+def promote_confirmed(
+    database: Database,
+    localiser: Localiser,
+    options: PromotionOptions | None = None,
+    new: NewPhotos | None = None,
+    *,
+    budget_m: float,
+) -> list[Promotion]:
+    """Try every quarantined map that growth has made.
+
+    Args:
+        localiser: of the active maps of the newest snapshot.
+        new: photos that may bear witness, beside the images of other maps.
+        budget_m: maps that have drifted further stay.
+
+    Raises:
+        StoreError
+    """
+    options = options or PromotionOptions()
+    snapshot = database.snapshot()
+    waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
+    ready: list[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]] = []
+    outcomes: list[Promotion] = []
+    for summary in waiting:
+        held_back = _held_back(summary, snapshot, budget_m)
+        if held_back is not None:
+            outcomes.append(held_back)
+            continue
+        feature_map = snapshot.load_map(summary.map_id)
+        confirmation, gates = examine(feature_map, snapshot, options, new)
+        failed = next((gate for gate in gates if not gate.passes), None)
+        if failed is not None:
+            outcomes.append(_stays(summary.map_id, failed.reason, failed.message, gates))
+        else:
+            ready.append((summary, feature_map, confirmation, gates))
+    if ready:
+        outcomes += _promote(database, snapshot, localiser, ready, options)
+    return outcomes
+
+
+def examine(
+    feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
+) -> tuple[Confirmation, tuple[Gate, ...]]:
+    """How far others confirm a map: by its own photos alone if they do, else with photos from outside."""
+    alone = confirm(feature_map, options.confirmation)
+    heard = hear_witnesses(
+        feature_map, _others(feature_map.map_id, snapshot), new, options.confirmation, options.witnesses
+    )
+    found = (
+        alone if alone.confirmed_by_others else confirm(feature_map, options.confirmation, heard.witnesses)
+    )
+    return found, (*found.gates, contradiction_gate(heard, options.max_contradictions))
+
+
+def contradiction_gate(heard: Heard, limit: float) -> Gate:
+    """Whether photos whose place is known are found elsewhere by the map."""
+    total = len(heard.witnesses) + len(heard.contradictions)
+    share = len(heard.contradictions) / total if total else 0.0
+    example = f": {heard.contradictions[0]}" if heard.contradictions else ""
+    return Gate(
+        name="witnesses_agree",
+        reason="CONTRADICTED",
+        figure=share,
+        limit=limit,
+        passes=share <= limit,
+        message=f"{len(heard.contradictions)} of {total} photos from outside contradict it{example}",
+    )
+
+
+def canary_gate(run: CanaryRun) -> Gate:
+    """Whether no known answer got worse."""
+    return Gate(
+        name="canaries",
+        reason="CANARY",
+        figure=len(run.regressions),
+        limit=0,
+        passes=not run.regressions,
+        message=run.message,
+    )
+
+
+def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
+    """What keeps a map in quarantine before anybody is asked."""
+    if "was placed anew" in summary.status_reason:
+        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason, ())
+    inactive = [p for p in summary.parents if not _active(snapshot, p)]
+    if len(inactive) == len(summary.parents):
+        return _stays(
+            summary.map_id, "NO_PARENT", f"no active map holds it: {', '.join(inactive)} is not active", ()
+        )
+    if summary.drift_m is not None and summary.drift_m > budget_m:
+        return _stays(
+            summary.map_id,
+            "DRIFT_BUDGET",
+            f"it may have drifted {summary.drift_m:.2f} m from its anchors, {budget_m:.2f} m are allowed",
+            (),
+        )
+    return None
+
+
+def _active(snapshot: Snapshot, map_id: str) -> bool:
+    return any(m.map_id == map_id and m.status == "active" for m in snapshot.maps())
+
+
+def _stays(map_id: str, code: str, reason: str, gates: tuple[Gate, ...]) -> Promotion:
+    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=gates)
+
+
+def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
+    """Maps around one, active or quarantined."""
+    me = snapshot.get(map_id)
+    if me.box is None:
+        return []
+    box = me.box
+    near = snapshot.maps_in(
+        me.epsg,
+        box.min_easting - _AROUND_M,
+        box.min_northing - _AROUND_M,
+        box.max_easting + _AROUND_M,
+        box.max_northing + _AROUND_M,
+    )
+    same = [m for m in near if m.map_id != map_id and m.extractor_fingerprint == me.extractor_fingerprint]
+    return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
+
+
+def _promote(
+    database: Database,
+    snapshot: Snapshot,
+    before: Localiser,
+    ready: Sequence[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]],
+    options: PromotionOptions,
+) -> list[Promotion]:
+    """Ask the canaries: of all of them together, and one by one where that shows a regression."""
+    together = _tried(database, before, [m for _, m, _, _ in ready], options)
+    if not together.regressions or len(ready) == 1:
+        return _decide(database, snapshot, before, ready, together)
+    outcomes: list[Promotion] = []
+    localiser = before
+    for item in ready:
+        run = _tried(database, localiser, [item[1]], options)
+        decided = _decide(database, snapshot, localiser, [item], run)
+        outcomes += decided
+        if decided[0].promoted:
+            snapshot = database.snapshot()
+            localiser = Localiser.open(database, previous=localiser)
+    return outcomes
+
+
+def _tried(
+    database: Database, before: Localiser, maps: Sequence[FeatureMap], options: PromotionOptions
+) -> CanaryRun:
+    after = Localiser.open(database, previous=before, also=[m.map_id for m in maps])
+    return run_canaries(database, before, after, maps, options.canaries)
+
+
+def _decide(
+    database: Database,
+    snapshot: Snapshot,
+    before: Localiser,
+    ready: Sequence[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]],
+    run: CanaryRun,
+) -> list[Promotion]:
+    gate = canary_gate(run)
+    ids = [summary.map_id for summary, _, _, _ in ready]
+    if not gate.passes:
+        return [_stays(s.map_id, gate.reason, gate.message, (*gates, gate)) for s, _, _, gates in ready]
+    reason = f"{'; '.join(dict.fromkeys(c.message for _, _, c, _ in ready))}; {run.message}"
+    active = [m.write_id for m in snapshot.maps() if m.status == "active"]
+    try:
+        database.set_status(
+            ids, "active", reason, based_on={s.map_id: s.write_id for s, _, _, _ in ready}, active=active
+        )
+    except ConflictError as error:
+        _LOG.info("promotion of %s waits: %s", ids, error)
+        return [_stays(s.map_id, "CONFLICT", str(error), (*gates, gate)) for s, _, _, gates in ready]
+    _LOG.info("promoted %s: %s", ids, reason)
+    return [
+        Promotion(map_id=s.map_id, promoted=True, reason_code="", reason=reason, gates=(*gates, gate))
+        for s, _, _, gates in ready
+    ]
