@@ -40,10 +40,10 @@ def read_events(
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"cannot read the table candidates ({error}); run `featuredb verify`") from error
     # As in commits.read_rows: no look into the system's time zone files.
-    times = table["at"].cast(pa.timestamp("us")).to_pylist()
-    rows: list[Row] = table.drop_columns("at").to_pylist()
+    times = table["happened_at"].cast(pa.timestamp("us")).to_pylist()
+    rows: list[Row] = table.drop_columns("happened_at").to_pylist()
     for row, time in zip(rows, times, strict=True):
-        row["at"] = time.replace(tzinfo=UTC)
+        row["happened_at"] = time.replace(tzinfo=UTC)
     return sorted(rows, key=event_order)
 
 
@@ -68,17 +68,19 @@ def note_events(database: Database, events: Mapping[str, Row]) -> None:
     """
     if not events:
         return
-    known = read_events(database, columns=["candidate_id", "write_id", "event_index", "at"])
+    known = read_events(database, columns=["candidate_id", "write_id", "event_index", "happened_at"])
     if missing := sorted(set(events) - {row["candidate_id"] for row in known}):
         raise not_found(missing)
     now = after(known, events, datetime.now(UTC))
-    rows = [{**event, "candidate_id": candidate_id, "at": now} for candidate_id, event in events.items()]
+    rows = [
+        {**event, "candidate_id": candidate_id, "happened_at": now} for candidate_id, event in events.items()
+    ]
     append_events(database, rows, new_write_id(now))
 
 
 def after(known: Iterable[Row], candidate_ids: Collection[str], time: datetime) -> datetime:
     """`time`, or so much later that it follows all known events of these candidates, whatever the clocks."""
-    earlier: list[datetime] = [row["at"] for row in known if row["candidate_id"] in candidate_ids]
+    earlier: list[datetime] = [row["happened_at"] for row in known if row["candidate_id"] in candidate_ids]
     return max([time, *(at + timedelta(microseconds=1) for at in earlier)])
 
 

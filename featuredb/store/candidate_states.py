@@ -137,7 +137,7 @@ def candidate_id_of(image: bytes) -> str:
 
 def event_order(event: Row) -> tuple[datetime, str, int]:
     """Sorts events by time; those of one write in the order in which they were given."""
-    return event["at"], event["write_id"], event["event_index"]
+    return event["happened_at"], event["write_id"], event["event_index"]
 
 
 def standing_of(events: Sequence[Row], live_maps: Collection[str]) -> Standing:
@@ -185,7 +185,7 @@ def contributors_of(events: Iterable[Row]) -> tuple[Contributor, ...]:
                     owner=event["owner"],
                     licence=event["licence"],
                     client_id=event["client_id"] or "",
-                    at=event["at"],
+                    at=event["happened_at"],
                 ),
             )
     return tuple((found or gone).values())
@@ -195,7 +195,9 @@ def candidate_of(events: Sequence[Row], live_maps: Collection[str]) -> Candidate
     """A candidate out of all its events, in order, among them at least one contribution."""
     given = [event for event in events if event["event"] == CONTRIBUTED]
     contributors = contributors_of(events)
-    first = next(e for e in given if e["at"] == contributors[0].at and e["owner"] == contributors[0].owner)
+    first = next(
+        e for e in given if e["happened_at"] == contributors[0].at and e["owner"] == contributors[0].owner
+    )
     standing = standing_of(events, live_maps)
     return Candidate(
         candidate_id=first["candidate_id"],

@@ -14,8 +14,10 @@ from featuredb.store.database import Database
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
 
 _EVENTS = (CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN)
-_COLUMNS = ("candidate_id", "write_id", "event_index", "event", "at", "sha256", "map_id", "reason_code",
-            "reason")  # fmt: skip
+_COLUMNS = (
+    "candidate_id", "write_id", "event_index", "event", "happened_at", "sha256", "map_id", "reason_code",
+    "reason",
+)  # fmt: skip
 
 
 def growth_tables(database: Database) -> tuple[str, ...]:
@@ -28,7 +30,7 @@ def growth_tables(database: Database) -> tuple[str, ...]:
 
 def named_writes(database: Database) -> set[str]:
     """Write ids of the events, which are those of the images that they name."""
-    events = read_events(database, columns=("candidate_id", "write_id", "event_index", "at"))
+    events = read_events(database, columns=("candidate_id", "write_id", "event_index", "happened_at"))
     return {event["write_id"] for event in events}
 
 
@@ -40,7 +42,7 @@ def superfluous_images(database: Database, now: datetime, history: timedelta) ->
     found = set()
     for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
         state = standing_of(events, live).state
-        if state == "withdrawn" or (state == "refused" and now - events[-1]["at"] >= history):
+        if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
             found.add(candidate_id)
     stored = database.table(CANDIDATE_IMAGES).dataset().to_table(["candidate_id"], use_threads=False)
     return found & set(stored["candidate_id"].to_pylist())

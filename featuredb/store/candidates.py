@@ -46,7 +46,7 @@ from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
 
-_ORDER = ("candidate_id", "write_id", "event_index", "event", "at", "owner")
+_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "owner")
 _LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
 
 
@@ -109,7 +109,7 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
             images[candidate_id] = contribution.image
         mine.add(contribution.owner)
         at = after(known, {candidate_id}, contribution.received_at.astimezone(UTC))
-        row = {"candidate_id": candidate_id, "event": CONTRIBUTED, "at": at}
+        row = {"candidate_id": candidate_id, "event": CONTRIBUTED, "happened_at": at}
         rows.append({**_contribution_row(contribution), **row})
     if images:
         columns = {"candidate_id": list(images), "write_id": [write_id] * len(images)}

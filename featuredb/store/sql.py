@@ -122,7 +122,10 @@ class SqlSession:
 
     def _register_growth(self, database: Database) -> None:
         there = growth_tables(database)
-        for name, time, hidden in ((CANDIDATES, "at", "event_index"), (CANARIES, "created_at", "image")):
+        for name, time, hidden in (
+            (CANDIDATES, "happened_at", "event_index"),
+            (CANARIES, "created_at", "image"),
+        ):
             columns = [field.name for field in SPECS[name].schema if field.name not in (hidden, "write_id")]
             if name in there:
                 rows = database.table(name).dataset().to_table(columns)

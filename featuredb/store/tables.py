@@ -234,7 +234,7 @@ _CANDIDATES_SCHEMA = pa.schema(
         _required("write_id", pa.string()),
         _required("event_index", pa.int32()),
         _required("event", pa.string()),
-        _required("at", pa.timestamp("us", tz="UTC")),
+        _required("happened_at", pa.timestamp("us", tz="UTC")),
         pa.field("owner", pa.string()),
         pa.field("licence", pa.string()),
         pa.field("client_id", pa.string()),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.growth_suite import GrowthSuite
 from tests.support.maps import random_map
 from tests.support.s3_server import BUCKET, ceph_gateway, missing_ceph_programs, moto_server
 from tests.support.store_suite import Place, StoreSuite
@@ -60,6 +61,18 @@ class TestCephStore(StoreSuite):
 class TestMotoStore(StoreSuite):
     """moto, which a test machine without Ceph has."""
 
+    @pytest.fixture
+    def place(self, moto: dict[str, str]) -> Place:
+        return _new_place(moto)
+
+
+class TestCephInbox(GrowthSuite):
+    @pytest.fixture
+    def place(self, ceph: dict[str, str]) -> Place:
+        return _new_place(ceph)
+
+
+class TestMotoInbox(GrowthSuite):
     @pytest.fixture
     def place(self, moto: dict[str, str]) -> Place:
         return _new_place(moto)

@@ -29,7 +29,7 @@ def events(text: str) -> list[dict[str, Any]]:
         row: dict[str, Any] = {
             "candidate_id": "c0",
             "event": kind,
-            "at": NOON + timedelta(minutes=i),
+            "happened_at": NOON + timedelta(minutes=i),
             "write_id": f"{i:032x}",
             "event_index": 0,
             "owner": None,
@@ -102,7 +102,7 @@ def test_who_gives_a_withdrawn_photo_again_is_its_contributor() -> None:
 
 def test_events_sort_by_time_then_as_they_were_given() -> None:
     rows = events("contributed refused:A reopened")
-    rows[1]["at"] = rows[2]["at"]
+    rows[1]["happened_at"] = rows[2]["happened_at"]
     rows[1]["write_id"] = rows[2]["write_id"]
     rows[2]["event_index"] = 1
     assert sorted([rows[2], rows[0], rows[1]], key=event_order) == rows

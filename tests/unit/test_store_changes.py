@@ -5,7 +5,15 @@ from typing import Any
 import pytest
 
 from featuredb.errors import MapNotFoundError, StoreError
-from featuredb.store.changes import add_maps, anchored, descendants, live_row, retire_map
+from featuredb.store.changes import (
+    Change,
+    add_maps,
+    anchored,
+    change_status,
+    descendants,
+    live_row,
+    retire_map,
+)
 
 
 def row(map_id: str, *parents: str, status: str = "active") -> dict[str, Any]:
@@ -112,3 +120,40 @@ def test_a_retired_row_of_the_same_id_gives_way() -> None:
     change = add_maps([row("a", status="retired")], [row("a")], ())
     assert [(r["map_id"], r["status"]) for r in change.rows] == [("a", "active")]
     assert not change.only_adds
+
+
+def statuses(change: Change) -> dict[str, str]:
+    return {r["map_id"]: r["status"] for r in change.rows}
+
+
+def test_quarantine_takes_what_stands_on_the_map_alone() -> None:
+    change, changed = change_status(FAMILY, ["a"], "quarantined", "doubt")
+    assert changed == ["a", "c", "d"]
+    assert {m for m, status in statuses(change).items() if status == "quarantined"} == {"a", "c", "d"}
+    reasons = {r["map_id"]: r["status_reason"] for r in change.rows}
+    assert (reasons["a"], reasons["c"], reasons["e"]) == ("doubt", "doubt (a)", "")
+    assert all(r["status"] == "active" for r in FAMILY), "the old rows are untouched"
+
+
+def test_promotion_needs_a_chain_of_active_parents() -> None:
+    rows = [row("a"), row("b", "a", status="quarantined"), row("c", "b", status="quarantined")]
+    assert change_status(rows, ["b"], "active", "seen")[1] == ["b"]
+    assert change_status(rows, ["c", "b"], "active", "seen")[1] == ["c", "b"]
+    with pytest.raises(StoreError, match=r"b is quarantined.*promote the parents first"):
+        change_status(rows, ["c"], "active", "seen")
+    with pytest.raises(StoreError, match="gone is not there"):
+        change_status([row("x", "gone", status="quarantined")], ["x"], "active", "seen")
+
+
+def test_a_promotion_leaves_others_alone() -> None:
+    """x is active on a parent that is not there, as after a hand-made change: not this commit's business."""
+    rows = [*FAMILY, row("n", "a", status="quarantined")]
+    change, changed = change_status(rows, ["n", "n"], "active", "seen")
+    assert changed == ["n"]
+    assert {m for m, status in statuses(change).items() if status != "active"} == set()
+    assert not change.only_adds
+
+
+def test_nothing_to_change_is_no_change() -> None:
+    change, changed = change_status(FAMILY, ["a", "b"], "active", "seen")
+    assert (changed, change.only_adds, change.added) == ([], True, [])
