@@ -142,7 +142,8 @@ def add_canary(
         "snapshot": snapshot,
         "note": note,
     }
-    Table.create(database.table_url(CANARIES), SPECS[CANARIES], database.storage_options)
+    if not has_canaries(database):
+        Table.create(database.table_url(CANARIES), SPECS[CANARIES], database.storage_options)
 
     def attempt() -> Row:
         table = database.table(CANARIES)

@@ -93,8 +93,9 @@ def contribute(database: Database, contributions: Sequence[Contribution]) -> lis
     Raises:
         StoreError: the store failed; none of them is visible.
     """
-    for name in reversed(CANDIDATE_TABLES):
-        Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    if not has_candidates(database):
+        for name in reversed(CANDIDATE_TABLES):  # `candidates` last: where it is, the other is, too
+            Table.create(database.table_url(name), SPECS[name], database.storage_options)
     ids = [candidate_id_of(c.image) for c in contributions]
     known = read_events(database, columns=_ORDER, candidate_ids=set(ids))
     owners = _owners(known)

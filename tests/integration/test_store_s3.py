@@ -66,12 +66,6 @@ class TestMotoStore(StoreSuite):
         return _new_place(moto)
 
 
-class TestCephInbox(GrowthSuite):
-    @pytest.fixture
-    def place(self, ceph: dict[str, str]) -> Place:
-        return _new_place(ceph)
-
-
 class TestMotoInbox(GrowthSuite):
     @pytest.fixture
     def place(self, moto: dict[str, str]) -> Place:
