@@ -167,6 +167,30 @@ def check_known(
     )
 
 
+def answer_now(
+    database: Database, image: bytes, tolerance_m: float, tolerance_deg: float
+) -> tuple[KnownPose | None, int]:
+    """What the active maps answer to a photo, as what is known of it; None where they do not localise it.
+
+    Raises:
+        ImageError: no usable image.
+    """
+    localiser = Localiser.open(database)
+    gray = decode_gray(image, DecodeLimits())
+    result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, gray))
+    if result.pose is None:
+        return None, localiser.snapshot
+    known = KnownPose(
+        epsg=result.pose.epsg,
+        utm=result.pose.utm,
+        height_datum=result.pose.height_datum,
+        cam_from_utm_xyzw=result.pose.cam_from_utm_xyzw,
+        tolerance_m=tolerance_m,
+        tolerance_deg=tolerance_deg,
+    )
+    return known, localiser.snapshot
+
+
 def known_verdict(result: LocaliseResult, expected: KnownPose | None) -> Verdict:
     """What an answer to a known query is worth."""
     if expected is None:

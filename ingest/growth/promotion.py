@@ -99,6 +99,29 @@ def promote_confirmed(
     return outcomes
 
 
+def promote_by_hand(
+    database: Database, map_id: str, reason: str, *, force: bool, options: PromotionOptions | None = None
+) -> Promotion:
+    """Promote one map without confirmation; canaries are asked, and refuse it unless forced.
+
+    Raises:
+        MapNotFoundError, StoreError: it is retired, or no active map holds it.
+        ConflictError: it was changed by someone else meanwhile.
+    """
+    options = options or PromotionOptions()
+    snapshot = database.snapshot()
+    summary = snapshot.get(map_id)
+    if summary.status == "active":
+        return Promotion(map_id=map_id, promoted=True, reason_code="", reason="it was active already")
+    before = Localiser.open(database)
+    gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], options))
+    if not gate.passes and not force:
+        return _stays(map_id, gate.reason, gate.message, (gate,))
+    text = f"{reason} (by hand; {gate.message})"
+    database.set_status([map_id], "active", text, based_on={map_id: summary.write_id})
+    return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=(gate,))
+
+
 def examine(
     feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
 ) -> tuple[Confirmation, tuple[Gate, ...]]:

@@ -1,0 +1,164 @@
+"""`featuredb grow`: contributed photos that wait become maps; once, or as a worker beside the server."""
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from featuredb.errors import FeatureDbError
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.store import Database
+from featuredb.store.candidate_states import Candidate
+from featuredb.store.candidates import list_candidates, refuse
+from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
+from ingest.fingerprint import digest
+from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
+from ingest.growth.grow import GrowthOptions, GrowthPhotos, extractor_for, grow
+from ingest.growth.growth_report import GrowthReport, PhotoFate
+from ingest.reconstruction import MapMakingOptions, reconstruct_photos
+from ingest.workspace import Workspace, default_root, remove_leftovers
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowingOptions:
+    """A run of `featuredb grow`.
+
+    Attributes:
+        growth: from reconstructions to promoted maps.
+        making: from photos to reconstructions; whether descriptors are upright follows the active maps.
+        workers: processes of extraction, matching and reconstruction; 1 runs everything in this process.
+        work: work folder; default inside the database.
+        give_up_days: photos that have waited so long without any use are refused: each run tries all that
+            wait. Their owner, or `featuredb candidates`, can open them again.
+        max_photos: that one run takes, oldest first; more wait for the next.
+    """
+
+    growth: GrowthOptions = field(default_factory=GrowthOptions)
+    making: MapMakingOptions = field(default_factory=MapMakingOptions)
+    workers: int = 1
+    work: Path | None = None
+    give_up_days: float = 90.0
+    max_photos: int = 2000
+
+
+def grow_candidates(
+    database: Database,
+    options: GrowingOptions | None = None,
+    progress: Progress = no_progress,
+    *,
+    now: datetime | None = None,
+) -> GrowthReport:
+    """Take the contributed photos that wait, and let the database grow by them.
+
+    Raises:
+        StoreError, ConflictError: the database cannot be read or written; what is committed stands.
+        IngestError: a worker process died; what it left is used again.
+    """
+    options = options or GrowingOptions()
+    now = now or datetime.now(UTC)
+    work = options.work or default_root(database.url)
+    remove_leftovers(work)
+    waiting = waiting_photos(database, work, progress)
+    photos = waiting.photos[: options.max_photos]
+    if options.workers == 1:
+        new, unreadable = _prepared(database, waiting, work, options, InProcessExecutor(), progress)
+    else:
+        with PoolExecutor(options.workers) as pool:
+            new, unreadable = _prepared(database, waiting, work, options, pool, progress)
+    report = grow(database, new, work, options.growth)
+    refused = _refuse(database, {**waiting.unusable, **unreadable}, report, now, options)
+    left = len(waiting.photos) - len(photos)
+    notes = (*report.notes, *((f"{left} photos wait for the next run",) if left else ()))
+    kept = tuple(p for p in report.photos if p.name not in refused)
+    return replace(report, photos=(*kept, *refused.values()), notes=notes)
+
+
+def _prepared(
+    database: Database,
+    waiting: CandidatePhotos,
+    work: Path,
+    options: GrowingOptions,
+    executor: Executor,
+    progress: Progress,
+) -> tuple[GrowthPhotos, dict[str, tuple[str, str]]]:
+    """Features, matches and reconstructions of the waiting photos; and those that cannot be read."""
+    photos = waiting.photos[: options.max_photos]
+    extractor: ExtractorOptions = extractor_for(database.snapshot(), options.making.extractor)
+    making = replace(options.making, extractor=extractor)
+    job = digest("growth", making.fingerprint, *sorted(p.sha256 for p in photos))[:24]
+    done = reconstruct_photos(photos, Workspace(root=work, job_id=job), making, executor, progress=progress)
+    ids = dict(zip((p.name for p in photos), waiting.candidate_ids, strict=False))
+    new = GrowthPhotos(
+        photos=done.usable,
+        features_of=done.features.__getitem__,
+        models=done.reconstruction.models,
+        candidate_ids={row: ids[photo.name] for row, photo in enumerate(done.usable)},
+    )
+    return new, {ids[name]: ("UNREADABLE", reason) for name, reason in done.unreadable.items()}
+
+
+def _refuse(
+    database: Database,
+    unusable: dict[str, tuple[str, str]],
+    report: GrowthReport,
+    now: datetime,
+    options: GrowingOptions,
+) -> dict[str, PhotoFate]:
+    """Refuse for good what can never be used: broken files, copies, photos of retired maps, the forgotten."""
+    reasons = dict(unusable)
+    reasons.update(
+        {p.name: (p.reason_code, p.reason) for p in report.photos if p.reason_code == "RETIRED_MAP"}
+    )
+    oldest = now - timedelta(days=options.give_up_days)
+    candidates: dict[str, Candidate] = {c.candidate_id: c for c in list_candidates(database, state="waiting")}
+    for photo in report.photos:
+        candidate = candidates.get(photo.name)
+        if photo.outcome == "waiting" and candidate is not None and candidate.received_at < oldest:
+            text = f"waited {options.give_up_days:.0f} days: {photo.reason_code}: {photo.reason}"
+            reasons.setdefault(photo.name, ("GAVE_UP", text))
+    reasons = {c: why for c, why in reasons.items() if c in candidates}
+    if reasons:
+        refuse(database, reasons)
+    return {
+        c: PhotoFate(name=c, owner=candidates[c].owner, outcome="refused", reason_code=code, reason=reason)
+        for c, (code, reason) in reasons.items()
+    }
+
+
+def watch_and_grow(
+    database: Database,
+    options: GrowingOptions,
+    stop: threading.Event,
+    on_report: Callable[[GrowthReport], None],
+    *,
+    poll_s: float = 30.0,
+) -> None:
+    """Grow whenever photos have arrived or the maps have changed, until `stop` is set.
+
+    An error of one run is logged and tried again at the next poll: a worker that gives up is of no use.
+    """
+    seen: tuple[int, int] | None = None
+    while not stop.is_set():
+        try:
+            state = _state(database)
+            if state != seen:
+                on_report(grow_candidates(database, options))
+                seen = _state_after(database, state)
+        except FeatureDbError:
+            _LOG.exception("growth failed; the next try is in %.0f s", poll_s)
+        stop.wait(poll_s)
+
+
+def _state(database: Database) -> tuple[int, int]:
+    """What a run depends on: version of the maps, number of waiting photos."""
+    return database.poll_version(), len(list_candidates(database, state="waiting"))
+
+
+def _state_after(database: Database, before: tuple[int, int]) -> tuple[int, int]:
+    """The state that needs no run: what this one left, unless photos arrived meanwhile."""
+    after = _state(database)
+    return after if after[1] <= before[1] else before

@@ -1,0 +1,414 @@
+"""The story of growth on a database: new photos in, quarantined maps, confirmation, canaries, promoted maps.
+
+Rounds: photos are localised by the active maps, reconstructions placed by them and committed in quarantine,
+quarantined maps confirmed and promoted; then again, while something new was promoted that photos may see.
+Every step is a commit of its own and can be repeated: a run that was killed is finished by the next.
+"""
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import GROWTH
+from featuredb.store import Database, Snapshot
+from featuredb.store.candidates import mark_used
+from ingest.colmap_bridge import Model
+from ingest.fingerprint import digest
+from ingest.growth.confirmation import confirm, sources_json
+from ingest.growth.gates import Gate
+from ingest.growth.grow_photos import GrowPhotosOptions, grow_photos
+from ingest.growth.grown_map import grow_component
+from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
+from ingest.growth.localised import LocaliseEachOptions, localise_photos
+from ingest.growth.map_graph import (
+    PlacedMap,
+    StoredEdge,
+    corners_of,
+    drift_m,
+    growth_of,
+    placed_maps,
+    solve_with_new,
+)
+from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
+from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
+from ingest.growth.submodel import keep_photos
+from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
+from ingest.growth.witnesses import NewPhotos
+from ingest.map_builder import MapIdentity
+from ingest.photo import Photo
+from reloc.candidates import IndexedArea
+from reloc.localiser import Localiser
+
+_LOG = logging.getLogger(__name__)
+# Part of every grown map's id; raised when the same photos would give another map.
+_VERSION = "grown-1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowthOptions:
+    """How a database grows.
+
+    Attributes:
+        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
+            a survey's points are usually wanted for. Photos beyond it wait for an anchor.
+        max_rounds: a bound on one run; each round needs a promotion.
+        localise, grow, promotion, replacing: of the steps.
+    """
+
+    drift_budget_m: float = 0.5
+    max_rounds: int = 10
+    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
+    grow: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
+    promotion: PromotionOptions = field(default_factory=PromotionOptions)
+    replacing: ReplaceOptions = field(default_factory=ReplaceOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GrowthPhotos:
+    """New photos, matched and reconstructed.
+
+    Attributes:
+        photos: rows of everything here.
+        features_of: of a row.
+        models: their reconstructions, called once a round; rows of a model are rows of `photos`.
+        candidate_ids: of contributed photos, by row.
+    """
+
+    photos: Sequence[Photo]
+    features_of: FeaturesOf
+    models: Callable[[], Iterable[Model]]
+    candidate_ids: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(slots=True, kw_only=True)
+class _Run:
+    """What a run has come to; rows of the new photos."""
+
+    map_of: dict[int, str] = field(default_factory=dict)
+    why: dict[int, tuple[str, str]] = field(default_factory=dict)
+    entries: dict[str, GrownEntry] = field(default_factory=dict)
+    refused: list[GrownEntry] = field(default_factory=list)
+    promotions: dict[str, Promotion] = field(default_factory=dict)
+    replacements: list[Replacement] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    rounds: int = 0
+
+
+def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOptions:
+    """The options whose descriptors fit the active maps': most maps decide whether they are upright."""
+    active = [m for m in snapshot.maps() if m.status == "active"]
+    upright = sum("-upright-" in m.extractor_fingerprint for m in active)
+    return replace(options, upright=upright > len(active) / 2) if active else options
+
+
+def grow(
+    database: Database, new: GrowthPhotos, work: Path, options: GrowthOptions | None = None
+) -> GrowthReport:
+    """Let a database grow by new photos, in rounds, as far as they carry.
+
+    Args:
+        work: the database's work folder, for what is measured once.
+
+    Raises:
+        ConflictError: others changed the same maps too often; what is committed stands.
+        StoreError
+    """
+    options = options or GrowthOptions()
+    started, clock = datetime.now(UTC), time.perf_counter()
+    run, localiser = _Run(), None
+    for _ in range(options.max_rounds):
+        run.rounds += 1
+        replaced = replace_descendants(database, work, options.replacing, budget_m=options.drift_budget_m)
+        if replaced is not None:
+            run.replacements.append(replaced)
+        localiser = Localiser.open(database, previous=localiser)
+        localised = _round(database, new, localiser, run, options)
+        if not _promote(database, new, localiser, localised, run, options):
+            break
+    return GrowthReport(
+        database=database.url,
+        started=started,
+        seconds=time.perf_counter() - clock,
+        rounds=run.rounds,
+        version=database.poll_version(),
+        photos=_fates(new, run, database.snapshot()),
+        maps=(*run.entries.values(), *run.refused),
+        promotions=tuple(run.promotions.values()),
+        replacements=tuple(run.replacements),
+        notes=tuple(run.notes),
+    )
+
+
+def _round(
+    database: Database, new: GrowthPhotos, localiser: Localiser, run: _Run, options: GrowthOptions
+) -> dict[int, LocalisedPhoto]:
+    """Localise what is not in a map yet, place reconstructions and lone photos, commit what passes."""
+    open_rows = [row for row in range(len(new.photos)) if row not in run.map_of]
+    localised, reasons = localise_photos(
+        new.photos, open_rows, new.features_of, localiser.areas, options.localise
+    )
+    run.why.update({row: _split(reason) for row, reason in reasons.items()})
+    run.refused.clear()
+    for model in new.models():
+        part = keep_photos(model, [int(r) for r in model.rows if int(r) not in run.map_of])
+        if part is None or not any(int(r) in localised for r in part.rows):
+            continue
+        _try_model(database, part, new, localised, localiser.areas, run, options)
+    left = {row: photo for row, photo in localised.items() if row not in run.map_of}
+    grown = grow_photos(
+        [], new.photos, new.features_of, left, localiser.areas, _identity_of(new), options.grow
+    )
+    for found in grown.maps:
+        _take(database, found, new, run, options)
+    for refused in grown.refused:
+        _note_refusal(refused, new, run)
+    run.why.update({row: _split(reason) for row, reason in grown.waiting.items()})
+    return localised
+
+
+def _try_model(
+    database: Database,
+    model: Model,
+    new: GrowthPhotos,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
+    run: _Run,
+    options: GrowthOptions,
+) -> None:
+    """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not."""
+    part: Model | None = model
+    for _ in range(3):  # the part that is left may lie otherwise, and be cut again
+        assert part is not None
+        rows = tuple(int(r) for r in part.rows)
+        outcome = grow_component(
+            part, new.photos, new.features_of, localised, areas, _identity_of(new)(rows), options.grow.grow
+        )
+        if isinstance(outcome, Refused):
+            _note_refusal(outcome, new, run)
+            return
+        within = _take(database, outcome, new, run, options)
+        if within is None:
+            return
+        part = keep_photos(part, within, least=3) if len(within) < len(rows) else None
+        if part is None:
+            return
+
+
+def _take(
+    database: Database, grown: GrownMap, new: GrowthPhotos, run: _Run, options: GrowthOptions
+) -> list[int] | None:
+    """Commit a grown map in quarantine if it is within the drift budget.
+
+    Returns:
+        None if it was, or was refused for good; else the rows of its photos that are within the budget.
+    """
+    snapshot = database.snapshot()
+    rows = [int(r) for r in grown.model.rows if int(r) < len(new.photos)]
+    feature_map, drift, relative = _with_drift(grown, placed_maps(snapshot), options)
+    gate = drift_gate(drift, options.drift_budget_m)
+    names = tuple(new.photos[r].name for r in rows)
+    if not gate.passes:
+        run.refused.append(_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
+        run.why.update(dict.fromkeys(rows, (gate.reason, gate.message)))
+        return _rows_within(feature_map, rows, relative, options.drift_budget_m)
+    known = {m.map_id: m for m in snapshot.maps(include_retired=True)}.get(feature_map.map_id)
+    if known is not None and known.status == "retired":
+        reason = f"map {known.map_id} of these photos was retired: {known.status_reason}"
+        run.refused.append(_entry(feature_map, grown, names, "refused", "RETIRED_MAP", reason))
+        run.why.update(dict.fromkeys(rows, ("RETIRED_MAP", reason)))
+        return None
+    used = [new.candidate_ids[r] for r in rows if r in new.candidate_ids]
+    if used:
+        mark_used(database, used, feature_map.map_id)
+    database.commit_map(feature_map)
+    run.map_of.update(dict.fromkeys(rows, feature_map.map_id))
+    for row in rows:
+        run.why.pop(row, None)
+    run.entries[feature_map.map_id] = _entry(feature_map, grown, names, "quarantined", "", "")
+    _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
+    return None
+
+
+def drift_gate(drift: float, budget_m: float) -> Gate:
+    """Whether a map is near enough to its anchors."""
+    return Gate(
+        name="drift",
+        reason="DRIFT_BUDGET",
+        figure=drift,
+        limit=budget_m,
+        passes=drift <= budget_m,
+        message=f"it may have drifted {drift:.2f} m from its anchors, {budget_m:.2f} m are allowed; it "
+        "waits for an anchor",
+    )
+
+
+def _with_drift(
+    grown: GrownMap, maps: Mapping[str, PlacedMap], options: GrowthOptions
+) -> tuple[FeatureMap, float, np.ndarray]:
+    """The map with its edges, drift and covariance by the graph of all maps; drift, relative covariance."""
+    feature_map = grown.feature_map
+    growth = growth_of(feature_map.placement.evidence)
+    edges = [
+        replace(StoredEdge.from_json(edge), place=maps[edge["map_id"]].place)
+        for edge in growth.get("edges", ())
+        if edge["map_id"] in maps
+    ]
+    covariance = feature_map.placement.covariance
+    relative = np.asarray(growth["covariance_relative"], dtype=np.float64).reshape(7, 7)
+    solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
+    if solution.reason is None and feature_map.map_id in solution.covariance:
+        covariance = solution.covariance[feature_map.map_id]
+        relative = solution.covariance_relative[feature_map.map_id]
+    drift = drift_m(relative, corners_of(feature_map))
+    confirmation = confirm(feature_map, options.promotion.confirmation)
+    gates = {g.name: g.as_json() for g in (*confirmation.gates, drift_gate(drift, options.drift_budget_m))}
+    growth |= {
+        "drift_m": round(drift, 6),
+        "budget_m": options.drift_budget_m,
+        "covariance_relative": relative.ravel().tolist(),
+        "edges": [edge.as_json() for edge in edges],
+        "sources": sources_json(confirmation),
+        "gates": {**growth.get("gates", {}), **gates},
+    }
+    placement = replace(
+        feature_map.placement,
+        covariance=covariance,
+        evidence={**feature_map.placement.evidence, GROWTH: growth},
+    )
+    return replace(feature_map, placement=placement, status="quarantined"), drift, relative
+
+
+def _rows_within(
+    feature_map: FeatureMap, rows: Sequence[int], relative: np.ndarray, budget_m: float
+) -> list[int]:
+    """Rows of the photos whose points are within the budget; images come in the order of the rows."""
+    points = feature_map.points_local()
+    seen = feature_map.observations
+    within = []
+    for row, image in zip(rows, feature_map.images, strict=True):
+        own = points[seen.point_index[seen.image_id == image.image_id]]
+        places = np.vstack([own, image.cam_from_local.center[None]])
+        # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
+        if drift_m(relative, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
+            within.append(row)
+    return within
+
+
+def _promote(
+    database: Database,
+    new: GrowthPhotos,
+    localiser: Localiser,
+    localised: dict[int, LocalisedPhoto],
+    run: _Run,
+    options: GrowthOptions,
+) -> bool:
+    """Confirm and promote; whether anything was."""
+    witnesses = NewPhotos(
+        photos=new.photos,
+        rows=[row for row in range(len(new.photos)) if row not in run.map_of],
+        features_of=new.features_of,
+        localised=localised,
+    )
+    outcomes = promote_confirmed(
+        database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m
+    )
+    for outcome in outcomes:
+        run.promotions[outcome.map_id] = outcome
+        entry = run.entries.get(outcome.map_id)
+        if entry is not None:
+            run.entries[outcome.map_id] = replace(
+                entry,
+                status="active" if outcome.promoted else "quarantined",
+                reason_code=outcome.reason_code,
+                reason=outcome.reason,
+                gates={**entry.gates, **{g.name: g.as_json() for g in outcome.gates}},
+            )
+    return any(outcome.promoted for outcome in outcomes)
+
+
+def _note_refusal(refused: Refused, new: GrowthPhotos, run: _Run) -> None:
+    rows = [r for r in refused.rows if r < len(new.photos) and r not in run.map_of]
+    run.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
+    run.refused.append(
+        GrownEntry(
+            map_id="",
+            status="refused",
+            reason_code=refused.reason,
+            reason=refused.message,
+            photos=tuple(new.photos[r].name for r in rows),
+            gates=refused.figures(),
+        )
+    )
+
+
+def _entry(
+    feature_map: FeatureMap, grown: GrownMap, names: tuple[str, ...], status: str, code: str, reason: str
+) -> GrownEntry:
+    growth: dict[str, Any] = growth_of(feature_map.placement.evidence)
+    return GrownEntry(
+        map_id=feature_map.map_id,
+        status=status,
+        reason_code=code,
+        reason=reason,
+        photos=names,
+        points=len(feature_map.points),
+        parents=feature_map.parents,
+        generation=feature_map.generation,
+        steps=growth.get("steps"),
+        drift_m=growth.get("drift_m"),
+        budget_m=growth.get("budget_m"),
+        gates=growth.get("gates", {}),
+        agreements=tuple(str(a) for a in grown.agreements),
+    )
+
+
+def _identity_of(new: GrowthPhotos) -> Callable[[tuple[int, ...]], MapIdentity]:
+    """The map of some photos is named by them: the same photos give the same map."""
+
+    def identity(rows: tuple[int, ...]) -> MapIdentity:
+        photos = [new.photos[r] for r in rows]
+        key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
+        licences = sorted({p.licence for p in photos if p.licence})
+        return MapIdentity(
+            map_id=f"g{key}",
+            name=f"grown {key[:6]}",
+            source="growth",
+            licence=", ".join(licences),
+            provenance={"version": _VERSION, "photos": len(photos)},
+        )
+
+    return identity
+
+
+def _split(reason: str) -> tuple[str, str]:
+    code, _, text = reason.partition(": ")
+    return code, text or code
+
+
+def _fates(new: GrowthPhotos, run: _Run, snapshot: Snapshot) -> tuple[PhotoFate, ...]:
+    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
+    fates = []
+    for row, photo in enumerate(new.photos):
+        map_id = run.map_of.get(row, "")
+        code, reason = run.why.get(row, ("", ""))
+        if map_id and not code and map_id not in active and map_id in run.promotions:
+            code, reason = run.promotions[map_id].reason_code, run.promotions[map_id].reason
+        fates.append(
+            PhotoFate(
+                name=new.candidate_ids.get(row, photo.name),
+                owner=photo.owner,
+                outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
+                map_id=map_id,
+                reason_code=code,
+                reason=reason,
+            )
+        )
+    return tuple(fates)

@@ -1,0 +1,187 @@
+"""What a run of growth did: photos by outcome and reason, maps with what they stand on; JSON and text."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+from ingest.growth.promotion import Promotion
+from ingest.growth.replacing import Replacement
+
+PhotoOutcome = Literal["promoted", "quarantined", "waiting", "refused"]
+_WORDS: tuple[tuple[PhotoOutcome, str], ...] = (
+    ("promoted", "in active maps"),
+    ("quarantined", "in quarantined maps"),
+    ("waiting", "waiting"),
+    ("refused", "refused"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoFate:
+    """What became of a photo.
+
+    Attributes:
+        name: of the photo; a contributed one's candidate id.
+        owner: who gave it.
+        outcome: in an active map, in a quarantined one, still waiting, or refused for good.
+        map_id: of its map, "" where it has none.
+        reason_code, reason: why it waits or is refused.
+    """
+
+    name: str
+    owner: str
+    outcome: PhotoOutcome
+    map_id: str = ""
+    reason_code: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrownEntry:
+    """A map that this run has made.
+
+    Attributes:
+        status: active or quarantined; "refused" where it was never committed.
+        reason_code, reason: why it is not active, or who confirmed it.
+        drift_m, budget_m: 95 % bound on its drift against its anchors, and what is allowed.
+        photos: names. gates: every gate with its figure.
+        agreements: how well the existing maps agree that it overlaps, in words.
+    """
+
+    map_id: str
+    status: str
+    reason_code: str
+    reason: str
+    photos: tuple[str, ...]
+    points: int = 0
+    parents: tuple[str, ...] = ()
+    generation: int = 0
+    steps: int | None = None
+    drift_m: float | None = None
+    budget_m: float | None = None
+    gates: Mapping[str, Any] = field(default_factory=dict)
+    agreements: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowthReport:
+    """One run.
+
+    Attributes:
+        rounds: of localising, growing and promoting; more than one where photos saw a map that was just
+            promoted.
+        promotions: of every quarantined map that was examined, in the last round that did.
+        replacements: what new anchors did.
+        notes: for people.
+    """
+
+    database: str
+    started: datetime
+    seconds: float
+    rounds: int
+    version: int
+    photos: tuple[PhotoFate, ...]
+    maps: tuple[GrownEntry, ...]
+    promotions: tuple[Promotion, ...]
+    replacements: tuple[Replacement, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def count(self, outcome: PhotoOutcome) -> int:
+        return sum(photo.outcome == outcome for photo in self.photos)
+
+    @property
+    def promoted(self) -> tuple[str, ...]:
+        """Maps that are active since this run."""
+        return tuple(p.map_id for p in self.promotions if p.promoted)
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "database": self.database,
+            "started": self.started.isoformat(),
+            "seconds": round(self.seconds, 3),
+            "rounds": self.rounds,
+            "version": self.version,
+            "photos": [
+                {
+                    "name": p.name,
+                    "owner": p.owner,
+                    "outcome": p.outcome,
+                    "map_id": p.map_id,
+                    "reason_code": p.reason_code,
+                    "reason": p.reason,
+                }
+                for p in self.photos
+            ],
+            "maps": [_entry_json(entry) for entry in self.maps],
+            "promotions": [p.as_json() for p in self.promotions],
+            "replacements": [r.as_json() for r in self.replacements],
+            "notes": list(self.notes),
+        }
+
+    def as_text(self) -> str:
+        """For the terminal."""
+        counts = ", ".join(f"{self.count(outcome)} {word}" for outcome, word in _WORDS)
+        lines = [f"{len(self.photos)} photos: {counts}; {self.rounds} rounds, {self.seconds:.1f} s"]
+        reasons = Counter(p.reason_code for p in self.photos if p.reason_code)
+        lines += [f"  {code}: {count} photos" for code, count in reasons.most_common()]
+        lines += _replacement_lines(self.replacements)
+        lines += [_entry_line(entry) for entry in self.maps]
+        mine = {entry.map_id for entry in self.maps}
+        for p in self.promotions:
+            if p.map_id not in mine:
+                became = "promoted" if p.promoted else f"stays in quarantine: {p.reason_code}"
+                lines.append(f"map {p.map_id}: {became}: {p.reason}")
+        lines += [f"note: {note}" for note in self.notes]
+        return "\n".join(lines) + "\n"
+
+
+def _entry_json(entry: GrownEntry) -> dict[str, Any]:
+    return {
+        "map_id": entry.map_id,
+        "status": entry.status,
+        "reason_code": entry.reason_code,
+        "reason": entry.reason,
+        "photos": list(entry.photos),
+        "points": entry.points,
+        "parents": list(entry.parents),
+        "generation": entry.generation,
+        "steps": entry.steps,
+        "drift_m": entry.drift_m,
+        "budget_m": entry.budget_m,
+        "gates": dict(entry.gates),
+        "agreements": list(entry.agreements),
+    }
+
+
+def _entry_line(entry: GrownEntry) -> str:
+    drift = ""
+    if entry.drift_m is not None and entry.budget_m is not None:
+        drift = f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"
+    steps = (
+        "" if entry.steps is None else f", {entry.steps} step{'s' if entry.steps != 1 else ''} from an anchor"
+    )
+    code = f"{entry.reason_code}: " if entry.reason_code else ""
+    agreements = "".join(f"\n  {text}" for text in entry.agreements)
+    return (
+        f"map {entry.map_id or '-'}: {entry.status}, {len(entry.photos)} photos, {entry.points} points{steps}"
+        f"{drift}: {code}{entry.reason}{agreements}"
+    )
+
+
+def _replacement_lines(replacements: Sequence[Replacement]) -> list[str]:
+    lines = []
+    for found in replacements:
+        code = f"{found.reason}: " if found.reason else ""
+        lines.append(f"new anchors: {code}{found.message}")
+        for moved in found.moved:
+            before = "" if moved.drift_before_m is None else f" (before {moved.drift_before_m:.2f} m)"
+            lines.append(
+                f"  map {moved.map_id} moved by {moved.move_m:.2f} m, drift {moved.drift_m:.2f} m{before}"
+            )
+        lines += [f"  left out: overlap {edge}" for edge in found.left_out]
+        if found.flagged:
+            lines.append(f"  quarantined, because nothing holds them any more: {', '.join(found.flagged)}")
+    return lines
