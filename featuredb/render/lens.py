@@ -1,10 +1,9 @@
-"""Any camera model as one vector of numbers, for projection inside compiled loops."""
+"""Any camera model as one row of numbers, for projection inside compiled loops."""
 
 from typing import Final
 
 import numpy as np
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 
 # fx, fy, cx, cy; numerator k1..k4 and denominator k1..k3 of the radial factor; tangential p1, p2;
@@ -14,8 +13,8 @@ FISHEYE: Final = 13
 FOLD: Final = 14
 
 
-def lens_vector(camera: Camera) -> FloatArray:
-    """(LENS_SIZE,) float64 of a camera: focal lengths, principal point, distortion, fold limit.
+def lens_numbers(camera: Camera) -> tuple[float, ...]:
+    """LENS_SIZE numbers of a camera: focal lengths, principal point, distortion, fold limit.
 
     The radial factor is (1 + n1 q + n2 q^2 + n3 q^3 + n4 q^4) / (1 + d1 q + d2 q^2 + d3 q^3), q being the
     squared tangent of the angle off the axis, or the squared angle in a fisheye.
@@ -39,4 +38,4 @@ def lens_vector(camera: Camera) -> FloatArray:
         lens[4 : 4 + len(k)] = k
     lens[FISHEYE] = "FISHEYE" in camera.model
     lens[FOLD] = camera.tan_of_fold**2
-    return lens
+    return tuple(lens.tolist())

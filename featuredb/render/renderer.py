@@ -12,8 +12,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.rendering import Rendering
-from featuredb.render.splats import SplatOptions, Splats, draw_splats
-from featuredb.render.surfaces import SurfaceOptions, Surfaces, apart_px, block_planes, surfaces_of
+from featuredb.render.splats import BlockPlanes, SplatOptions, draw_splats, project_points
+from featuredb.render.surfaces import SurfaceOptions, apart_px, block_planes, close_holes, surfaces_of
 from featuredb.render.threads import over_rows, thread_count
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
@@ -71,59 +71,47 @@ def render(
     near_m, finest_px = options.splats.near_m, options.splats.finest_px
     rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)
     clock.lap("cull")
-    splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads)
+    points = project_points(
+        cloud, rows, camera, cam_from_local, options.splats, threads, attributes=options.attributes
+    )
+    clock.lap("project")
+    splats = draw_splats(points, camera, options.splats, threads)
     clock.lap("draw")
-    planes = None
-    if options.surfaces.tilt_splats:
-        planes = block_planes(cloud.xyz, splats, camera, cam_from_local, threads)
+    focal_px, planes = camera.focal_px, BlockPlanes.unknown()
+    if options.surfaces.tilt_splats and points.count.any():
+        planes = block_planes(splats, focal_px, threads)
         clock.lap("planes")
-        if planes is not None and np.quantile(apart_px(splats, camera.focal_px), 0.95) > _WORTH_REDRAWING_PX:
-            splats = draw_splats(cloud, rows, camera, cam_from_local, options.splats, threads, planes)
+        if np.quantile(apart_px(splats, focal_px), 0.95) > _WORTH_REDRAWING_PX:
+            splats = draw_splats(points, camera, options.splats, threads, planes)
             clock.lap("draw again")
-    surfaces = surfaces_of(cloud.xyz, splats, planes, camera, cam_from_local, options.surfaces, threads)
-    clock.lap("close holes")
-    rgb = intensity = None
-    if options.attributes and cloud.rgb is not None:
-        rgb = _painted(cloud.rgb, splats, surfaces, threads)
-    if options.attributes and cloud.intensity is not None:
-        intensity = _painted(cloud.intensity[:, None], splats, surfaces, threads)[..., 0]
-    depth = _finished(splats, surfaces, threads)
+    surfaces = surfaces_of(splats, planes, focal_px, threads)
+    clock.lap("surfaces")
+    if options.surfaces.close_holes:
+        surfaces = close_holes(surfaces, splats, planes, focal_px, options.surfaces, threads)
+        clock.lap("close holes")
+    rgb, intensity = _painted(surfaces.paint, cloud, options.attributes, threads)
     clock.lap("paint")
     return Rendering(
         camera=camera,
         cam_from_local=cam_from_local,
-        depth=depth,
-        index=splats.index,
+        depth=surfaces.depth,
+        index=surfaces.index,
         rgb=rgb,
         intensity=intensity,
-        points_drawn=splats.points_drawn,
+        points_drawn=int(points.count.sum()),
     )
 
 
 def _painted(
-    values: NDArray[np.uint8], splats: Splats, surfaces: Surfaces, threads: int
-) -> NDArray[np.uint8]:
-    """Picture (h, w, c) of values (n, c)."""
+    paint: NDArray[np.uint32], cloud: PointCloud, attributes: bool, threads: int
+) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint8] | None]:
+    """Colours (h, w, 3) and intensity (h, w), those that the cloud has and that are wanted."""
     loops = compiled_module("featuredb.render.picture_loops")
-    picture = np.empty((*splats.index.shape, values.shape[1]), np.uint8)
-    s = surfaces
-    over_rows(
-        lambda first, end: loops.paint(
-            values, splats.index, s.nearness, s.filled, splats.apart_m, s.source, picture, first, end
-        ),
-        len(picture),
-        threads,
+    with_rgb, with_intensity = (
+        attributes and cloud.rgb is not None,
+        attributes and cloud.intensity is not None,
     )
-    return picture
-
-
-def _finished(splats: Splats, surfaces: Surfaces, threads: int) -> NDArray[np.float32]:
-    """Depth (h, w); marks closed holes in the index."""
-    loops = compiled_module("featuredb.render.picture_loops")
-    depth = np.empty(splats.index.shape, np.float32)
-    over_rows(
-        lambda first, end: loops.finish(surfaces.filled, surfaces.source, splats.index, depth, first, end),
-        len(depth),
-        threads,
-    )
-    return depth
+    rgb = np.empty((*paint.shape, 3) if with_rgb else (0, 0, 3), np.uint8)
+    intensity = np.empty(paint.shape if with_intensity else (0, 0), np.uint8)
+    over_rows(lambda first, end: loops.unpack(paint, rgb, intensity, first, end), len(paint), threads)
+    return rgb if with_rgb else None, intensity if with_intensity else None

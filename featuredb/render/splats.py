@@ -1,6 +1,7 @@
 """Draws points as z-buffered splats: which point each pixel shows."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
-from featuredb.render.lens import lens_vector
-from featuredb.render.threads import mapped
+from featuredb.render.lens import lens_numbers
+from featuredb.render.threads import mapped, over_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,73 +49,117 @@ class BlockPlanes:
     planes: FloatArray
     side: int
 
+    @classmethod
+    def unknown(cls) -> "BlockPlanes":
+        return cls(planes=np.empty((0, 0, 3)), side=1)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ProjectedPoints:
+    """The points of a cloud that fall into a picture, in slots; each node has as many as it has points.
+
+    Attributes:
+        seen: (m, 4) float32 of each slot: pixel u, v, depth in metres, distance to the neighbours in metres.
+        shows: (m, 2) uint32 of each slot: row of the cloud, and what it is painted with, see draw_loops.
+        first, count: (k,) int64, the slots of each node that hold points; the others hold nothing.
+    """
+
+    seen: NDArray[np.float32]
+    shows: NDArray[np.uint32]
+    first: NDArray[np.int64]
+    count: NDArray[np.int64]
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Splats:
     """What is nearest in each pixel.
 
     Attributes:
-        key: (h, w) float32, the depth that decided, metres; infinity where nothing is.
-        index: (h, w) int32 rows of the cloud, -1 where nothing is.
-        apart_m: (h, w) float32, distance between points of the surface seen; undefined where nothing is.
-        points_drawn: points that fell into the image.
+        points: the points drawn.
+        nearest: (h, w) uint64 z-buffer of their slots, see draw_loops.
     """
 
-    key: NDArray[np.float32]
-    index: NDArray[np.int32]
-    apart_m: NDArray[np.float32]
-    points_drawn: int
+    points: ProjectedPoints
+    nearest: NDArray[np.uint64]
 
 
-def draw_splats(
+def project_points(
     cloud: PointCloud,
     rows: NDArray[np.intp],
     camera: Camera,
     cam_from_local: Rigid3,
     options: SplatOptions,
     threads: int,
+    *,
+    attributes: bool = True,
+) -> ProjectedPoints:
+    """Where the points of the nodes `rows` fall into the picture, and with `attributes` their paint."""
+    loops = compiled_module("featuredb.render.draw_loops")
+    nodes, by_run = cloud.nodes, cloud.spacing_m is None
+    runs = np.column_stack([nodes.start[rows], nodes.count[rows]])
+    ends = np.cumsum(runs[:, 1])
+    first = ends - runs[:, 1]
+    room = int(ends[-1]) if len(ends) else 0
+    seen, shows = np.empty((room, 4), np.float32), np.empty((room, 2), np.uint32)
+    pose = tuple(cam_from_local.matrix()[:3].ravel().tolist())
+    lens, widest = lens_numbers(camera), options.max_radius_px
+    bounds = (-widest, camera.width + widest, -widest, camera.height + widest)
+    spacing = nodes.spacing_m[rows] if cloud.spacing_m is None else cloud.spacing_m
+    none = np.empty(0, np.uint8)
+    rgb = cloud.rgb if attributes and cloud.rgb is not None else none.reshape(0, 3)
+    intensity = cloud.intensity if attributes and cloud.intensity is not None else none
+    # Nodes of points less than this apart are not drawn, so what is drawn may be twice as far apart.
+    finest = 2.0 * options.finest_px
+
+    def project(part: slice) -> NDArray[np.int64]:
+        own = spacing[part] if by_run else spacing
+        kept: NDArray[np.int64] = loops.project_runs(
+            *(cloud.xyz, runs[part], first[part], own, by_run, pose, lens),
+            *(options.near_m, finest, bounds, rgb, intensity, seen, shows),
+        )
+        return kept
+
+    count = np.concatenate(mapped(project, _balanced(runs[:, 1], threads), threads))
+    return ProjectedPoints(seen=seen, shows=shows, first=first, count=count)
+
+
+def draw_splats(
+    points: ProjectedPoints,
+    camera: Camera,
+    options: SplatOptions,
+    threads: int,
     surface: BlockPlanes | None = None,
 ) -> Splats:
-    """Draw the nodes `rows` of a cloud; the result does not depend on the number of threads.
+    """Draw projected points; the result does not depend on the number of threads.
 
     Where a surface is given, splats lie in it; else they face the camera.
     """
     loops = compiled_module("featuredb.render.draw_loops")
-    nodes, lens = cloud.nodes, lens_vector(camera)
-    pose = cam_from_local.matrix()[:3]
-    shape = (camera.height, camera.width)
-    known = surface or BlockPlanes(planes=np.empty((0, 0, 3)), side=1)
-    # Nodes of points less than this apart are not drawn, so what is drawn may be twice as far apart.
-    sizes = np.array(
-        [options.near_m, options.radius_per_spacing, 2.0 * options.finest_px, options.max_radius_px]
-    )
+    known = surface or BlockPlanes.unknown()
 
-    def draw_part(part: NDArray[np.intp]) -> Splats:
-        key, index = np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int32)
-        apart = np.empty(shape, np.float32)
-        runs = np.column_stack([nodes.start[part], nodes.count[part]])
-        by_run = cloud.spacing_m is None
-        spacing = nodes.spacing_m[part] if cloud.spacing_m is None else cloud.spacing_m
-        drawn = loops.draw(
-            cloud.xyz, runs, spacing, by_run, known.planes, known.side, pose, lens, sizes, key, index, apart
+    def draw_part(part: slice) -> NDArray[np.uint64]:
+        nearest = np.full((camera.height, camera.width), loops.NOTHING)
+        loops.draw(
+            *(points.seen, points.first[part], points.count[part], known.planes, known.side),
+            *(camera.focal_px, options.radius_per_spacing, options.max_radius_px, nearest),
         )
-        return Splats(key=key, index=index, apart_m=apart, points_drawn=drawn)
+        return nearest
 
-    splats, *others = mapped(draw_part, _balanced(rows, nodes.count, threads), threads)
-    for other in others:
-        loops.merge(splats.key, splats.index, splats.apart_m, other.key, other.index, other.apart_m)
-    return Splats(
-        key=splats.key,
-        index=splats.index,
-        apart_m=splats.apart_m,
-        points_drawn=splats.points_drawn + sum(other.points_drawn for other in others),
-    )
+    nearest, *others = mapped(draw_part, _balanced(points.count, threads), threads)
+
+    def merge_rows(first: int, end: int) -> None:
+        for other in others:
+            loops.merge(nearest, other, first, end)
+
+    if others:
+        over_rows(merge_rows, len(nearest), threads)
+    return Splats(points=points, nearest=nearest)
 
 
-def _balanced(rows: NDArray[np.intp], count: NDArray[np.int64], parts: int) -> list[NDArray[np.intp]]:
-    """Rows cut into runs of about equally many points."""
-    ends = np.cumsum(count[rows])
+def _balanced(count: NDArray[np.int64], parts: int) -> list[slice]:
+    """Nodes cut into runs of about equally many points."""
+    ends = np.cumsum(count)
     if len(ends) == 0 or parts == 1:
-        return [rows]
-    cuts = np.searchsorted(ends, ends[-1] * np.arange(1, parts) / parts)
-    return np.split(rows, cuts)
+        return [slice(0, len(ends))]
+    cuts = [0, *np.searchsorted(ends, ends[-1] * np.arange(1, parts) / parts).tolist(), len(ends)]
+    return [slice(first, end) for first, end in pairwise(cuts)]

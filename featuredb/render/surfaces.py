@@ -1,19 +1,16 @@
 """From splats to surfaces: depth between points, and holes closed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.compiled import compiled_module
-from featuredb.render.lens import lens_vector
 from featuredb.render.splats import BlockPlanes, Splats
 from featuredb.render.threads import mapped, over_rows
 
-_MOMENTS = 9  # of picture_loops.plane_moments
+_MOMENTS = 9  # of plane_loops.plane_moments
 _BLOCK_PER_SPACING = 1.5  # blocks of three by three then hold about twenty points for a plane
 _SMALLEST_BLOCK_PX = 4  # smaller ones cost more and see only the points' noise
 _DENSE_PX = 2.0  # where nearly every pixel shows a point of its own, every fourth is enough for a plane
@@ -38,92 +35,116 @@ class SurfaceOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Surfaces:
-    """What the pixels show once splats are surfaces.
+    """What the pixels show; see `picture_loops.show_splats`.
 
     Attributes:
-        nearness: (h, w) float32, one over the depth of the splats, 1/m; zero where nothing is.
-        filled: (h, w) float32, the same with holes closed.
-        source: (h, w) int32: 0, or the radius in pixels within which the surface lies that closed a hole.
+        nearness, apart_m: (h, w) float32 of the splats, 1/m and m.
+        depth: (h, w) float32 metres, NaN where nothing is.
+        index: (h, w) int32, -1 where nothing is or a hole was closed.
+        paint: (h, w) uint32.
     """
 
     nearness: NDArray[np.float32]
-    filled: NDArray[np.float32]
-    source: NDArray[np.int32]
+    apart_m: NDArray[np.float32]
+    depth: NDArray[np.float32]
+    index: NDArray[np.int32]
+    paint: NDArray[np.uint32]
 
 
-def surfaces_of(
-    xyz: NDArray[np.float32],
+def surfaces_of(splats: Splats, planes: BlockPlanes, focal_px: float, threads: int) -> Surfaces:
+    """What each pixel shows of its own point, at its depth between the points."""
+    loops = compiled_module("featuredb.render.picture_loops")
+    shape = splats.nearest.shape
+    nearness, apart, depth = (np.empty(shape, np.float32) for _ in range(3))
+    index, paint = np.empty(shape, np.int32), np.empty(shape, np.uint32)
+    points = splats.points
+    over_rows(
+        lambda first, end: loops.show_splats(
+            *(points.seen, points.shows, splats.nearest, planes.planes, planes.side, focal_px),
+            *(nearness, apart, depth, index, paint, first, end),
+        ),
+        shape[0],
+        threads,
+    )
+    return Surfaces(nearness=nearness, apart_m=apart, depth=depth, index=index, paint=paint)
+
+
+def close_holes(
+    surfaces: Surfaces,
     splats: Splats,
-    surface: BlockPlanes | None,
-    camera: Camera,
-    cam_from_local: Rigid3,
+    planes: BlockPlanes,
+    focal_px: float,
     options: SurfaceOptions,
     threads: int,
 ) -> Surfaces:
-    """Depth of each pixel, between the points too.
+    """The surfaces with holes closed; depth and index are changed in place.
 
     A hole is a pixel that a morphological closing of nearness by a square brings to the front: it lies
     between parts of a surface on both sides of it, no wider apart than the points' distance allows. A
     straight silhouette is left where it is by a closing, so the surface does not grow over what lies
     behind it. The pixel may be empty, or show a point farther off through the surface.
     """
-    loops = compiled_module("featuredb.render.picture_loops")
-    pose, height = cam_from_local.matrix()[:3], camera.height
-    index, apart = splats.index, splats.apart_m
-    nearness, lens = np.empty(index.shape, np.float32), lens_vector(camera)
-    planes, side = (np.empty((0, 0, 3)), 1) if surface is None else (surface.planes, surface.side)
-    over_rows(
-        lambda first, end: loops.splat_nearness(
-            xyz, index, apart, pose, lens, planes, side, nearness, first, end
-        ),
-        height,
-        threads,
-    )
-    source = np.zeros(index.shape, np.int32)
-    if not options.close_holes or splats.points_drawn == 0:
-        return Surfaces(nearness=nearness, filled=nearness, source=source)
-    reach, focal = options.reach_per_spacing, camera.focal_px
-    radii = _radii(splats, reach, focal)
-    closed = _closings(nearness, radii, threads)
-    filled = np.empty_like(nearness)
+    loops = compiled_module("featuredb.render.hole_loops")
+    s, reach = surfaces, options.reach_per_spacing
+    radii = _radii(splats, reach, focal_px)
+    closed = _closings(s.nearness, radii, threads)
+    widest = _widest_m(s.apart_m, radii, threads)
+    paint = np.empty_like(s.paint)
     over_rows(
         lambda first, end: loops.close_holes(
-            nearness, apart, planes, side, closed, radii, focal, reach, filled, source, first, end
+            *(
+                s.nearness,
+                s.apart_m,
+                s.paint,
+                planes.planes,
+                planes.side,
+                closed,
+                radii,
+                widest,
+                focal_px,
+                reach,
+            ),
+            *(s.depth, s.index, paint, first, end),
         ),
-        height,
+        len(paint),
         threads,
     )
-    return Surfaces(nearness=nearness, filled=filled, source=source)
+    return replace(surfaces, paint=paint)
 
 
 def apart_px(splats: Splats, focal_px: float) -> NDArray[np.float32]:
     """Distance between points in pixels, of a sixteenth of the pixels that show any."""
-    part = slice(None, None, 4), slice(None, None, 4)
-    seen = splats.index[part] >= 0
-    apart: NDArray[np.float32] = splats.apart_m[part][seen] / splats.key[part][seen] * np.float32(focal_px)
+    loops = compiled_module("featuredb.render.draw_loops")
+    part = splats.nearest[::4, ::4]
+    seen = splats.points.seen[(part[part != loops.NOTHING] & np.uint64(0xFFFFFFFF)).astype(np.int64)]
+    apart: NDArray[np.float32] = seen[:, 3] / seen[:, 2] * np.float32(focal_px)
     return apart
 
 
-def block_planes(
-    xyz: NDArray[np.float32], splats: Splats, camera: Camera, cam_from_local: Rigid3, threads: int
-) -> BlockPlanes | None:
-    """The surfaces that the points in view lie on; None where there are no points."""
-    apart = apart_px(splats, camera.focal_px)
+def block_planes(splats: Splats, focal_px: float, threads: int) -> BlockPlanes:
+    """The surfaces that the points in view lie on."""
+    apart = apart_px(splats, focal_px)
     if len(apart) == 0:
-        return None
-    loops = compiled_module("featuredb.render.picture_loops")
-    pose, lens, index = cam_from_local.matrix()[:3], lens_vector(camera), splats.index
+        return BlockPlanes.unknown()
+    loops = compiled_module("featuredb.render.plane_loops")
+    height, width = splats.nearest.shape
     typical = float(np.median(apart))
     side = max(int(np.ceil(_BLOCK_PER_SPACING * typical)), _SMALLEST_BLOCK_PX)
     stride = 2 if typical < _DENSE_PX else 1
-    blocks = -(-camera.height // side), -(-camera.width // side)
+    blocks = -(-height // side), -(-width // side)
     moments, planes = np.zeros((*blocks, _MOMENTS)), np.empty((*blocks, 3))
     over_rows(
-        lambda first, end: loops.plane_moments(xyz, index, pose, lens, side, stride, moments, first, end),
+        lambda first, end: loops.plane_moments(
+            splats.points.seen, splats.nearest, side, stride, moments, first, end
+        ),
         blocks[0],
         threads,
     )
-    over_rows(lambda first, end: loops.plane_slopes(moments, side, planes, first, end), blocks[0], threads)
+    over_rows(
+        lambda first, end: loops.plane_slopes(moments, side, height, width, planes, first, end),
+        blocks[0],
+        threads,
+    )
     return BlockPlanes(planes=planes, side=side)
 
 
@@ -143,3 +164,13 @@ def _closings(nearness: NDArray[np.float32], radii: NDArray[np.int32], threads: 
 
     mapped(close, range(len(radii)), threads)
     return closed
+
+
+def _widest_m(apart_m: NDArray[np.float32], radii: NDArray[np.int32], threads: int) -> NDArray[np.float32]:
+    """The largest distance between points within each of k radii of tiles: (k, tiles down, tiles across)."""
+    loops = compiled_module("featuredb.render.hole_loops")
+    tile = loops.TILE_PX
+    in_tile = np.empty((-(-apart_m.shape[0] // tile), -(-apart_m.shape[1] // tile)), np.float32)
+    over_rows(lambda first, end: loops.widest_in_tiles(apart_m, in_tile, first, end), len(in_tile), threads)
+    reach = [-(-int(r) // tile) for r in radii]
+    return np.stack([cv2.dilate(in_tile, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in reach])

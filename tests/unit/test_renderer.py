@@ -15,7 +15,7 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.draw_loops import project_many
-from featuredb.render.lens import lens_vector
+from featuredb.render.lens import lens_numbers
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.shading import ReliefOptions, shaded_relief
@@ -75,7 +75,7 @@ def cloud_of(*parts: NDArray[np.float64]) -> PointCloud:
 def test_the_compiled_projection_is_pycolmaps(camera: Camera) -> None:
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-30, 30, (4000, 2)), rng.uniform(-5, 30, 4000)])
-    ours, theirs = project_many(points, lens_vector(camera)), camera.project(points)
+    ours, theirs = project_many(points, lens_numbers(camera)), camera.project(points)
     assert np.array_equal(np.isnan(ours), np.isnan(theirs))
     seen = np.isfinite(theirs).all(axis=1)
     assert seen.any()
@@ -132,6 +132,28 @@ def test_holes_of_a_near_surface_show_neither_nothing_nor_what_is_behind() -> No
     assert (rendering.intensity[outside] == 100).all()
     bare = render(cloud, CAMERA, DOWN, RenderOptions(surfaces=SurfaceOptions(close_holes=False)))
     assert (np.abs(bare.depth[inside] - 12.0) < 0.05).mean() < 0.95  # there is something to close
+
+
+def test_colours_and_intensity_of_closed_holes_are_those_around_them() -> None:
+    points = lattice(0.4, 12.0, 0.0)
+    # Each channel tells a place: east, north, height, and east plus north.
+    east, north = points[:, 0] + 12.0, points[:, 1] + 12.0
+    rgb = np.column_stack([10.0 * east, 10.0 * north, np.full(len(points), 77.0)]).astype(np.uint8)
+    cloud = build_cloud(FRAME, "unknown", points, rgb=rgb, intensity=(5.0 * (east + north)).astype(np.uint8))
+    rendering = render(cloud, CAMERA, DOWN)
+    holes = (rendering.index < 0) & rendering.valid
+    assert holes.sum() > 1000
+    x, y = (grid[holes] for grid in pixel_rays(CAMERA))
+    z = rendering.depth[holes]
+    ground = DOWN.inverse().act(np.column_stack([x * z, y * z, z]).astype(np.float64))
+    inside = (np.abs(ground[:, :2]) < 11.0).all(axis=1)
+    expected = np.column_stack([10.0 * (ground[:, :2] + 12.0), np.full(len(ground), 77.0)])[inside]
+    assert rendering.rgb is not None
+    assert rendering.intensity is not None
+    # Half a spacing of 0.4 m, and what rounding to whole numbers takes.
+    assert np.abs(rendering.rgb[holes][inside] - expected).max() < 10.0 * 0.4 * 0.75 + 1.0
+    off = rendering.intensity[holes][inside] - 0.5 * expected[:, :2].sum(axis=1)
+    assert np.abs(off).max() < 5.0 * 2 * 0.4 * 0.75 + 1.0
 
 
 def test_the_silhouette_of_a_near_surface_stays_where_it_is() -> None:
@@ -217,6 +239,7 @@ def test_the_picture_does_not_depend_on_threads() -> None:
     assert one.intensity is not None
     assert three.intensity is not None
     assert np.array_equal(one.intensity, three.intensity)
+    assert one.points_drawn == three.points_drawn
     with pytest.raises(InvalidValueError, match="threads"):
         render(cloud, CAMERA, DOWN, RenderOptions(threads=-1))
 
