@@ -78,10 +78,11 @@ def render(
     splats = draw_splats(points, camera, options.splats, threads)
     clock.lap("draw")
     focal_px, planes = camera.focal_px, BlockPlanes.unknown()
-    if options.surfaces.tilt_splats and points.count.any():
-        planes = block_planes(splats, focal_px, threads)
+    apart = apart_px(splats, focal_px)
+    if options.surfaces.tilt_splats and len(apart):
+        planes = block_planes(splats, float(np.median(apart)), threads)
         clock.lap("planes")
-        if np.quantile(apart_px(splats, focal_px), 0.95) > _WORTH_REDRAWING_PX:
+        if np.quantile(apart, 0.95) > _WORTH_REDRAWING_PX:
             splats = draw_splats(points, camera, options.splats, threads, planes)
             clock.lap("draw again")
     surfaces = surfaces_of(splats, planes, focal_px, threads)

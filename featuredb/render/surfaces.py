@@ -121,16 +121,12 @@ def apart_px(splats: Splats, focal_px: float) -> NDArray[np.float32]:
     return apart
 
 
-def block_planes(splats: Splats, focal_px: float, threads: int) -> BlockPlanes:
-    """The surfaces that the points in view lie on."""
-    apart = apart_px(splats, focal_px)
-    if len(apart) == 0:
-        return BlockPlanes.unknown()
+def block_planes(splats: Splats, typical_px: float, threads: int) -> BlockPlanes:
+    """The surfaces that the points in view lie on, which are `typical_px` apart in the picture."""
     loops = compiled_module("featuredb.render.plane_loops")
     height, width = splats.nearest.shape
-    typical = float(np.median(apart))
-    side = max(int(np.ceil(_BLOCK_PER_SPACING * typical)), _SMALLEST_BLOCK_PX)
-    stride = 2 if typical < _DENSE_PX else 1
+    side = max(int(np.ceil(_BLOCK_PER_SPACING * typical_px)), _SMALLEST_BLOCK_PX)
+    stride = 2 if typical_px < _DENSE_PX else 1
     blocks = -(-height // side), -(-width // side)
     moments, planes = np.zeros((*blocks, _MOMENTS)), np.empty((*blocks, 3))
     over_rows(

@@ -229,6 +229,14 @@ def test_nothing_in_view_is_an_empty_picture() -> None:
     assert not shaded_relief(rendering).any()
 
 
+def test_points_beside_the_picture_that_reach_nothing_in_it_are_no_error() -> None:
+    beside = lattice(0.1, 0.5, 0.0)
+    beside[:, 0] += (CAMERA.width - CAMERA.params[2]) * 20.0 / CAMERA.focal_px + 1.2
+    rendering = render(cloud_of(beside), CAMERA, DOWN)
+    assert rendering.points_drawn > 0
+    assert not rendering.valid.any()
+
+
 def test_the_picture_does_not_depend_on_threads() -> None:
     rng = np.random.default_rng(8)
     points = np.column_stack([rng.uniform(-15, 15, (30_000, 2)), rng.uniform(0, 2, 30_000)])
