@@ -4,7 +4,7 @@ import logging
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 
 from featuredb.errors import FeatureDbError
@@ -15,7 +15,7 @@ from featuredb.store.candidates import list_candidates, refuse
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
-from ingest.growth.grow import GrowthOptions, GrowthPhotos, extractor_for, grow
+from ingest.growth.grow import GrowthOptions, GrowthPhotos, extractor_for, grow, no_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
 from ingest.reconstruction import MapMakingOptions, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
@@ -87,6 +87,8 @@ def _prepared(
 ) -> tuple[GrowthPhotos, dict[str, tuple[str, str]]]:
     """Features, matches and reconstructions of the waiting photos; and those that cannot be read."""
     photos = waiting.photos[: options.max_photos]
+    if not photos:
+        return no_photos(), {}
     extractor: ExtractorOptions = extractor_for(database.snapshot(), options.making.extractor)
     making = replace(options.making, extractor=extractor)
     job = digest("growth", making.fingerprint, *sorted(p.sha256 for p in photos))[:24]
@@ -113,11 +115,12 @@ def _refuse(
     reasons.update(
         {p.name: (p.reason_code, p.reason) for p in report.photos if p.reason_code == "RETIRED_MAP"}
     )
-    oldest = now - timedelta(days=options.give_up_days)
     candidates: dict[str, Candidate] = {c.candidate_id: c for c in list_candidates(database, state="waiting")}
     for photo in report.photos:
         candidate = candidates.get(photo.name)
-        if photo.outcome == "waiting" and candidate is not None and candidate.received_at < oldest:
+        if photo.outcome != "waiting" or candidate is None:
+            continue
+        if (now - candidate.received_at).total_seconds() > options.give_up_days * 86_400.0:
             text = f"waited {options.give_up_days:.0f} days: {photo.reason_code}: {photo.reason}"
             reasons.setdefault(photo.name, ("GAVE_UP", text))
     reasons = {c: why for c, why in reasons.items() if c in candidates}

@@ -13,30 +13,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.store import Database, Snapshot
 from featuredb.store.candidates import mark_used
 from ingest.colmap_bridge import Model
+from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
-from ingest.growth.confirmation import confirm, sources_json
-from ingest.growth.gates import Gate
+from ingest.growth.drift import drift_gate, rows_within, with_drift
 from ingest.growth.grow_photos import GrowPhotosOptions, grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.localised import LocaliseEachOptions, localise_photos
-from ingest.growth.map_graph import (
-    PlacedMap,
-    StoredEdge,
-    corners_of,
-    drift_m,
-    growth_of,
-    placed_maps,
-    solve_with_new,
-)
+from ingest.growth.map_graph import growth_of, placed_maps
 from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
 from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
 from ingest.growth.submodel import keep_photos
@@ -86,6 +75,15 @@ class GrowthPhotos:
     features_of: FeaturesOf
     models: Callable[[], Iterable[Model]]
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
+
+
+def no_photos() -> GrowthPhotos:
+    """Nothing new: old quarantined maps are examined, and new anchors looked for."""
+
+    def none(row: int) -> PhotoFeatures:
+        raise IndexError(f"there is no photo {row}")
+
+    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())
 
 
 @dataclass(slots=True, kw_only=True)
@@ -212,13 +210,15 @@ def _take(
     """
     snapshot = database.snapshot()
     rows = [int(r) for r in grown.model.rows if int(r) < len(new.photos)]
-    feature_map, drift, relative = _with_drift(grown, placed_maps(snapshot), options)
+    feature_map, drift, relative = with_drift(
+        grown, placed_maps(snapshot), options.promotion.confirmation, options.drift_budget_m
+    )
     gate = drift_gate(drift, options.drift_budget_m)
     names = tuple(new.photos[r].name for r in rows)
     if not gate.passes:
         run.refused.append(_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
         run.why.update(dict.fromkeys(rows, (gate.reason, gate.message)))
-        return _rows_within(feature_map, rows, relative, options.drift_budget_m)
+        return rows_within(feature_map, rows, relative, options.drift_budget_m)
     known = {m.map_id: m for m in snapshot.maps(include_retired=True)}.get(feature_map.map_id)
     if known is not None and known.status == "retired":
         reason = f"map {known.map_id} of these photos was retired: {known.status_reason}"
@@ -235,71 +235,6 @@ def _take(
     run.entries[feature_map.map_id] = _entry(feature_map, grown, names, "quarantined", "", "")
     _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
     return None
-
-
-def drift_gate(drift: float, budget_m: float) -> Gate:
-    """Whether a map is near enough to its anchors."""
-    return Gate(
-        name="drift",
-        reason="DRIFT_BUDGET",
-        figure=drift,
-        limit=budget_m,
-        passes=drift <= budget_m,
-        message=f"it may have drifted {drift:.2f} m from its anchors, {budget_m:.2f} m are allowed; it "
-        "waits for an anchor",
-    )
-
-
-def _with_drift(
-    grown: GrownMap, maps: Mapping[str, PlacedMap], options: GrowthOptions
-) -> tuple[FeatureMap, float, np.ndarray]:
-    """The map with its edges, drift and covariance by the graph of all maps; drift, relative covariance."""
-    feature_map = grown.feature_map
-    growth = growth_of(feature_map.placement.evidence)
-    edges = [
-        replace(StoredEdge.from_json(edge), place=maps[edge["map_id"]].place)
-        for edge in growth.get("edges", ())
-        if edge["map_id"] in maps
-    ]
-    covariance = feature_map.placement.covariance
-    relative = np.asarray(growth["covariance_relative"], dtype=np.float64).reshape(7, 7)
-    solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
-    if solution.reason is None and feature_map.map_id in solution.covariance:
-        covariance = solution.covariance[feature_map.map_id]
-        relative = solution.covariance_relative[feature_map.map_id]
-    drift = drift_m(relative, corners_of(feature_map))
-    confirmation = confirm(feature_map, options.promotion.confirmation)
-    gates = {g.name: g.as_json() for g in (*confirmation.gates, drift_gate(drift, options.drift_budget_m))}
-    growth |= {
-        "drift_m": round(drift, 6),
-        "budget_m": options.drift_budget_m,
-        "covariance_relative": relative.ravel().tolist(),
-        "edges": [edge.as_json() for edge in edges],
-        "sources": sources_json(confirmation),
-        "gates": {**growth.get("gates", {}), **gates},
-    }
-    placement = replace(
-        feature_map.placement,
-        covariance=covariance,
-        evidence={**feature_map.placement.evidence, GROWTH: growth},
-    )
-    return replace(feature_map, placement=placement, status="quarantined"), drift, relative
-
-
-def _rows_within(
-    feature_map: FeatureMap, rows: Sequence[int], relative: np.ndarray, budget_m: float
-) -> list[int]:
-    """Rows of the photos whose points are within the budget; images come in the order of the rows."""
-    points = feature_map.points_local()
-    seen = feature_map.observations
-    within = []
-    for row, image in zip(rows, feature_map.images, strict=True):
-        own = points[seen.point_index[seen.image_id == image.image_id]]
-        places = np.vstack([own, image.cam_from_local.center[None]])
-        # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
-        if drift_m(relative, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
-            within.append(row)
-    return within
 
 
 def _promote(

@@ -9,7 +9,7 @@ other is placed anew the digest differs, and the edge has to be measured again.
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -232,6 +232,23 @@ def solve_with_new(
     ids = {node.map_id for node in nodes}
     new = [in_graph(map_id, e, frame, frame) for e in edges if e.map_id in ids]
     return solve_pose_graph(nodes, [*known, *new])
+
+
+def no_surer_than(edges: Sequence[StoredEdge], together: FloatArray | None) -> list[StoredEdge]:
+    """Edges of one map to several, all made of the same photos, so that they do not count these twice.
+
+    Taken as independent, they would place the map more surely than one fit to all of them did; their
+    covariances grow by the largest ratio.
+
+    Args:
+        together: (7, 7) covariance of the map's placement by all of them at once.
+    """
+    if together is None or len(edges) < 2:
+        return list(edges)
+    information = sum(np.linalg.inv(edge.covariance) for edge in edges)
+    half = np.linalg.cholesky(together)
+    factor = max(1.0, float(np.linalg.eigvalsh(half.T @ information @ half)[-1]))
+    return [replace(edge, covariance=factor * edge.covariance) for edge in edges]
 
 
 def drift_m(covariance_relative: FloatArray, corners: FloatArray) -> float:
