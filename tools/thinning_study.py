@@ -5,13 +5,13 @@
 
 WORLD and DB are what `tools/simulated_evaluation.py` leaves (world/, db/), PART_DB and WHOLE_DB what
 `tools/real_photos.py --work` leaves (part, whole). For each K the map is thinned so that every image keeps
-seeing K described points, and by chance to the same number of points; then all held-out photos are asked for as
-a client does that knows nothing but the file. The held-out photos of a real set are compared with their poses in
-the map of all photos.
+seeing K described points, and by chance to the same number of points; then all held-out photos are asked for
+as a client does that knows nothing but the file. The held-out photos of a real set are compared with their
+poses in the map of all photos.
 
-Recall is the share localised within 0.25 m and 0.3 degrees (simulated), 1.0 m and 0.5 degrees (real, where both
-maps are placed by GPS). Bytes are those of the files of a database that holds this map alone; the index is
-FAISS' own size; the query's time is CPU without the photo's features, which no map changes.
+Recall is the share localised within 0.25 m and 0.3 degrees (simulated), 1.0 m and 0.5 degrees (real, where
+both maps are placed by GPS). Bytes are those of the files of a database that holds this map alone; the index
+is FAISS' own size; the query's time is CPU without the photo's features, which no map changes.
 
 Writes thinning.csv and thinning.png, and prints the table.
 """
@@ -21,7 +21,7 @@ import csv
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -30,9 +30,10 @@ import faiss
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.features.decode import decode_gray
+from featuredb.features.extractor import extract
+from featuredb.features.features import Features
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
@@ -41,14 +42,15 @@ from featuredb.simworld.scoring import PoseError, pose_difference, pose_error
 from featuredb.simworld.world import open_world
 from featuredb.store import Database
 from reloc.candidates import IndexedArea
-from reloc.localise import localise
+from reloc.localise import localise_features
+from reloc.options import LocaliseOptions
 from reloc.result import LocaliseRequest, LocaliseResult
 from reloc.service.handler import localise_request
 from reloc.wire import LocaliseWireRequest
 
 mpl.use("Agg")  # no display is needed
 
-COVERS = (20, 30, 40, 60, 80, 120, 160, 240, 400)
+COVERS = (20, 30, 40, 60, 80, 120, 160, 240, 400, 600, 800, 1200)
 SIMULATED, REAL = (0.25, 0.3), (1.0, 0.5)  # metres, degrees
 
 
@@ -56,7 +58,7 @@ SIMULATED, REAL = (0.25, 0.3), (1.0, 0.5)  # metres, degrees
 class Query:
     """A held-out photo and how far an answer to it is off."""
 
-    gray: NDArray[np.uint8]
+    features: Features
     request: LocaliseRequest
     error: Callable[[LocaliseResult], PoseError | None]
 
@@ -127,9 +129,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def curve(study: Study, covers: Sequence[int], max_views: int, seed: int) -> "list[Row]":
+def curve(study: Study, covers: Sequence[int], max_views: int, seed: int) -> Iterator[Row]:
     """The whole map, then each cover and chance with as many points."""
-    rows = [_measure(study, study.feature_map, study.feature_map, "whole", 0, 0.0)]
+    yield _measure(study, study.feature_map, study.feature_map, "whole", 0, 0.0)
     for cover in covers:
         start = time.process_time()
         options = ThinOptions(cover=cover, max_views=max_views)
@@ -138,12 +140,11 @@ def curve(study: Study, covers: Sequence[int], max_views: int, seed: int) -> "li
         dropped = thin_map(
             study.feature_map, ThinOptions(cover=cover, max_views=max_views, keep_points=False)
         )
-        rows.append(_measure(study, thin, dropped, "cover", cover, seconds))
+        yield _measure(study, thin, dropped, "cover", cover, seconds)
         described = thin.observations.point_index[thin.observations.has_descriptor]
         chance = by_chance(study.feature_map, len(np.unique(described)), seed, keep_points=True)
         gone = by_chance(study.feature_map, len(np.unique(described)), seed, keep_points=False)
-        rows.append(_measure(study, chance, gone, "random", cover, 0.0))
-    return rows
+        yield _measure(study, chance, gone, "random", cover, 0.0)
 
 
 def by_chance(feature_map: FeatureMap, count: int, seed: int, *, keep_points: bool) -> FeatureMap:
@@ -161,9 +162,8 @@ def _measure(study: Study, thin: FeatureMap, dropped: FeatureMap, how: str, cove
     errors, inliers, times = [], [], []
     for query in study.queries:
         start = time.process_time()
-        result = localise(query.gray, query.request, indexed)
-        spent_ms = 1e3 * (time.process_time() - start)
-        times.append(spent_ms - result.timings_ms["features"])
+        result = localise_features(query.features, query.request, indexed).result
+        times.append(1e3 * (time.process_time() - start))
         error = query.error(result)
         if error is not None:
             errors.append(error)
@@ -292,7 +292,8 @@ def _real(part: Path, whole: Path, photos: Path, names: Sequence[str]) -> Study:
 def _asked(path: Path, error: Callable[[LocaliseResult], PoseError | None]) -> Query:
     data = path.read_bytes()
     gray = decode_gray(data)
-    return Query(gray=gray, request=localise_request(LocaliseWireRequest(), data, gray), error=error)
+    features = extract(gray, LocaliseOptions().extractor)
+    return Query(features=features, request=localise_request(LocaliseWireRequest(), data, gray), error=error)
 
 
 def _largest(database: Path) -> FeatureMap:
