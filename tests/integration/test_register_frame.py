@@ -17,8 +17,9 @@ from featuredb.render.levels import build_cloud
 from featuredb.simworld.airborne import ScanOptions, scan_town
 from featuredb.simworld.photograph import render_view
 from featuredb.simworld.town import make_town
+from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.register import available_sources, register_frame
+from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(640.0, 398.0, 303.0, 0.02))

@@ -15,9 +15,10 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from ingest.register.frame.confirmation import confirm_pose
-from ingest.register.frame.dense_registration import register_by_pictures
 from ingest.register.frame.dense_templates import dense_matches
 from ingest.register.frame.intensity import refine_by_intensity
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior
 
 CAMERA = Camera(
@@ -96,24 +97,19 @@ def _prior() -> FramePrior:
     )
 
 
-def test_found_from_afar_refined_and_confirmed() -> None:
-    pose, confirmation = register_by_pictures(_photo(0), CAMERA, _prior(), _ground(0)[0], "intensity")
-    assert pose is not None
-    assert confirmation is not None
-    metres, degrees = _errors(pose.cam_from_local)
+def test_found_from_afar_and_confirmed() -> None:
+    found = register_frame(_photo(0), CAMERA, _prior(), _ground(0)[0], FrameOptions(threads=1))
+    assert found.accepted, found.message
+    assert found.cam_from_local is not None
+    metres, degrees = _errors(found.cam_from_local)
     assert metres < 0.5  # a pixel is 0.14 m on the ground; position and tilt trade
     assert degrees < 0.6
-    assert confirmation.confirmed
-    assert confirmation.local_maximum
-    assert confirmation.share > 0.4
+    assert found.source == "intensity"
 
 
 def test_another_place_is_not_confirmed() -> None:
-    pose, confirmation = register_by_pictures(_photo(0), CAMERA, _prior(), _ground(1)[0], "intensity")
-    assert pose is not None
-    assert confirmation is not None
-    assert not confirmation.confirmed
-    assert "needed" in confirmation.message
+    found = register_frame(_photo(0), CAMERA, _prior(), _ground(1)[0], FrameOptions(threads=1))
+    assert not found.accepted
 
 
 def test_a_pose_that_is_a_few_metres_off_is_not_confirmed() -> None:

@@ -8,12 +8,13 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
+from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame.uncertainty import left_perturbation
 from ingest.register.frame.verdict import (
     FrameEvidence,
     VerdictOptions,
+    asks_elsewhere,
     cells_with_inliers,
-    prior_sigmas,
     verdict,
 )
 from ingest.register.frame_registration import FramePrior
@@ -56,6 +57,30 @@ def test_each_gate_fires(change: dict[str, float], reason: str) -> None:
     refusal = verdict(replace(GOOD, **change), VerdictOptions())  # type: ignore[arg-type]
     assert refusal is not None
     assert refusal[0] == reason
+
+
+MIDDLING = replace(GOOD, log_nfa=0.0, confirmation_log_nfa=9.0)
+
+
+def test_middling_evidence_is_believed_where_other_places_show_much_less() -> None:
+    options = VerdictOptions()
+    assert verdict(MIDDLING, options) is not None  # nobody has looked elsewhere
+    assert asks_elsewhere(MIDDLING, options)
+    assert verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=0.4), options) is None
+    refusal = verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=3.0), options)
+    assert refusal is not None
+    assert refusal[0] == "AMBIGUOUS"
+    # What is found elsewhere counts as 1 at least.
+    faint = replace(MIDDLING, confirmation_log_nfa=4.0, places_elsewhere=2)
+    assert verdict(faint, options) is not None
+
+
+def test_elsewhere_is_asked_only_where_it_decides() -> None:
+    options = VerdictOptions()
+    assert not asks_elsewhere(GOOD, options)
+    assert not asks_elsewhere(replace(MIDDLING, inliers=12), options)
+    assert not asks_elsewhere(replace(MIDDLING, confirmed=False), options)
+    assert not asks_elsewhere(replace(MIDDLING, confirmation_log_nfa=3.0), options)
 
 
 def test_decisive_features_bear_silent_pictures_but_no_contradiction() -> None:

@@ -66,11 +66,11 @@ class ConfirmOptions:
     piece_share: float = 0.21
     min_piece_px: int = 40
     max_piece_px: int = 40
-    min_agreeing: float = 0.2
+    min_agreeing: float = 0.18
     min_low_agreeing: float = 0.0
     max_layer_ratio: float = 1.5
     min_layer_m: float = 2.0
-    min_log_nfa: float = 6.0
+    min_log_nfa: float = 5.0
     min_cells: int = 4
     gradients: GradientOptions = field(default_factory=GradientOptions)
 

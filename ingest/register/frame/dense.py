@@ -9,6 +9,7 @@ from ingest.register.frame.dense_fit import DenseFitOptions, near_places
 from ingest.register.frame.dense_search import register_dense
 from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame.matching import joined
+from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.search import FrameHypothesis, independent
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
@@ -45,9 +46,9 @@ def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource)
 
 
 def dense_fitted(
-    views: FrameViews, start: FrameHypothesis, options: DenseFitOptions
+    views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
 ) -> FrameHypothesis | None:
-    """The pose fitted to all pieces near it, coarse to fine; None where too few are found."""
+    """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few."""
     found = start
     for spacing_px, piece_px in zip(options.spacing_px, options.piece_px, strict=True):
         side = dense_side_px(views, spacing_px)
@@ -59,6 +60,7 @@ def dense_fitted(
             return None
         settings = dense_pose_options(views, options, spacing_px)
         pose = refine_pose(matches.pixels, matches.points, found.pose, settings)
+        pose = fitted_under_prior(matches, pose, prior, settings, views.options.correlated_inliers)
         inliers = independent(views.camera, matches.take(pose.inliers))
         found = replace(found, pose=pose, matches=matches, inliers=inliers)
     return found

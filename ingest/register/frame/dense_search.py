@@ -17,11 +17,12 @@ from scipy.optimize import minimize
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp, so3_log
+from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
 from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame.scan_resolution import finest_side_px, viewing_distance_m
 from ingest.register.frame.score_maps import (
     ScoreMaps,
@@ -177,7 +178,7 @@ def _vote(
     found.sort(key=lambda item: -item[0])
     poses = [DensePose(cam_from_local=p, score=s, mean_score=0.0, pieces=0) for s, p in found]
     distinct = _distinct(poses, view.camera, prior, options)
-    return [p.cam_from_local for p in distinct[: options.candidates]]
+    return [p.cam_from_local for p in distinct]
 
 
 def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray, options: DenseOptions) -> FloatArray:
@@ -278,7 +279,7 @@ def _refined(
     def cost(step: FloatArray) -> float:
         moved = Rigid3.exp(step * scale) @ pose
         total, _ = _summed(maps, moved, options)
-        return -options.score_weight * total + 0.5 * prior_distance(moved, prior) ** 2
+        return -options.score_weight * total + 0.5 * prior_sigmas(prior, moved) ** 2
 
     simplex = np.vstack([np.zeros(6), np.eye(6)])
     result = minimize(
@@ -306,23 +307,10 @@ def _summed(maps: ScoreMaps, pose: Rigid3, options: DenseOptions) -> tuple[float
     return float(np.clip(scores[0], -options.score_clip, options.score_clip).sum()), int(inside.sum())
 
 
-def prior_distance(pose: Rigid3, prior: FramePrior) -> float:
-    """Distance of a pose from the prior in the prior's own standard deviations."""
-    start = prior.cam_from_local
-    moved = (pose.center - start.center) / (
-        prior.sigma_horizontal_m,
-        prior.sigma_horizontal_m,
-        prior.sigma_vertical_m,
-    )
-    turned = start.rotation.T @ so3_log(pose.rotation @ start.rotation.T)  # about east, north, up
-    turned = np.degrees(turned) / (prior.sigma_tilt_deg, prior.sigma_tilt_deg, prior.sigma_heading_deg)
-    return float(np.sqrt(moved @ moved + turned @ turned))
-
-
 def _distinct(
     poses: Sequence[DensePose], camera: Camera, prior: FramePrior, options: DenseOptions
 ) -> list[DensePose]:
-    """Those that show something else than every better one."""
+    """The first of those that show something else than every better one, as many as are looked into."""
     kept: list[DensePose] = []
     corners = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)]) * (
         camera.width,
@@ -335,9 +323,11 @@ def _distinct(
         # Compared on a plane across the optical axis, far away beside the step between positions.
         here = cam_from_prior.inverse().act(rays * 100.0)
         pixels = here[:, :2] / np.maximum(here[:, 2:], 1e-3) * camera.params[0]
-        if all(np.abs(pixels - other).max() > options.separation_px for other in seen):
+        if not seen or np.abs(np.array(seen) - pixels).max(axis=(1, 2)).min() > options.separation_px:
             kept.append(pose)
             seen.append(pixels)
+        if len(kept) == options.candidates:
+            break
     return kept
 
 

@@ -34,10 +34,14 @@ class FrameOptions:
             longer side; the second is a third of it.
         min_log_nfa: a pose with less evidence among the features' matches is not looked into.
         decisive_log_nfa: one with so much, if the pictures confirm it, ends the search.
+        promising_log_nfa: a pose of the dense search with less evidence of the pictures is not fitted. Before
+            the fit right ones had 0.6 and more, of those at wrong places one in ten.
         sure_confirmation_log_nfa: and so does one that the pictures confirm so strongly. Three of
             four right poses do; wrong ones reached 8.
         tolerance_rel: inlier tolerance as a share of the longer side (4 pixels at 1600), where points are
             denser than pixels; max_tolerance_rel: where they are sparser, it grows up to this.
+        prior_slack: in the fit the prior's deviations count so many times as large. People and devices
+            understate them, and what matches leave open stays well within what the verdict bears.
         correlated_inliers: so many inliers count as one measurement. shared_point_share: standard
             deviation of what all inliers share, as a share of the scan's spacing. Both from the
             normalised errors that tools/frame_evaluation.py prints.
@@ -60,9 +64,11 @@ class FrameOptions:
     guided_radius_rel: float = 0.012
     min_log_nfa: float = 2.0
     decisive_log_nfa: float = 60.0
+    promising_log_nfa: float = 0.5
     sure_confirmation_log_nfa: float = 20.0
     tolerance_rel: float = 0.0025
     max_tolerance_rel: float = 0.006
+    prior_slack: float = 2.0
     correlated_inliers: float = 4.0
     shared_point_share: float = 0.1
     threads: int = 0

@@ -13,6 +13,7 @@ from ingest.register.frame.consistency import ConsistencyOptions, consistent_mat
 from ingest.register.frame.matching import FrameMatches, guided_matches, joined, pooled_matches
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.pool import Pool
+from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.star import fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
@@ -111,7 +112,9 @@ def search(
     return _hypothesis(views, joined(raw), joined(kept), source, upright)
 
 
-def guided(views: FrameViews, start: FrameHypothesis, radius_px: float) -> FrameHypothesis | None:
+def guided(
+    views: FrameViews, prior: FramePrior, start: FrameHypothesis, radius_px: float
+) -> FrameHypothesis | None:
     """The pose from matches looked for where `start` predicts them, on a render from its pose."""
     options = views.options
     side_px = views.side_px(options.final_side_px)
@@ -134,6 +137,7 @@ def guided(views: FrameViews, start: FrameHypothesis, radius_px: float) -> Frame
     if pose is None:
         return None
     pose = refine_pose(matches.pixels, matches.points, _with_prior_lens(pose, start.pose), settings)
+    pose = fitted_under_prior(matches, pose, prior, settings, options.correlated_inliers)
     return replace(
         start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
     )

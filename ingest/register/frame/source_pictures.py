@@ -24,15 +24,5 @@ def source_picture(rendering: Rendering, source: RenderSource) -> FloatImage:
     if source == "shaded":
         return shaded_relief(rendering).astype(np.float32)
     raise InvalidValueError(
-        f"source_picture: expected a source that the scan has, found {source!r}; use available_sources()"
+        f"source_picture: expected a source that the scan has, found {source!r}; see available_sources()"
     )
-
-
-def available_sources(rendering: Rendering) -> tuple[RenderSource, ...]:
-    """What a rendering can be compared by; shading works for every scan."""
-    found: list[RenderSource] = []
-    if rendering.rgb is not None:
-        found.append("rgb")
-    if rendering.intensity is not None:
-        found.append("intensity")
-    return (*found, "shaded")

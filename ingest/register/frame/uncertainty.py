@@ -4,6 +4,8 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
+from ingest.register.frame.prior_fit import prior_information
+from ingest.register.frame_registration import FramePrior
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, pose_uncertainty
 from reloc.self_calibration import covariance_from_information, joint_jacobians
@@ -18,6 +20,7 @@ def frame_covariance(
     options: PoseOptions,
     correlated_inliers: float,
     shared_point_share: float,
+    prior: FramePrior | None = None,
 ) -> FloatArray:
     """Covariance (6, 6) of the left perturbation of cam_from_local.
 
@@ -29,12 +32,16 @@ def frame_covariance(
         pixels, points: (k, 2), (k, 3) of the inliers.
         spacing_m: of the scan. depth_m: distance to it.
         shared_point_share: standard deviation of the shared shift, as a share of the spacing.
+        prior: that the pose was fitted under, too.
     """
     spread = (0.3 * spacing_m) ** 2 * np.eye(3)  # a point stands for a cell of its spacing
     found = pose_uncertainty(pixels, points, np.broadcast_to(spread, (len(points), 3, 3)), pose, options)
     covariance = correlated_inliers * found.covariance
     shared = (shared_point_share * spacing_m) ** 2
     covariance = covariance + np.diag([shared / depth_m**2] * 3 + [shared] * 3)
+    if prior is not None and not pose.focal_is_free:
+        information = np.linalg.inv(covariance) + prior_information(pose.cam_from_local, prior)
+        covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return left_perturbation(covariance, pose.cam_from_local)
 
 

@@ -1,15 +1,13 @@
 """Whether a registered frame is believed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_log
-from ingest.register.frame_registration import FramePrior, FrameReason
+from ingest.register.frame_registration import FrameReason
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,9 +22,12 @@ class VerdictOptions:
         min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
         min_log_nfa_alone: features with that much evidence among their unguided matches need no confirmation
             where the pictures have fewer than `min_confirmation_pieces` pieces to compare.
-        min_confirmation_log_nfa: evidence of the pictures that a pose without so many features needs. It is
-            the best of very many that were tried, and towns resemble each other: of 20 photos of another town
-            the strongest reached 14.3; of the right poses that need it the weakest had 10.0, the next 20.9.
+        min_confirmation_log_nfa: evidence of the pictures with which a pose needs no features. It is the best
+            of very many that were tried, and towns resemble each other: of 20 photos of another town the
+            strongest reached 14.3.
+        min_confirmation_ratio: with less, it must be so many times what the photo reaches at places of the
+            scan where it cannot be (`elsewhere`), of which max_places_elsewhere are tried and
+            min_places_elsewhere must be there. What is found there counts as 1 at least.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
         max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
             axes together. Generous: people and devices understate their errors.
@@ -42,6 +43,9 @@ class VerdictOptions:
     min_log_nfa_alone: float = 60.0
     min_confirmation_pieces: int = 25
     min_confirmation_log_nfa: float = 20.0
+    min_confirmation_ratio: float = 5.0
+    max_places_elsewhere: int = 3
+    min_places_elsewhere: int = 1
     rival_share: float = 0.5
     max_prior_sigmas: float = 6.0
     max_position_sigma_share: float = 0.05
@@ -62,6 +66,7 @@ class FrameEvidence:
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
         position_sigma_share: see VerdictOptions. focal_sigma_rel: of an estimated focal length, else 0.
+        places_elsewhere, elsewhere_log_nfa: see `elsewhere`; none where it was not asked.
     """
 
     inliers: int
@@ -77,6 +82,19 @@ class FrameEvidence:
     prior_sigmas: float
     position_sigma_share: float
     focal_sigma_rel: float = 0.0
+    places_elsewhere: int = 0
+    elsewhere_log_nfa: float = 0.0
+
+
+def asks_elsewhere(evidence: FrameEvidence, options: VerdictOptions) -> bool:
+    """Whether all that keeps the pose from being believed is how the photo agrees with the scan elsewhere."""
+    clean = replace(evidence, places_elsewhere=options.min_places_elsewhere, elsewhere_log_nfa=0.0)
+    return verdict(evidence, options) is not None and verdict(clean, options) is None
+
+
+def highest_elsewhere(log_nfa: float, options: VerdictOptions) -> float:
+    """The evidence elsewhere that a pose with `log_nfa` bears."""
+    return log_nfa / options.min_confirmation_ratio
 
 
 def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReason, str] | None:
@@ -90,11 +108,9 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
     if e.log_nfa < o.min_log_nfa_alone and e.confirmation_log_nfa < o.min_confirmation_log_nfa:
-        return (
-            "NOT_CONFIRMED",
-            f"the pictures agree too little at a pose that few features speak for: evidence of "
-            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{o.min_confirmation_log_nfa:g} needed",
-        )
+        refusal = _against_elsewhere(e, o)
+        if refusal is not None:
+            return refusal
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
             "NO_CONSISTENT_POSE",
@@ -119,26 +135,20 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     return None
 
 
-def prior_sigmas(prior: FramePrior, cam_from_local: Rigid3) -> float:
-    """Distance of a pose from the prior in standard deviations over all axes together.
-
-    A heading is a rotation about the vertical, tilt what is left; an unknown heading counts nothing.
-    """
-    offset = cam_from_local.center - prior.cam_from_local.center
-    sigma_m = np.array([prior.sigma_horizontal_m, prior.sigma_horizontal_m, prior.sigma_vertical_m])
-    turn = np.degrees(so3_log(cam_from_local.rotation.T @ prior.cam_from_local.rotation))
-    sigma_deg = np.array([prior.sigma_tilt_deg, prior.sigma_tilt_deg, prior.sigma_heading_deg])
-    if prior.sigma_heading_deg >= 180.0:
-        turn = _tilt_deg(prior.cam_from_local, cam_from_local)
-    return float(np.sqrt(np.sum((offset / sigma_m) ** 2) + np.sum((turn / sigma_deg) ** 2)))
-
-
-def _tilt_deg(prior: Rigid3, pose: Rigid3) -> FloatArray:
-    """Difference of the vertical in camera axes: rotations of pitch and roll, none about the vertical."""
-    up_prior, up_pose = prior.rotation[:, 2], pose.rotation[:, 2]
-    cross = np.cross(up_prior, up_pose)
-    angle = np.degrees(np.arctan2(np.linalg.norm(cross), up_prior @ up_pose))
-    return np.array([angle, 0.0, 0.0])
+def _against_elsewhere(e: FrameEvidence, o: VerdictOptions) -> tuple[FrameReason, str] | None:
+    if e.places_elsewhere < o.min_places_elsewhere:
+        return (
+            "NOT_CONFIRMED",
+            f"the pictures agree too little at a pose that few features speak for: evidence of "
+            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{o.min_confirmation_log_nfa:g} needed",
+        )
+    if max(e.elsewhere_log_nfa, 1.0) > highest_elsewhere(e.confirmation_log_nfa, o):
+        return (
+            "AMBIGUOUS",
+            f"evidence of 10^-{e.confirmation_log_nfa:.1f} at the pose found, and of "
+            f"10^-{e.elsewhere_log_nfa:.1f} at a place of the scan where the photo cannot be",
+        )
+    return None
 
 
 def cells_with_inliers(pixels: FloatArray, valid: NDArray[np.bool_], camera: Camera) -> tuple[int, float]:

@@ -1,0 +1,149 @@
+"""The pose that is to be judged: of all that features and dense templates find, the one that the pictures
+confirm most.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from featuredb.render.cloud import PointCloud
+from ingest.register.frame.clock import StageClock
+from ingest.register.frame.confirmation import Confirmation
+from ingest.register.frame.dense import confirmed, dense_fitted, dense_hypotheses, intensity_refined
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.prior_fit import loosened
+from ingest.register.frame.search import (
+    FrameHypothesis,
+    RenderGroup,
+    fan_groups,
+    guided,
+    oriented_features_suffice,
+    search,
+    star_groups,
+)
+from ingest.register.frame.views import FrameViews
+from ingest.register.frame_registration import FramePrior, RenderSource
+
+_GUIDED_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Judged:
+    """A fitted pose with what the pictures say of it."""
+
+    found: FrameHypothesis
+    confirmation: Confirmation
+
+
+def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> Judged | None:
+    """The first pose that is beyond doubt, or of all found the one that the pictures confirm most."""
+    options = views.options
+    judged: list[Judged] = []
+    loose = loosened(prior, options.prior_slack)
+    for start in _starts(views, prior, clock):
+        with clock.stage("compare sources"):
+            begun = _by_agreement(views, start)
+        if start.kind == "dense" and begun.confirmation.log_nfa < options.promising_log_nfa:
+            continue
+        judged.append(_polished(views, loose, begun.found, clock))
+        confirmation = judged[-1].confirmation
+        # Decisive features stand alone where the pictures have too little to compare.
+        silent = confirmation.pieces < options.verdict.min_confirmation_pieces
+        if start.log_nfa >= options.decisive_log_nfa and (confirmation.confirmed or silent):
+            return judged[-1]
+        if confirmation.confirmed and confirmation.log_nfa >= options.sure_confirmation_log_nfa:
+            return judged[-1]
+    return max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
+
+
+def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
+    """What can be rendered of a scan, most telling first."""
+    sources: list[RenderSource] = []
+    if cloud.rgb is not None:
+        sources.append("rgb")
+    if cloud.intensity is not None:
+        sources.append("intensity")
+    return (*sources, "shaded")
+
+
+def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
+    """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
+    options = views.options
+    with clock.stage("render star"):
+        star = star_groups(views, prior)
+    fan: list[RenderGroup] | None = None
+    for source in _searched(_sources(views)):
+        for upright in _kinds(prior, options):
+            if upright and fan is None:
+                with clock.stage("render fan"):
+                    fan = fan_groups(views, prior)
+            groups = [*star, *(fan or [])] if upright else star
+            with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
+                found = search(views, groups, source, upright)
+            if found is not None and found.log_nfa >= options.min_log_nfa:
+                yield found
+        with clock.stage(f"search {source} dense"):
+            dense = dense_hypotheses(views, prior, source)
+        yield from dense
+
+
+def _sources(views: FrameViews) -> tuple[RenderSource, ...]:
+    return views.options.sources or available_sources(views.cloud)
+
+
+def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
+    """Shaded relief gives points nothing to match and has few edges (docs/descriptors.md): where the scan has
+    more to show, poses are compared with it, but not searched.
+    """
+    telling = tuple(source for source in sources if source != "shaded")
+    return telling or sources
+
+
+def _by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
+    """The pose with the source that agrees best with the photo there, whichever it was found by."""
+    own = Judged(found=found, confirmation=confirmed(views, found))
+    if found.log_nfa >= views.options.decisive_log_nfa:
+        return own
+    others = [replace(found, source=source) for source in _sources(views) if source != found.source]
+    judged = [own, *(Judged(found=other, confirmation=confirmed(views, other)) for other in others)]
+    return max(judged, key=lambda j: j.confirmation.log_nfa)
+
+
+def _polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
+    """Fitted by guided features where colours are rendered, else by pieces; and shown to the pictures."""
+    by_features = found.source == "rgb" and found.kind != "dense"
+    with clock.stage("fit"):
+        if by_features:
+            fitted = _guided(views, prior, found)
+        else:
+            fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
+    with clock.stage("confirm"):
+        judged = Judged(found=fitted, confirmation=confirmed(views, fitted))
+    if not views.options.refine or not judged.confirmation.confirmed:
+        return judged
+    with clock.stage("refine"):
+        return _refined(views, judged)
+
+
+def _refined(views: FrameViews, judged: Judged) -> Judged:
+    """By intensities, where the photo's pieces agree better with the refined pose than the fitted one."""
+    refined = intensity_refined(views, judged.found)
+    again = Judged(found=refined, confirmation=confirmed(views, refined))
+    return again if again.confirmation.score > judged.confirmation.score else judged
+
+
+def _guided(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis:
+    side = max(views.camera.width, views.camera.height)
+    for turn in range(_GUIDED_ROUNDS):
+        better = guided(views, prior, found, views.options.guided_radius_rel * side / 3.0**turn)
+        if better is None:
+            break
+        found = better
+    return found
+
+
+def _kinds(prior: FramePrior, options: FrameOptions) -> tuple[bool, ...]:
+    """Upright features first where the heading is known; without, those with orientation cost less."""
+    unknown = prior.sigma_heading_deg >= options.star.full_circle_sigma_deg
+    if not unknown:
+        return (True, False)
+    return (False, True) if oriented_features_suffice(prior) else (True,)

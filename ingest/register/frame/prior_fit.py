@@ -1,0 +1,151 @@
+"""What a prior says of a pose, and the pose that matches and prior together make most likely.
+
+From a kilometre with a long lens, or over flat ground, matches leave position and tilt open against each
+other by tens of metres while every pixel is right. There the prior decides; where matches determine a pose,
+it weighs nothing.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp, so3_log
+from ingest.register.frame.matching import FrameMatches
+from ingest.register.frame_registration import FramePrior
+from reloc.jacobians import pixel_jacobians
+from reloc.options import PoseOptions
+from reloc.pose import PoseHypothesis, reprojection_errors
+
+_ROUNDS = 5  # Gauss-Newton; a step of 50 m and 3 degrees leaves a metre to the next
+_MIN_MATCHES = 6
+
+
+def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
+    """Displacement of the centre, tilt about east and north, and turn about the vertical (6,), in the prior's
+    standard deviations. An unknown heading counts nothing.
+    """
+    moved = pose.center - prior.cam_from_local.center
+    turn = pose.rotation.T @ prior.cam_from_local.rotation
+    heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+    cosine, sine = np.cos(heading), np.sin(heading)
+    tilt = _small_log(turn @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
+    if prior.sigma_heading_deg >= 180.0:
+        heading = 0.0
+    angles = np.degrees([tilt[0], tilt[1], heading])
+    level, tilted = prior.sigma_horizontal_m, prior.sigma_tilt_deg
+    return np.concatenate(
+        [
+            moved / (level, level, prior.sigma_vertical_m),
+            angles / (tilted, tilted, prior.sigma_heading_deg),
+        ]
+    )
+
+
+def _small_log(rotation: FloatArray) -> FloatArray:
+    """so3_log, ten times as fast where the angle is not near 180 degrees."""
+    cosine = float(np.trace(rotation) - 1.0) / 2.0
+    if cosine < -0.9:
+        return so3_log(rotation)
+    axis = np.array(
+        [
+            rotation[2, 1] - rotation[1, 2],
+            rotation[0, 2] - rotation[2, 0],
+            rotation[1, 0] - rotation[0, 1],
+        ]
+    )
+    sine = float(np.linalg.norm(axis)) / 2.0
+    return axis / 2.0 * (float(np.arctan2(sine, cosine)) / sine if sine > 1e-9 else 1.0)
+
+
+def prior_sigmas(prior: FramePrior, pose: Rigid3) -> float:
+    """Distance of a pose from the prior in standard deviations over all axes together."""
+    return float(np.linalg.norm(prior_residual(pose, prior)))
+
+
+def loosened(prior: FramePrior, factor: float) -> FramePrior:
+    """The prior with deviations so many times as large; a heading that was unknown stays unknown."""
+    return replace(
+        prior,
+        sigma_horizontal_m=factor * prior.sigma_horizontal_m,
+        sigma_vertical_m=factor * prior.sigma_vertical_m,
+        sigma_heading_deg=factor * prior.sigma_heading_deg,
+        sigma_tilt_deg=factor * prior.sigma_tilt_deg,
+    )
+
+
+def prior_information(pose: Rigid3, prior: FramePrior) -> FloatArray:
+    """Inverse covariance (6, 6) of rotations about local axes (rad) and displacement (m) of the camera."""
+    slopes = _prior_slopes(pose, prior)
+    return np.asarray(slopes.T @ slopes, dtype=np.float64)
+
+
+def fitted_under_prior(
+    matches: FrameMatches,
+    pose: PoseHypothesis,
+    prior: FramePrior,
+    options: PoseOptions,
+    correlated: float,
+) -> PoseHypothesis:
+    """The most likely pose next to `pose`, given matches with Cauchy residuals and the prior.
+
+    Args:
+        options: of the fit that `pose` comes from. correlated: so many matches count as one.
+
+    Returns:
+        `pose` itself where its lens was estimated with it, or the matches are few.
+    """
+    if pose.focal_is_free or len(matches) < _MIN_MATCHES:
+        return pose
+    tolerance_px = options.tolerance_rel * max(pose.camera.width, pose.camera.height)
+    here = pose.cam_from_local
+    for _ in range(_ROUNDS):
+        found = _information(matches, pose.camera, here, tolerance_px)
+        if found is None:
+            return pose
+        information, pull = (part / correlated for part in found)
+        slopes = _prior_slopes(here, prior)
+        information += slopes.T @ slopes
+        pull += slopes.T @ prior_residual(here, prior)
+        step = np.asarray(np.linalg.solve(information, -pull), dtype=np.float64)
+        here = moved(here, step)
+    error = reprojection_errors(matches.pixels, matches.points, pose.camera, here)
+    return replace(pose, cam_from_local=here, inliers=error < tolerance_px)
+
+
+def _information(
+    matches: FrameMatches, camera: Camera, pose: Rigid3, tolerance_px: float
+) -> tuple[FloatArray, FloatArray] | None:
+    """Normal equations (6, 6), (6,) of the matches within reach, weighted by Cauchy and their own spread."""
+    near = reprojection_errors(matches.pixels, matches.points, camera, pose) < 2.0 * tolerance_px
+    if near.sum() < _MIN_MATCHES:
+        return None
+    pixels, points = matches.pixels[near], matches.points[near]
+    residual = camera.project(pose.act(points)) - pixels
+    squared = np.sum(residual**2, axis=1)
+    weight = 1.0 / (1.0 + squared / (0.25 * tolerance_px) ** 2)
+    variance = max(float(weight @ squared / (2.0 * weight.sum())), 1e-4)
+    _, jacobian = pixel_jacobians(camera, pose, points)
+    information = np.einsum("n,nij,nik->jk", weight, jacobian, jacobian) / variance
+    return information, np.einsum("n,nij,ni->j", weight, jacobian, residual) / variance
+
+
+def _prior_slopes(pose: Rigid3, prior: FramePrior) -> FloatArray:
+    """Derivative (6, 6) of the prior's residual by rotations about local axes (rad) and displacement (m)."""
+
+    def slope(axis: FloatArray) -> FloatArray:
+        ahead, behind = (
+            prior_residual(moved(pose, axis), prior),
+            prior_residual(moved(pose, 0.0 - axis), prior),
+        )
+        return (ahead - behind) / 2e-5
+
+    return np.stack([slope(np.asarray(axis, dtype=np.float64)) for axis in 1e-5 * np.eye(6)], axis=1)
+
+
+def moved(pose: Rigid3, step: FloatArray) -> Rigid3:
+    """The camera turned by a rotation about local axes (rad) and its centre displaced (m): step (6,)."""
+    rotation = pose.rotation @ so3_exp(-step[:3])
+    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + step[3:]))
