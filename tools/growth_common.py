@@ -1,0 +1,305 @@
+"""What the programs that measure growth share: an anchored database, contributions, errors, a plan."""
+
+import json
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import rotation_angle
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.simworld.album_files import TABLE_FILES, AlbumFact, read_facts
+from featuredb.simworld.truth import Truth, read_truth
+from featuredb.store import Database
+from featuredb.store.candidate_states import Contribution, candidate_id_of
+from featuredb.store.candidates import contribute
+from ingest.growing import GrowingOptions
+from ingest.growth.grow import GrowthOptions
+from ingest.growth.growth_report import GrowthReport
+from ingest.map_builder import MapOptions
+from ingest.pipeline import IngestOptions, ingest_photos
+from ingest.reconstruction import MapMakingOptions
+
+mpl.use("Agg")  # no display is needed
+
+WRONG_M = 2.0  # a photo registered further off than this is wrong
+# The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
+_SURVEY_SIGMA_M = (0.02, 0.03)
+_UNSAID_M = 30.0  # accuracy of a geotag that names none
+_COLOURS = ("tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:brown", "tab:pink")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Album:
+    """An album on disk.
+
+    Attributes:
+        folder: of the photos. truth, facts: by name. rows: of the table, by name.
+    """
+
+    folder: Path
+    truth: Truth
+    facts: dict[str, AlbumFact]
+    rows: dict[str, dict[str, Any]]
+
+    def of(self, *kinds: str, batch: int | None = None) -> list[AlbumFact]:
+        """Facts of these kinds, by name."""
+        return [
+            self.facts[name]
+            for name in sorted(self.facts)
+            if self.facts[name].kind in kinds and batch in (None, self.facts[name].batch)
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Registered:
+    """A photo of the album in a living map.
+
+    Attributes:
+        fact: what it is. map_id, status, generation: of its map.
+        offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
+        angle_deg: between the orientations.
+        drift_m: 95 % bound that its map claims; None for anchors.
+    """
+
+    fact: AlbumFact
+    map_id: str
+    status: str
+    generation: int
+    offset_m: FloatArray | None
+    angle_deg: float
+    drift_m: float | None
+
+    @property
+    def error_m(self) -> float:
+        """Distance from the truth; infinite where the photo has no business here."""
+        return float("inf") if self.offset_m is None else float(np.linalg.norm(self.offset_m))
+
+    @property
+    def wrong(self) -> bool:
+        return self.error_m > WRONG_M
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """One line of the contract: what was measured, and whether it holds."""
+
+    name: str
+    text: str
+    holds: bool
+
+
+def say(text: str) -> None:
+    sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
+    sys.stdout.flush()
+
+
+def made(write: Callable[..., Path], folder: Path, options: Any, workers: int) -> "Album":
+    """The album in `folder`, made or finished unless it is complete."""
+
+    def progress(done: int, total: int) -> None:
+        if done % 100 == 0 or done == total:
+            say(f"{folder.name}: {done} of {total} photos")
+
+    write(folder, options, workers, progress)
+    return open_album(folder)
+
+
+def open_album(folder: Path) -> Album:
+    lines = (folder / TABLE_FILES[1]).read_text(encoding="utf-8").splitlines()
+    rows = {row["path"]: row for row in map(json.loads, lines)}
+    return Album(folder=folder, truth=read_truth(folder), facts=read_facts(folder), rows=rows)
+
+
+def making_options(max_features: int) -> MapMakingOptions:
+    return MapMakingOptions(
+        extractor=ExtractorOptions(max_features=max_features), maps=MapOptions(height_datum="ellipsoidal")
+    )
+
+
+def growing_options(max_features: int, workers: int, budget_m: float) -> GrowingOptions:
+    return GrowingOptions(
+        growth=GrowthOptions(drift_budget_m=budget_m),
+        making=making_options(max_features),
+        workers=workers,
+    )
+
+
+def anchored(path: Path, album: Album, survey: str, *, max_features: int, workers: int) -> Database:
+    """The database in `path`, with the survey of that folder of the album as an anchor."""
+    database = Database.create(path)
+    if any(m.name == survey for m in database.snapshot().maps()):
+        return database
+    options = IngestOptions(
+        gps_sigma_m=_SURVEY_SIGMA_M,
+        making=making_options(max_features),
+        name=survey,
+        workers=workers,
+    )
+    report = ingest_photos(database, album.folder / survey, options)
+    placed = [m for m in report.maps if m.status != "refused"]
+    if len(placed) != 1:
+        raise SystemExit(
+            f"{survey}: expected one anchored map, found {[(m.status, m.reason) for m in report.maps]}"
+        )
+    say(f"{survey}: {placed[0].photos} photos, {placed[0].points} points")
+    return database
+
+
+def give(database: Database, album: Album, facts: Iterable[AlbumFact]) -> None:
+    """Contribute photos as clients do: the bytes, owner, licence, and the table's position as the prior."""
+    contributions = []
+    for fact in facts:
+        image = album.truth.images.get(fact.name)
+        size = (1, 1) if image is None else (image.camera.width, image.camera.height)
+        row = album.rows.get(fact.name, {})
+        request: dict[str, Any] = {}
+        if row.get("lat") is not None:
+            accuracy = row["accuracy"] or _UNSAID_M
+            request["prior"] = {"lat": row["lat"], "lon": row["lon"], "sigma_m": accuracy}
+        contributions.append(
+            Contribution(
+                image=(album.folder / fact.name).read_bytes(),
+                width=size[0],
+                height=size[1],
+                owner=fact.owner,
+                licence=fact.licence,
+                received_at=datetime.now(UTC),
+                request=request,
+            )
+        )
+    for start in range(0, len(contributions), 50):
+        contribute(database, contributions[start : start + 50])
+
+
+@lru_cache(maxsize=64)
+def _candidate_names(folder: Path) -> dict[str, str]:
+    """Names of the album's photos by their candidate ids."""
+    return {
+        candidate_id_of(path.read_bytes()): path.relative_to(folder).as_posix()
+        for path in sorted(folder.rglob("*.jpg"))
+    }
+
+
+def registered(database: Database, album: Album) -> list[Registered]:
+    """All photos of the album in living maps, anchors included, with their errors."""
+    found: list[Registered] = []
+    for summary in database.snapshot().maps():
+        feature_map = _load(database, summary.map_id)
+        here = album.truth.frame.enu_from(feature_map.frame)
+        for image in feature_map.images:
+            fact = _fact_of(album, feature_map, image.name)
+            true = album.truth.images.get(fact.name)
+            offset, angle = None, float("nan")
+            if true is not None:
+                center = here.act(image.cam_from_local.center[None])[0]
+                offset = center - true.cam_from_local.center
+                turned = image.cam_from_local.rotation @ here.rotation.T
+                angle = float(np.degrees(rotation_angle(turned @ true.cam_from_local.rotation.T)))
+            found.append(
+                Registered(
+                    fact=fact,
+                    map_id=summary.map_id,
+                    status=summary.status,
+                    generation=summary.generation,
+                    offset_m=offset,
+                    angle_deg=angle,
+                    drift_m=summary.drift_m,
+                )
+            )
+    return found
+
+
+def _load(database: Database, map_id: str) -> FeatureMap:
+    return database.snapshot().load_map(map_id)
+
+
+def _fact_of(album: Album, feature_map: FeatureMap, name: str) -> AlbumFact:
+    """A map's image as a photo of the album: contributed ones are named by their ids."""
+    stem = name.rsplit("/", 1)[-1].split(".")[0]
+    known = _candidate_names(album.folder)
+    for tried in (name, f"{feature_map.name}/{name}", known.get(stem, "")):
+        if tried in album.facts:
+            return album.facts[tried]
+    raise SystemExit(f"map {feature_map.map_id}: image {name} is not one of {album.folder}")
+
+
+def newest_copy(source: Path, target: Path) -> Database:
+    """A copy of a database, made anew."""
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+    return Database.open(target)
+
+
+def table(rows: Sequence[Sequence[object]], head: Sequence[str]) -> str:
+    """Columns of text under a head."""
+    cells = [list(head), *([_cell(v) for v in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return "\n".join("  ".join(c.rjust(w) for c, w in zip(row, widths, strict=True)) for row in cells)
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[str, Any]) -> int:
+    """Print what holds, write `<name>.json`; 0 if everything holds."""
+    for v in verdicts:
+        sys.stdout.write(f"{'holds' if v.holds else 'FAILS'}  {v.name}: {v.text}\n")
+    document = {
+        "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
+        "figures": figures,
+    }
+    (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return 0 if all(v.holds for v in verdicts) else 1
+
+
+def tell(report: GrowthReport) -> None:
+    """The report of a run, without a line per gate."""
+    for line in report.as_text().splitlines():
+        say(line[:300])
+
+
+def plan_view(
+    path: Path, album: Album, found: Sequence[Registered], title: str, among: Sequence[str]
+) -> None:
+    """Truth, places and errors from above: generations by colour, crosses where nothing is registered."""
+    figure, axis = plt.subplots(figsize=(12, 9), layout="constrained")
+    in_map = {r.fact.name for r in found}
+    missed = [
+        i.cam_from_local.center
+        for n, i in album.truth.images.items()
+        if n not in in_map and album.facts[n].kind in among
+    ]
+    if missed:
+        at = np.array(missed)
+        axis.plot(at[:, 0], at[:, 1], "x", color="0.6", markersize=4, label=f"not registered ({len(at)})")
+    for generation in sorted({r.generation for r in found}):
+        mine = [r for r in found if r.generation == generation and r.offset_m is not None]
+        true = np.array([album.truth.images[r.fact.name].cam_from_local.center for r in mine]).reshape(-1, 3)
+        colour = _COLOURS[generation % len(_COLOURS)]
+        word = "anchor" if generation == 0 else f"generation {generation}"
+        axis.plot(true[:, 0], true[:, 1], ".", color=colour, label=f"{word} ({len(mine)})")
+        for r, t in zip(mine, true, strict=True):
+            assert r.offset_m is not None
+            wrong, held = r.wrong, r.status != "active"
+            end = t + r.offset_m * (1.0 if wrong else 20.0)
+            axis.plot([t[0], end[0]], [t[1], end[1]], "-", color="red" if wrong else colour, linewidth=1)
+            if held:
+                axis.plot(*t[:2], "s", color=colour, markersize=7, fillstyle="none")
+    axis.set(title=f"{title}; errors x 20, wrong ones red and as they are; squares: quarantined")
+    axis.set_aspect("equal")
+    axis.legend(loc="upper left", fontsize=8)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)

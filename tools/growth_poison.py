@@ -1,0 +1,331 @@
+"""Poison: look-alike blocks, mirrors, liars and forgers send photos. Is anything wrong promoted?
+
+    python -m tools.growth_poison --out DIR [--size full] [--seed 4]
+
+The world is that of `featuredb.simworld.poison_world`. The survey is ingested, honest photos are grown, and
+held-out photos become canaries with their true poses. Then for each kind of poison, and for all together, a
+copy of that database gets the poison, grows, gets honest photos that come later, and grows again. Whatever is
+active then is compared with the truth:
+
+- photos registered more than 2 m off, or without a place in this town at all;
+- points of grown maps more than 1 m off the surface that their photo truly sees, over all points of the map
+  (pieces that were moved or painted leave poses right and points wrong). Honest maps set the measure: a map
+  with twice their share and more than 2 % is wrong.
+
+Then wrong maps are forced in by hand: every quarantined map with poison, and, so that there is always one, an
+honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
+before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
+
+Prints a line per poison; writes poison.json and a plan per poison. Exit code 0 if nothing wrong was promoted
+and every answer came back.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from featuredb.features.decode import decode_gray
+from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.move import move_map
+from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.poison_world import POISONS, PoisonOptions, write_poison
+from featuredb.store import Database
+from featuredb.store.canaries import KnownPose, add_canary
+from ingest.growing import GrowingOptions, grow_candidates
+from ingest.growth.promotion import promote_by_hand
+from reloc.localiser import Localiser
+from reloc.service.handler import localise_request
+from reloc.wire import LocaliseWireRequest
+from tools.growth_common import (
+    Album,
+    Verdict,
+    anchored,
+    conclude,
+    give,
+    growing_options,
+    made,
+    newest_copy,
+    plan_view,
+    registered,
+    say,
+    table,
+    tell,
+)
+
+_OFF_M, _OFF_SHARE = 1.0, 0.02
+_MOVE_M = 3.0
+_CANARY_M, _CANARY_DEG = 0.5, 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Outcome:
+    """What a poison did.
+
+    Attributes:
+        sent: photos. active, quarantined: of them, in such maps. wrong: registered wrongly in active maps,
+            the poison's photos and honest ones alike.
+        off_share: largest share of points off the true surface among active grown maps with poison.
+        forced: maps that were forced in. restored: whether all answers came back; changed: whether any had
+            changed meanwhile.
+    """
+
+    poison: str
+    sent: int
+    active: int
+    quarantined: int
+    wrong: int
+    off_share: float
+    honest_active: int
+    forced: int = 0
+    changed: bool = False
+    restored: bool = True
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    world = PoisonOptions.short(args.seed) if args.size == "short" else PoisonOptions(seed=args.seed)
+    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    album = made(write_poison, folder, world, args.workers)
+    options = growing_options(args.max_features, args.workers, args.budget)
+    base = honest_base(args.out / "db", album, args.max_features, options)
+    clean = max(off_shares(base, album, world).values(), default=0.0)
+    say(f"honest maps: at most {clean:.2%} of the points {_OFF_M} m off the true surface")
+    outcomes = []
+    for poison in [*(args.poison or POISONS), *([] if args.poison else ["all together"])]:
+        kinds = POISONS if poison == "all together" else (poison,)
+        outcomes.append(try_poison(args.out, base, album, world, options, poison, kinds))
+        say(str(outcomes[-1]))
+    fabricated = force_and_retire(
+        newest_copy(args.out / "db", args.out / "db-forced"), album, [], fabricate=True
+    )
+    sys.stdout.write(outcome_table(outcomes))
+    verdicts = judge(outcomes, clean, fabricated)
+    figures: dict[str, Any] = {
+        "outcomes": [{n: getattr(o, n) for n in Outcome.__dataclass_fields__} for o in outcomes],
+        "clean_off_share": clean,
+        "fabricated": fabricated,
+    }
+    return conclude(args.out, "poison", verdicts, figures)
+
+
+def honest_base(path: Path, album: Album, max_features: int, options: GrowingOptions) -> Database:
+    """The database before any poison: survey, honest photos, canaries."""
+    database = anchored(path, album, "survey", max_features=max_features, workers=options.workers)
+    if any(m.method == "map" for m in database.snapshot().maps()):
+        return database
+    for fact in album.of("canary"):
+        true = album.truth.images[fact.name]
+        grid = album.truth.frame.grid_from_enu(true.cam_from_local.center, album.truth.epsg)
+        pose = KnownPose(
+            epsg=album.truth.epsg,
+            utm=true.utm,
+            height_datum="ellipsoidal",
+            cam_from_utm_xyzw=quaternion_from_matrix(true.cam_from_local.rotation @ grid.T),
+            tolerance_m=_CANARY_M,
+            tolerance_deg=_CANARY_DEG,
+        )
+        add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
+    give(database, album, album.of("honest"))
+    tell(grow_candidates(database, options))
+    return database
+
+
+def try_poison(
+    out: Path,
+    base: Database,
+    album: Album,
+    world: PoisonOptions,
+    options: GrowingOptions,
+    poison: str,
+    kinds: Sequence[str],
+) -> Outcome:
+    """One poison on a copy of the honest database."""
+    name = poison.replace(" ", "-")
+    database = newest_copy(Path(base.url), out / f"db-{name}")
+    sent = album.of(*kinds)
+    give(database, album, sent)
+    tell(grow_candidates(database, options))
+    give(database, album, album.of("late"))
+    tell(grow_candidates(database, options))
+    found = registered(database, album)
+    plan_view(out / f"plan-{name}.png", album, found, poison, (*kinds, "late", "honest"))
+    active = [r for r in found if r.status == "active" and r.generation > 0]
+    poisoned = {r.map_id for r in active if r.fact.kind in kinds}
+    shares = off_shares(database, album, world)
+    held = sorted(
+        {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in kinds or r.wrong)}
+    )
+    forced = force_and_retire(database, album, held, fabricate=False)
+    return Outcome(
+        poison=poison,
+        sent=len(sent),
+        active=sum(r.fact.kind in kinds for r in active),
+        quarantined=sum(r.fact.kind in kinds and r.status == "quarantined" for r in found),
+        wrong=sum(r.wrong for r in active),
+        off_share=max((shares[m] for m in poisoned if m in shares), default=0.0),
+        honest_active=sum(r.fact.kind in ("honest", "late") for r in active),
+        forced=forced["forced"],
+        changed=forced["changed"],
+        restored=forced["restored"],
+    )
+
+
+def off_shares(database: Database, album: Album, world: PoisonOptions) -> dict[str, float]:
+    """For each active grown map, the share of its points' observations off the surface that is truly there.
+
+    The depth that the true camera sees at an observation's pixel against that of the map's point; edges of
+    things, where a pixel decides, are left out.
+    """
+    shares = {}
+    for summary in database.snapshot().maps():
+        if summary.status == "active" and summary.method == "map":
+            feature_map = database.snapshot().load_map(summary.map_id)
+            found = registered_names(database, album, feature_map.map_id)
+            shares[summary.map_id] = _off_share(feature_map, album, world, found)
+    return shares
+
+
+def registered_names(database: Database, album: Album, map_id: str) -> list[str]:
+    """Names in the album of a map's images, in their order."""
+    return [r.fact.name for r in registered(database, album) if r.map_id == map_id]
+
+
+def _off_share(feature_map: FeatureMap, album: Album, world: PoisonOptions, names: Sequence[str]) -> float:
+    scene, seen = world.scene("home/0/000"), feature_map.observations
+    points = album.truth.frame.enu_from(feature_map.frame).act(feature_map.points_local())
+    off = total = 0
+    for image, name in zip(feature_map.images, names, strict=True):
+        true = album.truth.images.get(name)
+        if true is None:
+            continue
+        rows = seen.image_id == image.image_id
+        depth = render_depth(scene, true.camera, true.cam_from_local).depth
+        x, y = np.floor(seen.xy[rows]).astype(int).T
+        h, w = depth.shape
+        padded = np.pad(depth, 3, mode="edge")
+        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+        x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
+        around = np.stack([padded[y + 3 + i, x + 3 + j] for i in (-3, 0, 3) for j in (-3, 0, 3)])
+        z = true.cam_from_local.act(points[seen.point_index[rows]])[:, 2]
+        smooth = inside & np.isfinite(around).all(axis=0)
+        smooth[smooth] &= np.ptp(around[:, smooth], axis=0) < 0.5
+        off += int((np.abs(z - depth[y, x])[smooth] > _OFF_M).sum())
+        total += int(smooth.sum())
+    return off / max(total, 1)
+
+
+def force_and_retire(
+    database: Database, album: Album, held: Sequence[str], *, fabricate: bool
+) -> dict[str, Any]:
+    """Force maps in by hand and take them out again; whether answers changed, and whether they came back."""
+    before = answers(database, album)
+    forced = list(held)
+    if fabricate:
+        forced.append(_moved_copy(database))
+    done = []
+    for map_id in forced:
+        if promote_by_hand(database, map_id, "forced for the test", force=True).promoted:
+            done.append(map_id)
+    during = answers(database, album) if done else before
+    for map_id in done:
+        if database.snapshot().get(map_id).status != "retired":
+            database.retire(map_id, "it is wrong")
+    after = answers(database, album) if done else before
+    return {"forced": len(done), "changed": during != before, "restored": after == before}
+
+
+def _moved_copy(database: Database) -> str:
+    """A grown map under a new id, 3 m to the east of where it belongs, in quarantine; its id."""
+    source = next((m for m in database.snapshot().maps() if m.method == "map" and m.status == "active"), None)
+    if source is None:
+        raise SystemExit("no honest map has grown, so there is none to be moved")
+    feature_map = database.snapshot().load_map(source.map_id)
+    move = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([_MOVE_M, 0.0, 0.0]))
+    wrong = replace(move_map(feature_map, move), map_id="f" * 24, status="quarantined")
+    database.commit_map(wrong)
+    return wrong.map_id
+
+
+def answers(database: Database, album: Album) -> dict[str, str]:
+    """Every figure of the answers to canaries and honest photos, without times and the snapshot's number."""
+    localiser = Localiser.open(database)
+    found = {}
+    for fact in [*album.of("canary"), *album.of("honest")[:20]]:
+        data = (album.folder / fact.name).read_bytes()
+        gray = decode_gray(data)
+        result = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray))
+        pose = result.pose
+        found[fact.name] = repr(
+            (
+                result.reason,
+                result.inliers,
+                result.matches,
+                result.confidence,
+                None
+                if pose is None
+                else (
+                    pose.utm.tobytes().hex(),
+                    pose.cam_from_utm_xyzw.tobytes().hex(),
+                    pose.covariance.tobytes().hex(),
+                    pose.map_ids,
+                    pose.lineage,
+                ),
+            )
+        )
+    return found
+
+
+def judge(outcomes: Sequence[Outcome], clean: float, fabricated: dict[str, Any]) -> list[Verdict]:
+    """The contract's lines."""
+    limit = max(_OFF_SHARE, 2.0 * clean)
+    verdicts = [
+        Verdict(
+            name=f"poison: {o.poison}",
+            text=f"{o.wrong} photos wrong in active maps, none wanted; {o.active} of {o.sent} registered; "
+            f"points off the surface {o.off_share:.1%} of at most {limit:.1%}",
+            holds=o.wrong == 0 and o.off_share <= limit,
+        )
+        for o in outcomes
+    ]
+    forced = [o for o in outcomes if o.forced]
+    verdicts.append(
+        Verdict(
+            name="retire",
+            text=f"{sum(o.forced for o in forced)} quarantined maps forced in and retired, answers came back "
+            f"in {sum(o.restored for o in forced)} of {len(forced)} databases; a map moved by {_MOVE_M} m: "
+            f"answers {'changed' if fabricated['changed'] else 'did not change'} and "
+            f"{'came back' if fabricated['restored'] else 'DID NOT COME BACK'}",
+            holds=all(o.restored for o in forced) and fabricated["restored"] and fabricated["changed"],
+        )
+    )
+    return verdicts
+
+
+def outcome_table(outcomes: Sequence[Outcome]) -> str:
+    names = tuple(Outcome.__dataclass_fields__)
+    return table([[getattr(o, n) for n in names] for o in outcomes], names) + "\n"
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("growth-poison"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=4)
+    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
+    parser.add_argument("--poison", action="append", choices=POISONS, help="only these kinds")
+    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
+    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
+    parser.add_argument("--workers", type=int, default=2)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,213 @@
+"""How the time of an ingest grows: 500 and 5,000 simulated photos, wall time per photo and peak memory.
+
+    python -m tools.growth_scale --out DIR [--size full] [--seed 3] [--dask ADDRESS]
+
+The world is that of `featuredb.simworld.scale_world`: ten districts of 500 photos. The first district alone
+and all of them are ingested by `featuredb ingest photos` in a process of its own, from empty databases. With
+--dask the large one is ingested again on that scheduler, and the maps are compared by their digests.
+
+Prints seconds and processor seconds per photo, images per hour, registered photos and the peak of the memory
+of all processes together (proportional shares, sampled twice a second). Writes scale.json. Exit code 0 if the
+wall time per photo at the large size is at most 1.3 times that at the small one, and the peak is under 6 GiB.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.scale_world import ScaleOptions, write_scale
+from featuredb.store import Database
+from tools.growth_common import Album, Verdict, conclude, made, say, table
+
+_RATIO, _PEAK_GIB = 1.3, 6.0
+_SAMPLE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ingest:
+    """One ingest: photos, times in seconds, the peak of all its processes, what came of it."""
+
+    photos: int
+    wall_s: float
+    cpu_s: float
+    peak_gib: float
+    registered: int
+    maps: int
+
+    @property
+    def wall_per_photo_s(self) -> float:
+        return self.wall_s / self.photos
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    world = ScaleOptions.short(args.seed) if args.size == "short" else ScaleOptions(seed=args.seed)
+    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    album = made(write_scale, folder, world, args.workers)
+    everything = album.of("street", "drone")
+    runs = {}
+    for name, facts in (("small", [f for f in everything if f.batch == 0]), ("large", everything)):
+        runs[name] = ingested(args.out, name, album, facts, args, ())
+    if args.dask:
+        runs["dask"] = ingested(args.out, "dask", album, everything, args, ("--dask", args.dask))
+    rows = [
+        (
+            *(name, r.photos, r.wall_s, r.wall_per_photo_s, r.cpu_s / r.photos),
+            *(round(3600 * r.photos / r.wall_s), r.peak_gib, r.registered, r.maps),
+        )
+        for name, r in runs.items()
+    ]
+    head = (
+        "ingest",
+        "photos",
+        "wall s",
+        "s/photo",
+        "cpu s/photo",
+        "per hour",
+        "peak GiB",
+        "registered",
+        "maps",
+    )
+    sys.stdout.write(table(rows, head) + "\n")
+    figures: dict[str, Any] = {name: asdict(r) for name, r in runs.items()}
+    return conclude(args.out, "scale", judge(args.out, runs), figures)
+
+
+def judge(out: Path, runs: dict[str, Ingest]) -> list[Verdict]:
+    small, large = runs["small"], runs["large"]
+    ratio = large.wall_per_photo_s / small.wall_per_photo_s
+    verdicts = [
+        Verdict(
+            name="time per photo",
+            text=f"{large.wall_per_photo_s:.2f} s at {large.photos}, {ratio:.2f} times that at "
+            f"{small.photos}; at most {_RATIO} wanted",
+            holds=ratio <= _RATIO,
+        ),
+        Verdict(
+            name="peak memory",
+            text=f"{large.peak_gib:.2f} GiB, under {_PEAK_GIB} wanted",
+            holds=large.peak_gib < _PEAK_GIB,
+        ),
+    ]
+    if "dask" in runs:
+        digests = [content(out / name) for name in ("large", "dask")]
+        text = f"{len(digests[0] & digests[1])} maps are the same of {len(digests[0])} and {len(digests[1])}"
+        verdicts.append(Verdict(name="the same on Dask", text=text, holds=digests[0] == digests[1]))
+    return verdicts
+
+
+def content(database: Path) -> set[tuple[str, str]]:
+    """Ids and digests of the maps of a database."""
+    return {(m.map_id, m.content_digest) for m in Database.open(database).snapshot().maps()}
+
+
+def ingested(
+    out: Path,
+    name: str,
+    album: Album,
+    facts: Sequence[AlbumFact],
+    args: argparse.Namespace,
+    extra: Sequence[str],
+) -> Ingest:
+    """One ingest from an empty database, measured; a run that is measured already is not repeated."""
+    log = out / f"{name}.json"
+    if log.exists():
+        return Ingest(**json.loads(log.read_text(encoding="utf-8")))
+    photos, database = out / f"photos-{name}", out / name
+    link(album.folder, photos, (f.name for f in facts))
+    shutil.rmtree(database, ignore_errors=True)
+    command = [
+        *(sys.executable, "-m", "featuredb.cli.main", "ingest", "photos", str(database), str(photos)),
+        *("--workers", str(args.workers), "--quiet", *extra, *args.ingest_option),
+    ]
+    start, before = time.monotonic(), os.times()
+    with subprocess.Popen(command) as process:
+        peak = _peak_of(process)
+    wall, after = time.monotonic() - start, os.times()
+    if process.returncode != 0:
+        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    maps = Database.open(database).snapshot().maps()
+    run = Ingest(
+        photos=len(facts),
+        wall_s=wall,
+        cpu_s=cpu,
+        peak_gib=peak / 2**30,
+        registered=sum(m.images for m in maps),
+        maps=len(maps),
+    )
+    log.write_text(json.dumps(asdict(run)) + "\n", encoding="utf-8")
+    say(f"{name}: {run}")
+    return run
+
+
+def link(source: Path, target: Path, names: Iterable[str]) -> None:
+    """A folder of hard links, made anew; copies where the disk has none."""
+    shutil.rmtree(target, ignore_errors=True)
+    for name in names:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            os.link(source / name, target / name)
+        except OSError:
+            shutil.copyfile(source / name, target / name)
+
+
+def _peak_of(process: "subprocess.Popen[bytes]") -> int:
+    """Largest sum of the proportional memory (bytes) of a process and its descendants, until it ends."""
+    peak = 0
+    while process.poll() is None:
+        peak = max(peak, sum(_memory(pid) for pid in _family(process.pid)))
+        time.sleep(_SAMPLE_S)
+    return peak
+
+
+def _family(pid: int) -> list[int]:
+    found = [pid]
+    for parent in found:
+        for task in Path(f"/proc/{parent}/task").glob("*/children"):
+            try:
+                found += [int(child) for child in task.read_text().split()]
+            except OSError:
+                continue  # it has just ended
+    return found
+
+
+def _memory(pid: int) -> int:
+    """Proportional set size: pages that processes share are counted once in all."""
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(1024 * int(line.split()[1]) for line in lines if line.startswith("Pss:"))
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("growth-scale"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=3)
+    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--dask", default="", metavar="ADDRESS", help="ingest once more on this scheduler")
+    parser.add_argument(
+        "--ingest-option",
+        action="append",
+        default=[],
+        metavar="WORD",
+        help="handed on to the ingest; repeat it",
+    )
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

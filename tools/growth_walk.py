@@ -1,0 +1,335 @@
+"""A walk away from the anchor, from contributed queries alone: does coverage follow, and is the bound true?
+
+    python -m tools.growth_walk --out DIR [--size full] [--seed 2] [--budget 0.5]
+
+The world is that of `featuredb.simworld.walk_world`. Step by step the photos of three people are contributed
+and `featuredb grow` runs once. After each step photos that nobody contributes (probes) of all steps so far
+ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
+survey at the far end is ingested and growth runs again.
+
+For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %) and the true one
+(length of the median error of a map's photos), probes answered, their errors, how many lie inside their own
+95 % ellipsoid. Writes walk.json, walk.png (error and bound along the way) and plan-before.png,
+plan-after.png; everything is kept in DIR, and a run that was interrupted goes on.
+
+Exit code 0 if: coverage follows for at least 600 m or to the budget; the true drift of every map stays inside
+its bound at every step; no active map exceeds the budget, and growth stopped for it or came to the end; after
+the second anchor every probe that is answered is within 0.3 m, and the maps moved in one commit.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.features.decode import decode_gray
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.walk_world import WalkOptions, write_walk
+from featuredb.store import Database
+from ingest.growing import GrowingOptions, grow_candidates
+from reloc.localiser import Localiser
+from reloc.service.handler import localise_request
+from reloc.wire import LocaliseWireRequest
+from tools.growth_common import (
+    Album,
+    Registered,
+    Verdict,
+    anchored,
+    conclude,
+    give,
+    growing_options,
+    made,
+    plan_view,
+    registered,
+    say,
+    table,
+    tell,
+)
+
+_WALK_M = 600.0
+_AFTER_M = 0.3
+_INSIDE = float(chi2.ppf(0.95, 3))
+_PROBE_SHARE = 0.90  # of the probes inside their 95 %: of a few dozen, more may miss by chance
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Probe:
+    """One held-out photo asked: its step, distance from the anchor, error and squared normalised error."""
+
+    name: str
+    step: int
+    away_m: float
+    error_m: float | None
+    normalised: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """What a step came to.
+
+    Attributes:
+        reach_m: distance from the anchor's edge to the furthest photo in an active map.
+        maps, quarantined: numbers of grown maps.
+        drift_m: largest claimed of active maps. true_m: length of the median error of the map that is worst
+            against its claim; ratio: that over its claim.
+        stopped: photos that wait for the drift budget.
+    """
+
+    step: int
+    reach_m: float
+    maps: int
+    quarantined: int
+    drift_m: float
+    true_m: float
+    ratio: float
+    stopped: int
+    probes: tuple[Probe, ...]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    world = WalkOptions.short(args.seed) if args.size == "short" else WalkOptions(seed=args.seed)
+    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    album = made(write_walk, folder, world, args.workers)
+    common = {"max_features": args.max_features, "workers": args.workers}
+    database = anchored(args.out / "db", album, "survey", **common)
+    options = growing_options(args.max_features, args.workers, args.budget)
+    log = args.out / "steps.json"
+    steps = _read_steps(log)
+    batches = sorted({f.batch for f in album.of("walk")})
+    for batch in batches[len(steps) :]:
+        steps.append(take_step(database, album, batch, options))
+        log.write_text(json.dumps([asdict(s) for s in steps]) + "\n", encoding="utf-8")
+    before = registered(database, album)
+    if not _has_far(database, album):
+        plan_view(args.out / "plan-before.png", album, before, "walk before the second anchor", ("walk",))
+    end, commits = second_anchor(database, album, options, common)
+    plan_view(args.out / "plan-after.png", album, registered(database, album), "walk after it", ("walk",))
+    sys.stdout.write(step_table(steps))
+    plot(args.out / "walk.png", steps, end)
+    figures: dict[str, Any] = {"steps": [asdict(s) for s in steps], "after": asdict(end), "commits": commits}
+    return conclude(args.out, "walk", judge(steps, end, commits, args.budget, world), figures)
+
+
+def take_step(database: Database, album: Album, batch: int, options: GrowingOptions) -> Step:
+    """Contribute one step's photos, grow once, measure."""
+    give(database, album, album.of("walk", batch=batch))
+    report = grow_candidates(database, options)
+    tell(report)
+    stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
+    step = measure(database, album, batch, stopped)
+    answered = [p for p in step.probes if p.error_m is not None]
+    worst = max((p.error_m or 0.0 for p in answered), default=float("nan"))
+    say(
+        f"step {batch + 1}: reach {step.reach_m:.0f} m, drift claimed {step.drift_m:.2f} m, "
+        f"true {step.true_m:.2f} m, probes {len(answered)}/{len(step.probes)}, worst {worst:.2f} m"
+    )
+    return step
+
+
+def measure(database: Database, album: Album, batch: int, stopped: int) -> Step:
+    """Maps and probes of all steps up to this one against the truth."""
+    found = registered(database, album)
+    edge = max(_along(album, f) for f in album.of("survey"))
+    grown = [r for r in found if r.generation > 0]
+    active = [r for r in grown if r.status == "active"]
+    true, ratio = worst_map(active)
+    return Step(
+        step=batch,
+        reach_m=max((_along(album, r.fact) - edge for r in active), default=0.0),
+        maps=len({r.map_id for r in active}),
+        quarantined=len({r.map_id for r in grown} - {r.map_id for r in active}),
+        drift_m=max((r.drift_m or 0.0 for r in active), default=0.0),
+        true_m=true,
+        ratio=ratio,
+        stopped=stopped,
+        probes=tuple(ask_probes(database, album, batch, edge)),
+    )
+
+
+def worst_map(found: Sequence[Registered]) -> tuple[float, float]:
+    """True drift of the map that is worst against its claim, and the ratio of the two."""
+    worst = (0.0, 0.0)
+    for map_id in {r.map_id for r in found}:
+        mine = [r for r in found if r.map_id == map_id and r.offset_m is not None]
+        true = float(np.linalg.norm(np.median([r.offset_m for r in mine], axis=0)))
+        ratio = true / max(mine[0].drift_m or 0.0, 1e-6)
+        worst = max(worst, (true, ratio), key=lambda pair: pair[1])
+    return worst
+
+
+def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list[Probe]:
+    """Ask for every probe of the steps so far, as a client does that knows nothing but the file."""
+    localiser = Localiser.open(database)
+    probes = []
+    for fact in album.of("probe"):
+        if fact.batch > upto:
+            continue
+        data = (album.folder / fact.name).read_bytes()
+        gray = decode_gray(data)
+        pose = localiser.localise(gray, localise_request(LocaliseWireRequest(), data, gray)).pose
+        error, normalised = None, None
+        if pose is not None:
+            true = album.truth.images[fact.name].cam_from_local.center
+            center = album.truth.frame.enu_from(pose.frame).act(pose.cam_from_local.center[None])[0]
+            offset = center - true
+            error = float(np.linalg.norm(offset))
+            normalised = float(offset @ np.linalg.solve(pose.covariance[3:, 3:], offset))
+        probes.append(
+            Probe(
+                name=fact.name,
+                step=fact.batch,
+                away_m=_along(album, fact) - edge,
+                error_m=error,
+                normalised=normalised,
+            )
+        )
+    return probes
+
+
+def second_anchor(
+    database: Database, album: Album, options: GrowingOptions, common: dict[str, int]
+) -> tuple[Step, int]:
+    """Ingest the far survey, grow, measure; also in how many commits the grown maps moved."""
+    placed = {m.map_id: m.write_id for m in database.snapshot().maps()}
+    version = database.poll_version()
+    path = Path(database.url)
+    anchored(path, album, "survey_far", **common)
+    report = grow_candidates(database, options)
+    tell(report)
+    history = [database.snapshot(v) for v in range(version, database.poll_version() + 1)]
+    commits, known = 0, placed
+    for snapshot in history:
+        now = {m.map_id: m.write_id for m in snapshot.maps()}
+        commits += any(now[i] != known[i] for i in now.keys() & known.keys())
+        known = {**known, **now}
+    last = max(f.batch for f in album.of("walk"))
+    return measure(
+        database, album, last, sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
+    ), commits
+
+
+def judge(
+    steps: Sequence[Step], end: Step, commits: int, budget_m: float, world: WalkOptions
+) -> list[Verdict]:
+    """The contract's lines."""
+    reach = max((s.reach_m for s in steps), default=0.0)
+    stopped = next((s for s in steps if s.stopped), None)
+    ratio = max((s.ratio for s in steps), default=0.0)
+    over = max((s.drift_m for s in steps), default=0.0)
+    asked = [p for p in steps[-1].probes if p.normalised is not None] if steps else []
+    inside = sum((p.normalised or 0.0) <= _INSIDE for p in asked)
+    errors = [p.error_m for p in end.probes if p.error_m is not None]
+    wanted = min(_WALK_M, world.end_m - world.start_m - 150.0)
+    why = "not stopped" if stopped is None else f"stopped for the budget at step {stopped.step + 1}"
+    return [
+        Verdict(
+            name="coverage follows",
+            text=f"{reach:.0f} m from the anchor's edge, {why}; {wanted:.0f} m wanted, or the budget",
+            holds=reach >= wanted or stopped is not None,
+        ),
+        Verdict(
+            name="true drift inside the bound",
+            text=f"at most {ratio:.2f} of the claimed 95 % at every step",
+            holds=bool(steps) and ratio <= 1.0,
+        ),
+        Verdict(
+            name="probes inside their 95 %",
+            text=f"{inside} of {len(asked)} along the whole way",
+            holds=bool(asked) and inside >= _PROBE_SHARE * len(asked),
+        ),
+        Verdict(
+            name="budget",
+            text=f"largest claimed drift of an active map {over:.2f} of {budget_m:.2f} m",
+            holds=over <= budget_m,
+        ),
+        Verdict(
+            name="second anchor",
+            text=f"worst of {len(errors)} answered probes {max(errors, default=float('nan')):.3f} m of "
+            f"{_AFTER_M} m; {len(errors)} of {len(end.probes)} answered; maps moved in {commits} commits",
+            holds=bool(errors) and max(errors) < _AFTER_M and commits == 1,
+        ),
+    ]
+
+
+def step_table(steps: Sequence[Step]) -> str:
+    rows = []
+    for s in steps:
+        errors = [p.error_m for p in s.probes if p.error_m is not None]
+        inside = sum((p.normalised or 0.0) <= _INSIDE for p in s.probes if p.normalised is not None)
+        rows.append(
+            (
+                s.step + 1, s.reach_m, s.maps, s.quarantined, s.drift_m, s.true_m, s.ratio, s.stopped,
+                f"{len(errors)}/{len(s.probes)}", float(np.median(errors)) if errors else float("nan"),
+                max(errors, default=float("nan")), f"{inside}/{len(errors)}",
+            )
+        )  # fmt: skip
+    head = (
+        *("step", "reach m", "maps", "held", "claimed m", "true m", "ratio", "stopped"),
+        *("probes", "median m", "worst m", "in 95 %"),
+    )
+    return table(rows, head) + "\n"
+
+
+def plot(path: Path, steps: Sequence[Step], end: Step) -> None:
+    """Errors of the probes along the way, before and after the second anchor, and the claimed drift."""
+    figure, axis = plt.subplots(figsize=(10, 5), layout="constrained")
+    for step, colour, word in (
+        (steps[-1] if steps else end, "tab:blue", "one anchor"),
+        (end, "tab:green", "two"),
+    ):
+        known = [(p.away_m, p.error_m) for p in step.probes if p.error_m is not None]
+        axis.plot(*zip(*known, strict=True), ".", color=colour, label=f"probes, {word}") if known else None
+    axis.plot(
+        [s.reach_m for s in steps], [s.drift_m for s in steps], "r-", label="claimed 95 % of the furthest map"
+    )
+    axis.set(xlabel="distance from the first anchor's edge, m", ylabel="error, m", yscale="log")
+    axis.legend()
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
+
+
+def _along(album: Album, fact: AlbumFact) -> float:
+    """Coordinate along the way: the direction from the first survey to the far one."""
+    center = album.truth.images[fact.name].cam_from_local.center
+    ends = [
+        np.mean([album.truth.images[f.name].cam_from_local.center for f in album.of(kind)], axis=0)[:2]
+        for kind in ("survey", "survey_far")
+    ]
+    way = ends[1] - ends[0]
+    return float((center[:2] - ends[0]) @ way / np.linalg.norm(way))
+
+
+def _has_far(database: Database, album: Album) -> bool:
+    return any(m.name == "survey_far" for m in database.snapshot().maps())
+
+
+def _read_steps(log: Path) -> list[Step]:
+    if not log.exists():
+        return []
+    rows = json.loads(log.read_text(encoding="utf-8"))
+    return [Step(**{**row, "probes": tuple(Probe(**p) for p in row["probes"])}) for row in rows]
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("growth-walk"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=2)
+    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
+    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
+    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
+    parser.add_argument("--workers", type=int, default=2)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
