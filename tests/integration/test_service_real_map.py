@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from importlib.metadata import EntryPoint
 
 import cv2
@@ -22,6 +23,7 @@ from featuredb.geo.utm import geodetic_from_utm
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.store import Database
+from featuredb.store.candidates import list_candidates, load_image
 from reloc.client import CameraRequest, Client, PriorRequest
 from reloc.overlay import project_utm
 from reloc.wire import LocaliseReply
@@ -317,3 +319,26 @@ def test_hot_reload_commit_retire_and_a_clean_end(tmp_path, field, photos):
     answered = [line for line in log if line.get("event") == "answered"]
     assert [line["status"] for line in answered] == ["not_localised", "localised", "not_localised"]
     assert len({line["request_id"] for line in answered}) == 3
+
+
+def test_a_query_is_contributed_and_the_inbox_lists_it(server, database, photos, capsys):
+    query = ["query", str(photos / "a.png"), "--connect", server.endpoint, "--camera", CAMERA_TEXT]
+    assert run(*query, "--contribute", "--owner", "A. Person", "--licence", "CC0-1.0") == 0
+    given = re.search(r"^  given     candidate ([0-9a-f]{32})$", capsys.readouterr().out, flags=re.MULTILINE)
+    end = time.monotonic() + 30.0
+    while not (found := list_candidates(Database.open(database))):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+    assert [c.candidate_id for c in found] == [given[1]]
+    assert found[0].answer["maps"] == ["field"]
+    assert load_image(Database.open(database), given[1]) == (photos / "a.png").read_bytes()
+    assert run(*query, "--contribute", "--owner", "A. Person") == 2
+    assert "expected --owner and --licence" in capsys.readouterr().err
+
+
+def test_a_server_told_to_take_no_contributions(database, photos, capsys):
+    process = ServeProcess(database, "--contributions", "off")
+    query = ["query", str(photos / "a.png"), "--connect", process.endpoint, "--camera", CAMERA_TEXT]
+    assert run(*query, "--contribute", "--owner", "A. Person", "--licence", "CC0-1.0") == 2
+    assert "UNSUPPORTED" in capsys.readouterr().err
+    assert process.stop() == 0
