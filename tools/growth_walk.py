@@ -287,7 +287,8 @@ def plot(path: Path, steps: Sequence[Step], end: Step) -> None:
         (end, "tab:green", "two"),
     ):
         known = [(p.away_m, p.error_m) for p in step.probes if p.error_m is not None]
-        axis.plot(*zip(*known, strict=True), ".", color=colour, label=f"probes, {word}") if known else None
+        if known:
+            axis.plot(*zip(*known, strict=True), ".", color=colour, label=f"probes, {word}")
     axis.plot(
         [s.reach_m for s in steps], [s.drift_m for s in steps], "r-", label="claimed 95 % of the furthest map"
     )

@@ -1,0 +1,134 @@
+"""Verdicts of the programs that measure growth: each line holds, and fails where it should."""
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.simworld.album_files import AlbumFact
+from featuredb.simworld.truth import Truth
+from featuredb.simworld.walk_world import WalkOptions
+from tools import growth_community, growth_poison, growth_walk
+from tools.growth_common import Album, Registered, Verdict
+from tools.growth_poison import Outcome
+from tools.growth_walk import Probe, Step, worst_map
+
+
+def fact(i: int, kind: str = "drone") -> AlbumFact:
+    return AlbumFact(
+        name=f"photos/anna/{i}.jpg",
+        photo_id=str(i),
+        kind=kind,
+        owner="anna",
+        licence="CC0-1.0",
+        title="",
+        time=datetime(2025, 1, 1, tzinfo=UTC),
+        home=kind == "drone",
+    )
+
+
+def album(facts: list[AlbumFact]) -> Album:
+    frame = LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
+    truth = Truth(seed=1, epsg=32632, frame=frame, images={})
+    return Album(folder=Path(), truth=truth, facts={f.name: f for f in facts}, rows={})
+
+
+def placed(f: AlbumFact, error_m: float | None, status: str = "active", drift_m: float = 0.3) -> Registered:
+    return Registered(
+        fact=f,
+        map_id="m1",
+        status=status,
+        generation=1,
+        offset_m=None if error_m is None else np.array([0.0, error_m, 0.0]),
+        angle_deg=0.0,
+        drift_m=drift_m,
+    )
+
+
+def holding(verdicts: list[Verdict]) -> dict[str, bool]:
+    return {v.name: v.holds for v in verdicts}
+
+
+def test_a_community_that_registers_well_holds() -> None:
+    facts = [fact(i) for i in range(10)] + [fact(20, "other_town")]
+    found = [placed(f, 0.1) for f in facts[:7]]
+    assert all(holding(growth_community.judge(album(facts), found)).values())
+
+
+@pytest.mark.parametrize(
+    ("line", "change"),
+    [
+        ("registered", lambda found: found[:6]),
+        ("registered", lambda found: [replace(r, status="quarantined") for r in found]),
+        ("median error", lambda found: [replace(r, offset_m=np.array([0.4, 0.0, 0.0])) for r in found]),
+        ("foreign photos", lambda found: [*found, placed(fact(20, "other_town"), None)]),
+        ("wrong by more than 2 m", lambda found: [*found[1:], placed(fact(0), 2.1)]),
+    ],
+)
+def test_each_line_of_the_community_can_fail(line: str, change) -> None:  # type: ignore[no-untyped-def]
+    facts = [fact(i) for i in range(10)] + [fact(20, "other_town")]
+    found = change([placed(f, 0.1) for f in facts[:7]])
+    assert not holding(growth_community.judge(album(facts), found))[line]
+
+
+def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: float = 0.4) -> list[Step]:
+    probes = tuple(
+        Probe(name=str(i), step=0, away_m=float(i), error_m=0.1, normalised=2.0) for i in range(10)
+    )
+    return [
+        Step(
+            step=0,
+            reach_m=reach,
+            maps=1,
+            quarantined=0,
+            drift_m=drift,
+            true_m=ratio * drift,
+            ratio=ratio,
+            stopped=stopped,
+            probes=probes,
+        )
+    ]
+
+
+def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
+    world = WalkOptions()
+    good = steps()
+    assert all(holding(growth_walk.judge(good, good[0], 1, 0.5, world)).values())
+    near = steps(reach=300.0)
+    assert not holding(growth_walk.judge(near, good[0], 1, 0.5, world))["coverage follows"]
+    assert holding(growth_walk.judge(steps(reach=300.0, stopped=9), good[0], 1, 0.5, world))[
+        "coverage follows"
+    ]
+    far = steps(ratio=1.2)
+    assert not holding(growth_walk.judge(far, good[0], 1, 0.5, world))["true drift inside the bound"]
+    over = steps(drift=0.6)
+    assert not holding(growth_walk.judge(over, good[0], 1, 0.5, world))["budget"]
+    assert not holding(growth_walk.judge(good, good[0], 2, 0.5, world))["second anchor"]
+    off = replace(good[0], probes=(replace(good[0].probes[0], error_m=0.31, normalised=20.0),))
+    assert not holding(growth_walk.judge(good, off, 1, 0.5, world))["second anchor"]
+    assert not holding(growth_walk.judge([off], good[0], 1, 0.5, world))["probes inside their 95 %"]
+
+
+def test_the_worst_map_is_the_one_furthest_beyond_its_claim() -> None:
+    first = [placed(fact(i), 0.1, drift_m=0.4) for i in range(5)]
+    second = [replace(placed(fact(i), 0.08, drift_m=0.1), map_id="m2") for i in range(5, 10)]
+    true, ratio = worst_map([*first, *second])
+    assert (true, ratio) == pytest.approx((0.08, 0.8))
+
+
+def test_poison_that_gets_in_fails() -> None:
+    clean = Outcome(
+        poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0, honest_active=5
+    )
+    good = {"changed": True, "restored": True}
+    assert all(holding(growth_poison.judge([clean], 0.01, good)).values())
+    for bad in (replace(clean, wrong=1), replace(clean, off_share=0.03)):
+        assert not holding(growth_poison.judge([bad], 0.01, good))["poison: mirrored"]
+    assert holding(growth_poison.judge([replace(clean, off_share=0.03)], 0.02, good))["poison: mirrored"]
+    for bad in ({"changed": True, "restored": False}, {"changed": False, "restored": True}):
+        assert not holding(growth_poison.judge([clean], 0.01, bad))["retire"]
+    held = replace(clean, forced=1, restored=False)
+    assert not holding(growth_poison.judge([held], 0.01, good))["retire"]
