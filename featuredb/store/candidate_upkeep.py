@@ -10,6 +10,7 @@ from featuredb.errors import FeatureDbError
 from featuredb.store.canaries import has_canaries, list_canaries, load_canary_image
 from featuredb.store.candidate_events import by_candidate, has_candidates, live_maps, read_events
 from featuredb.store.candidate_states import CONTRIBUTED, REFUSED, REOPENED, USED, WITHDRAWN, standing_of
+from featuredb.store.commits import write_time
 from featuredb.store.database import Database
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
 
@@ -34,8 +35,11 @@ def named_writes(database: Database) -> set[str]:
     return {event["write_id"] for event in events}
 
 
-def superfluous_images(database: Database, now: datetime, history: timedelta) -> set[str]:
-    """Candidates whose bytes may go: withdrawn ones (left by a crash), and those refused longer ago."""
+def superfluous_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
+    """Candidates whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
+
+    Bytes that were written within `grace` stay: somebody may be giving the photo again just now.
+    """
     if not has_candidates(database):
         return set()
     live = live_maps(database, None)
@@ -44,8 +48,10 @@ def superfluous_images(database: Database, now: datetime, history: timedelta) ->
         state = standing_of(events, live).state
         if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
             found.add(candidate_id)
-    stored = database.table(CANDIDATE_IMAGES).dataset().to_table(["candidate_id"], use_threads=False)
-    return found & set(stored["candidate_id"].to_pylist())
+    columns = ["candidate_id", "write_id"]
+    stored = database.table(CANDIDATE_IMAGES).dataset().to_table(columns, use_threads=False).to_pylist()
+    fresh = {row["candidate_id"] for row in stored if now - write_time(row["write_id"]) < grace}
+    return (found & {row["candidate_id"] for row in stored}) - fresh
 
 
 def check_candidates(database: Database) -> Iterator[tuple[str, str]]:

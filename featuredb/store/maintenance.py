@@ -192,7 +192,7 @@ def _vacuum_candidates(
     named = named_writes(database)
     grace = timedelta(hours=options.orphan_grace_h)
     orphans = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
-    refused = superfluous_images(database, now, timedelta(hours=options.history_h))
+    refused = superfluous_images(database, now, timedelta(hours=options.history_h), grace)
     if orphans and not dry_run:
         table.delete_writes(orphans)
     if refused and not dry_run:

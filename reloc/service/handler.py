@@ -16,7 +16,7 @@ from featuredb.errors import (
     MapNotFoundError,
 )
 from featuredb.features.decode import DecodeLimits, decode_gray
-from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.features.exif import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
@@ -150,19 +150,6 @@ def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
         raise RequestError(
             ErrorCode.BAD_REQUEST, f"camera: {error} (the image has {width}x{height})"
         ) from error
-
-
-def _prior_from_exif(exif: ExifInfo) -> GeoPrior | None:
-    """The photo's own position; without its height, whose datum photos do not say reliably."""
-    if exif.latitude_deg is None or exif.longitude_deg is None:
-        return None
-    return GeoPrior(
-        latitude_deg=exif.latitude_deg,
-        longitude_deg=exif.longitude_deg,
-        height_m=None,
-        sigma_horizontal_m=exif.sigma_horizontal_m,
-        sigma_vertical_m=exif.sigma_vertical_m,
-    )
 
 
 def _prior(prior: PriorRequest) -> GeoPrior:

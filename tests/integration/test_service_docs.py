@@ -4,6 +4,7 @@ import ast
 import re
 from pathlib import Path
 
+from reloc.service.inbox import InboxOptions
 from tests.support.service import ScriptedLocaliser, photo, running_server
 
 _WIRE = Path(__file__).parents[2] / "docs" / "wire.md"
@@ -36,6 +37,16 @@ def test_a_client_needs_nothing_but_zenoh_and_a_dozen_lines(tmp_path, monkeypatc
     run(program, tmp_path, monkeypatch)
     out = capsys.readouterr().out
     assert out.startswith("localised {'epsg': 32632")
+
+
+def test_the_bounds_of_the_inbox_are_those_of_the_program():
+    text, bounds = _WIRE.read_text(encoding="utf-8"), InboxOptions()
+    for said in (
+        f"photos wait to be written ({bounds.max_queue}, or {bounds.max_queued_bytes >> 20} MiB)",
+        f"{bounds.max_owner_photos:,} photos of this owner",
+        f"{bounds.max_photos:,} photos wait, or {bounds.max_stored_bytes >> 30} GiB are stored",
+    ):
+        assert said in text
 
 
 def test_the_python_client_of_the_documentation_runs(tmp_path, monkeypatch, capsys):

@@ -17,7 +17,7 @@ from reloc.service.metrics import Metrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.session import Keys, bind_free_port
 from reloc.service.threads import capped_process
-from reloc.wire import encode, parse_request
+from reloc.wire import ContributionReply, encode, parse_request
 from reloc.wording import ADVICE, describe
 from tests.support.service import localised, not_localised
 
@@ -146,3 +146,21 @@ def test_no_attachment_means_all_defaults():
     assert request == parse_request(b"") == parse_request(b"{}")
     assert request.prior is None
     assert not request.options.inliers
+
+
+def test_people_read_what_a_grown_map_stands_on_and_what_became_of_their_photo():
+    result = localised(7, Camera.from_focal(640, 480, 600.0))
+    reply = reply_from_result(result, request_id="r", timings_ms={"total": 1.0})
+    assert "lineage" not in describe("a.jpg", reply), "nothing is to be said of an anchor"
+    grown = reply.lineage[0].model_copy(
+        update={"steps": 3, "anchors": ("A12", "B"), "drift_m": 0.312, "budget_m": 0.5}
+    )
+    taken = ContributionReply(accepted=True, candidate_id="0" * 32, reason=None, detail="queued")
+    text = describe("a.jpg", reply.model_copy(update={"lineage": (grown,), "contribution": taken}))
+    assert "  lineage   3 steps from anchor A12, 0.31 of 0.50 m\n" in text
+    assert f"  given     candidate {'0' * 32}\n" in text
+    full = ContributionReply(accepted=False, candidate_id=None, reason="QUEUE_FULL", detail="32 wait")
+    lost = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
+    assert "  not taken QUEUE_FULL: 32 wait\n" in describe(
+        "a.jpg", lost.model_copy(update={"contribution": full})
+    )
