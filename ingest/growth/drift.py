@@ -1,4 +1,4 @@
-"""How far a grown map may have drifted from its anchors, by the graph of all maps, and what is near enough."""
+"""How far a grown map may have drifted from its anchors, by the graph of all maps, and what is enough."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace

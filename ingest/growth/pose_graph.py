@@ -22,6 +22,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.pose_graph_fit import Fit, GraphEdge, GraphNode
 
+_NAMED = 8  # overlaps that a message names
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseGraphOptions:
@@ -130,7 +132,7 @@ def _solution(
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
     unanchored = tuple(n.map_id for n in nodes if n.map_id not in fitted.corrections)
     if factor > options.max_variance_factor:
-        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:3]
+        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
         named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
         return GraphSolution(
             reason="CONTRADICTION",

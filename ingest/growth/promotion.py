@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from featuredb.errors import ConflictError
+from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
 from ingest.growth.canaries import CanaryOptions, CanaryRun, run_canaries
@@ -113,6 +113,8 @@ def promote_by_hand(
     summary = snapshot.get(map_id)
     if summary.status == "active":
         return Promotion(map_id=map_id, promoted=True, reason_code="", reason="it was active already")
+    if summary.status == "retired":
+        raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
     before = Localiser.open(database)
     gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], options))
     if not gate.passes and not force:

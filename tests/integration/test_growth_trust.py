@@ -1,0 +1,287 @@
+"""Promotion, canaries and re-placement on databases of small maps whose truth is known."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.errors import StoreError
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.move import move_map
+from featuredb.store import Database
+from ingest.growth.canaries import CanaryOptions, CanaryRun, features_of_image, own_canaries, run_canaries
+from ingest.growth.confirmation import ConfirmationOptions
+from ingest.growth.map_graph import placed_maps
+from ingest.growth.overlaps import measure_overlap
+from ingest.growth.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
+from ingest.growth.replacing import replace_descendants
+from reloc.localise import localise_features
+from reloc.localiser import Localiser
+from reloc.result import LocaliseRequest
+from tests.support.scene_strip import DESCRIPTORS, FRAME, POINTS, east, error_m, strip_map
+from tests.support.scenes import CAMERA, looking_at, pixels_inside, query_features
+
+_BUDGET_M = 0.5
+
+
+def _database(folder: Path, *maps: FeatureMap) -> Database:
+    database = Database.create(folder / "db")
+    for feature_map in maps:  # one after the other, as they came
+        database.commit_map(feature_map)
+    return database
+
+
+def _promoted(database: Database, options: PromotionOptions | None = None) -> dict[str, Promotion]:
+    localiser = Localiser.open(database)
+    found = promote_confirmed(database, localiser, options, budget_m=_BUDGET_M)
+    return {outcome.map_id: outcome for outcome in found}
+
+
+def _status(database: Database, map_id: str) -> str:
+    return database.snapshot().get(map_id).status
+
+
+_ANCHOR = strip_map("A", 20.0, owners=["survey"])
+
+
+def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
+    database = _database(
+        tmp_path, _ANCHOR, strip_map("m", 50.0, owners=["anna", "ben"], parents=[_ANCHOR], seed=1)
+    )
+    outcome = _promoted(database)["m"]
+    assert outcome.promoted
+    assert _status(database, "m") == "active"
+    assert "2 sources" in database.snapshot().get("m").status_reason
+    assert [gate.name for gate in outcome.gates if not gate.passes] == []
+    assert {"sources", "witnesses_agree", "canaries"} <= {gate.name for gate in outcome.gates}
+
+
+def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> None:
+    """Anna's map reaches beyond the anchor; Ben's map, quarantined too, shows the same from elsewhere."""
+    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    database = _database(tmp_path, _ANCHOR, mine)
+    outcome = _promoted(database)["m"]
+    assert not outcome.promoted
+    assert outcome.reason_code == "ONE_SOURCE"
+    assert _status(database, "m") == "quarantined"
+    database.commit_map(strip_map("n", 78.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    outcomes = _promoted(database)
+    assert outcomes["m"].promoted
+    assert outcomes["n"].promoted
+
+
+def test_photos_of_the_anchor_bear_witness_to_a_map_that_lies_on_it(tmp_path: Path) -> None:
+    mine = strip_map("m", 22.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    assert _promoted(_database(tmp_path, _ANCHOR, mine))["m"].promoted
+
+
+def test_a_map_that_has_known_photos_elsewhere_is_contradicted(tmp_path: Path) -> None:
+    """Two owners agree on it, and it lies five metres from where the anchor's photos are."""
+    wrong = strip_map("m", 30.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(5.0), seed=1)
+    outcome = _promoted(_database(tmp_path, _ANCHOR, wrong))["m"]
+    assert not outcome.promoted
+    assert outcome.reason_code == "CONTRADICTED"
+    assert "5.0" in outcome.reason
+
+
+def test_a_copy_of_a_block_elsewhere_is_refused_by_canaries(tmp_path: Path) -> None:
+    """The anchor's block is claimed 500 m away, by two owners who agree."""
+    copy = strip_map("m", 20.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(500.0), seed=1)
+    database = _database(tmp_path, _ANCHOR, copy)
+    before = _answer(database, 20.0)
+    outcome = _promoted(database)["m"]
+    assert not outcome.promoted
+    assert outcome.reason_code == "CANARY"
+    assert _answer(database, 20.0) == before
+    # Forced in by hand it does harm; retired, the earlier answers are back bit for bit.
+    refused = promote_by_hand(database, "m", "looks fine to me", force=False)
+    assert not refused.promoted
+    assert refused.reason_code == "CANARY"
+    assert promote_by_hand(database, "m", "I insist", force=True).promoted
+    assert _answer(database, 20.0) != before
+    database.retire("m", "it was wrong")
+    assert _answer(database, 20.0) == before
+
+
+def _answer(database: Database, at_east_m: float) -> tuple[object, ...]:
+    """What a stranger's photo gets, as bytes."""
+    rng = np.random.default_rng(77)
+    pose = looking_at(np.array([at_east_m + 12.0, -30.0, 40.0]), np.array([at_east_m, 2.0, 3.0]))
+    pixels, inside = pixels_inside(CAMERA, pose, POINTS)
+    localiser = Localiser.open(database)
+    areas = list(localiser.areas)
+    features = query_features(
+        rng, pixels[inside], DESCRIPTORS[inside], fingerprint=areas[0].area.extractor_fingerprint
+    )
+    result = localise_features(features, LocaliseRequest(camera=CAMERA), areas).result
+    if result.pose is None:
+        return (result.reason, result.inliers)
+    pose_bytes = hashlib.sha256(
+        result.pose.utm.tobytes() + result.pose.cam_from_utm_xyzw.tobytes() + result.pose.covariance.tobytes()
+    ).hexdigest()
+    return (result.reason, result.inliers, result.pose.map_ids, pose_bytes)
+
+
+@pytest.mark.parametrize("more", [None, "m"])
+def test_own_canaries_are_right_while_nothing_is_wrong(tmp_path: Path, more: str | None) -> None:
+    database = _database(
+        tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna", "ben"], parents=[_ANCHOR], seed=1)
+    )
+    before = Localiser.open(database)
+    after = Localiser.open(database, previous=before, also=[more] if more else [])
+    new = [database.snapshot().load_map("m")]
+    run = run_canaries(database, before, after, new if more else [])
+    assert run.checks
+    assert all(check.before == "right" and check.after == "right" for check in run.checks)
+    assert run.regressions == ()
+    assert "no known queries" in run.note
+
+
+def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:
+    database = _database(tmp_path, _ANCHOR, strip_map("B", 150.0, owners=["survey"], seed=3))
+    localiser = Localiser.open(database)
+    options = CanaryOptions(own_near=3, own_elsewhere=2)
+    chosen = own_canaries(localiser, [strip_map("m", 25.0, seed=1)], options)
+    again = own_canaries(Localiser.open(database), [strip_map("m", 25.0, seed=1)], options)
+    assert [(m.map_id, i.name) for m, i in chosen] == [(m.map_id, i.name) for m, i in again]
+    assert [m.map_id for m, _ in chosen] == ["A"] * 3 + ["B"] * 2
+    features = features_of_image(*chosen[0])
+    assert len(features) > 60
+    assert features.width == CAMERA.width
+
+
+def test_maps_that_are_held_back_are_not_examined(tmp_path: Path) -> None:
+    owners = ["anna", "ben"]
+    quarantined = strip_map("q", 60.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    database = _database(
+        tmp_path,
+        _ANCHOR,
+        quarantined,
+        strip_map("far", 40.0, owners=owners, parents=[_ANCHOR], seed=2, drift_m=0.9),
+        strip_map("orphan", 85.0, owners=owners, parents=[quarantined], seed=3),
+    )
+    outcomes = _promoted(database)
+    assert outcomes["far"].reason_code == "DRIFT_BUDGET"
+    assert outcomes["orphan"].reason_code == "NO_PARENT"
+
+
+def test_by_hand_a_good_map_needs_no_confirmation(tmp_path: Path) -> None:
+    database = _database(tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[_ANCHOR], seed=1))
+    outcome = promote_by_hand(database, "m", "I know Anna", force=False)
+    assert outcome.promoted
+    assert "I know Anna" in database.snapshot().get("m").status_reason
+    assert promote_by_hand(database, "m", "again", force=False).promoted
+
+
+def test_an_overlap_is_measured(tmp_path: Path) -> None:
+    """A map displaced by a known similarity, against one that is right."""
+    move = Sim3.exp([0.002, 0.001, -0.002, 0.003, 0.4, -0.3, 0.2])
+    crooked = strip_map("m", 40.0, move=move, seed=1)
+    found = measure_overlap(crooked, strip_map("n", 55.0, seed=2))
+    assert found.reason is None
+    assert found.other_from_map is not None
+    assert found.covariance is not None
+    places = POINTS[np.abs(POINTS[:, 0] - 45.0) < 20.0]
+    miss = found.other_from_map.act(move.act(places)) - places
+    assert np.linalg.norm(miss, axis=1).max() < 0.03
+    error = (found.other_from_map @ move).log()
+    assert error @ np.linalg.solve(found.covariance, error) < 24.0  # 0.1 % of a chi-square of 7
+
+
+def test_maps_that_do_not_overlap_have_none(tmp_path: Path) -> None:
+    found = measure_overlap(strip_map("m", 20.0, seed=1), strip_map("n", 150.0, seed=2))
+    assert found.reason == "NO_OVERLAP"
+
+
+def _chain(drift_each_m: float, far: Sim3 | None) -> list[FeatureMap]:
+    """An anchor, four maps that drift away from it, and an anchor at the far end that came later."""
+    maps = [_ANCHOR]
+    for k in range(1, 5):
+        maps.append(
+            strip_map(
+                f"m{k}", 20.0 + 32.0 * k, owners=["anna", "ben"], parents=[maps[-1]], status="active",
+                move=east(drift_each_m * k), seed=k,
+            )
+        )  # fmt: skip
+    if far is not None:
+        maps.append(strip_map("B", 165.0, owners=["survey"], move=far, seed=9))
+    return maps
+
+
+def test_an_anchor_at_the_far_end_re_places_what_drifted_in_one_commit(tmp_path: Path) -> None:
+    database = _database(tmp_path, *_chain(0.06, Sim3.identity()))
+    before = database.poll_version()
+    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
+    assert done is not None
+    assert done.reason is None
+    assert database.poll_version() == before + 1
+    snapshot = database.snapshot()
+    for k in range(1, 5):
+        drifted, placed = 0.06 * k, error_m(snapshot.load_map(f"m{k}"), 20.0 + 32.0 * k)
+        assert placed < max(0.5 * drifted, 0.05)
+        assert snapshot.get(f"m{k}").status == "active"
+    assert error_m(snapshot.load_map("A"), 20.0) < 0.03
+    assert {m.map_id for m in done.moved} >= {"m1", "m2", "m3", "m4"}
+    # m4 overlaps the new anchor and says so; drift is a quarter of a chain of four, at most.
+    assert "B" in snapshot.get("m4").parents
+    drift = {m.map_id: m.drift_m for m in done.moved}
+    assert drift["m4"] < drift["m2"] < 0.5
+    # Everything has been said: a second look finds nothing to do, and measures nothing.
+    assert replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M) is None
+    assert database.poll_version() == before + 1
+
+
+def test_an_anchor_that_contradicts_by_far_moves_nothing(tmp_path: Path) -> None:
+    """The far anchor lies eight metres off: neither side is believed, and the report names the overlaps."""
+    database = _database(tmp_path, *_chain(0.0, east(8.0)))
+    before = database.poll_version()
+    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
+    assert done is not None
+    assert done.reason == "CONTRADICTION"
+    assert "m4 - B" in done.message
+    assert database.poll_version() == before
+
+
+def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -> None:
+    """A survey with GPS of metres is anchored by LiDAR two metres west: its children follow."""
+    loose = np.diag(np.repeat([1e-4, 3.0], [4, 3]) ** 2)
+    first = strip_map("A", 20.0, owners=["survey"], move=east(2.0), covariance=loose)
+    child = strip_map(
+        "m1", 52.0, owners=["anna", "ben"], parents=[first], status="active", move=east(2.0), seed=1
+    )
+    database = _database(tmp_path, first, child)
+    right = replace(
+        move_map(first, east(-2.0), FRAME, covariance=_ANCHOR.placement.covariance), status="active"
+    )
+    result = database.commit_map(right, replaces="A")
+    assert result.flagged == ("m1",)
+    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
+    assert done is not None
+    assert done.reason is None
+    snapshot = database.snapshot()
+    assert snapshot.get("m1").status == "active"
+    assert error_m(snapshot.load_map("m1"), 52.0) < 0.1
+    assert error_m(snapshot.load_map("A"), 20.0) < 0.02
+    placed = placed_maps(snapshot)
+    assert placed["m1"].edges[0].place == placed["A"].place
+
+
+def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
+    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    options = PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=("anna",)))
+    assert _promoted(_database(tmp_path, _ANCHOR, mine), options)["m"].promoted
+
+
+def test_what_is_retired_cannot_be_promoted(tmp_path: Path) -> None:
+    database = _database(tmp_path, _ANCHOR, strip_map("m", 45.0, owners=["anna"], parents=[_ANCHOR], seed=1))
+    database.retire("m", "wrong")
+    assert _promoted(database) == {}
+    with pytest.raises(StoreError, match="retired"):
+        promote_by_hand(database, "m", "again", force=True)
+
+
+def test_a_run_of_canaries_says_what_regressed() -> None:
+    assert "0 canaries answered as before" in CanaryRun(checks=(), note="none").message
