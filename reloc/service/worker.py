@@ -4,6 +4,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import UTC, datetime
 
@@ -44,6 +45,8 @@ class WorkerPool:
         self._area = area
         self._options = options
         self._inbox = inbox
+        # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
+        self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
         self._busy: set[PendingQuery] = set()
         self._lock = threading.Lock()
         self._caps = ExitStack()
@@ -67,6 +70,7 @@ class WorkerPool:
         for thread in self._threads:
             thread.join(max(0.0, end - time.perf_counter()))
         self._caps.close()
+        self._namer.shutdown(wait=False, cancel_futures=False)
         with self._lock:
             return list(self._busy)
 
@@ -119,6 +123,7 @@ class WorkerPool:
         clock.end("request")
         if item.answered:
             return
+        name = self._namer.submit(candidate_id_of, data) if request.contribute else None
         reply = answer_query(
             data,
             request,
@@ -129,8 +134,8 @@ class WorkerPool:
             before_localising=lambda: _check_deadline(item),
         )
         _check_deadline(item)
-        if request.contribute and self._inbox is not None:
-            _answer_and_keep(item, data, request, reply, clock, self._inbox)
+        if name is not None and self._inbox is not None:
+            _answer_and_keep(item, data, request, reply, clock, self._inbox, name)
         else:
             item.answer(reply)
 
@@ -142,6 +147,7 @@ def _answer_and_keep(
     reply: LocaliseReply,
     clock: StageClock,
     inbox: Inbox,
+    name: "Future[str]",
 ) -> None:
     """Answer, and hand the photo to the inbox if it has a place; what is said in the answer is then done."""
     received_at = datetime.now(UTC)
@@ -153,7 +159,7 @@ def _answer_and_keep(
     answered = False
     try:
         said = ContributionReply(
-            accepted=True, candidate_id=candidate_id_of(data), reason=None, detail="queued for the inbox"
+            accepted=True, candidate_id=name.result(), reason=None, detail="queued for the inbox"
         )
         answered = item.answer(_with_contribution(reply, said, clock))
     finally:
