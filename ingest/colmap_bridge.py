@@ -214,6 +214,25 @@ def quiet() -> Iterator[None]:
         pycolmap.logging.minloglevel = before
 
 
+def write_posed(
+    folder: Path, cameras: Sequence[Camera], photos: Sequence[SfmPhoto], poses: Mapping[int, Rigid3]
+) -> None:
+    """A model folder of posed photos without points.
+
+    Args:
+        cameras: by the photos' camera_row.
+        poses: cam_from_sfm by row of the photos.
+    """
+    reconstruction = pycolmap.Reconstruction()
+    for row in sorted({photos[i].camera_row for i in poses}):
+        reconstruction.add_camera_with_trivial_rig(cameras[row].to_pycolmap(row + 1))
+    for row, pose in sorted(poses.items()):
+        photo = photos[row]
+        image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=row + 1)
+        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
+    reconstruction.write(str(folder))
+
+
 def read_models(output: Path) -> list[Model]:
     """The models of a finished mapping, largest first, ties by first photo."""
     models = [read_model(folder) for folder in sorted(output.iterdir()) if folder.is_dir()]

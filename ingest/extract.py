@@ -1,7 +1,9 @@
 """Stage: the features of each photo, on a pool of processes, one file each."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import overload
 
 import cv2
 import numpy as np
@@ -14,7 +16,7 @@ from featuredb.features.features import Features
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photo import Photo
-from ingest.workspace import Workspace, read_arrays, write_arrays
+from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
 _COLOUR_SHRINK = 4  # colours of points need no full resolution; JPEG decodes a quarter size much faster
 _ARRAYS = ("xy", "scale", "angle", "response", "descriptors")
@@ -101,6 +103,36 @@ def read_features(path: Path) -> PhotoFeatures:
         fingerprint=str(arrays["fingerprint"]),
     )
     return PhotoFeatures(features=features, rgb=arrays["rgb"])
+
+
+def read_keypoints(path: Path) -> NDArray[np.float32]:
+    """Keypoints (n, 2) in pixels of one npz file of this stage; nothing else is read."""
+    return np.asarray(read_array(path, "xy"), dtype=np.float32)
+
+
+class FeatureFiles(Sequence[PhotoFeatures]):
+    """Features of many photos, each read from its file when it is asked for, and not kept."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+
+    @overload
+    def __getitem__(self, index: int) -> PhotoFeatures: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "FeatureFiles": ...
+
+    def __getitem__(self, index: int | slice) -> "PhotoFeatures | FeatureFiles":
+        if isinstance(index, slice):
+            return FeatureFiles(self.paths[index])
+        return read_features(self.paths[index])
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def of(self, rows: Sequence[int] | NDArray[np.int64]) -> "FeatureFiles":
+        """Those of some photos."""
+        return FeatureFiles([self.paths[int(row)] for row in rows])
 
 
 def _extract_one(task: ExtractTask) -> str:

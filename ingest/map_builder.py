@@ -65,11 +65,13 @@ def build_map(
     """The map of one placed model; None if no point is placed well enough.
 
     Args:
-        photos, features: of the model's registered photos, in the order of `model.rows`.
+        photos, features: of the model's registered photos, in the order of `model.rows`; features are read
+            once, photo by photo.
     """
+    used = _used_features(features, model)
     poses = [placement.local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
     enu = placement.local_from_sfm.act(model.xyz)
-    xy = _gather(features, model, "xy").astype(np.float64)
+    xy = used.xy.astype(np.float64)
     linear = linearise(model.cameras, model.camera_of, poses, enu, model.point_of, model.photo_of, xy)
     variance = residual_variance(linear, len(poses), len(enu))
     covariances = point_covariances(linear, len(enu), variance)
@@ -78,7 +80,6 @@ def build_map(
     if not kept.any():
         return None
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
-    fingerprints = {f.features.fingerprint for f in features}
     return FeatureMap(
         map_id=identity.map_id,
         name=identity.name,
@@ -88,10 +89,10 @@ def build_map(
         cameras=model.cameras,
         camera_keys=_camera_keys(model, photos),
         images=tuple(_images(photos, model, poses, pose_spread)),
-        points=_points(model, features, frame.utm_from_enu(enu, epsg), linear, covariances, kept),
-        observations=_observations(model, features, xy, kept, options),
+        points=_points(model, used.rgb, frame.utm_from_enu(enu, epsg), linear, covariances, kept),
+        observations=_observations(model, used, kept, options),
         placement=placement,
-        extractor_fingerprint=fingerprints.pop(),
+        extractor_fingerprint=used.fingerprint,
         source=identity.source,
         licence=identity.licence,
         provenance=identity.provenance | {"residual_sigma_px": variance**0.5},
@@ -128,16 +129,15 @@ def _images(
 
 def _points(
     model: Model,
-    features: Sequence[PhotoFeatures],
+    rgb: NDArray[np.uint8],
     utm: FloatArray,
     linear: Linearised,
     covariances: FloatArray,
     kept: NDArray[np.bool_],
 ) -> MapPoints:
     lengths = model.track_lengths()
-    colours = _gather(features, model, "rgb").astype(np.float64)
     errors = np.linalg.norm(linear.residual, axis=1)
-    mean_rgb = np.stack([_mean(c, model.point_of, lengths) for c in colours.T], axis=1)
+    mean_rgb = np.stack([_mean(c.astype(np.float64), model.point_of, lengths) for c in rgb.T], axis=1)
     return MapPoints(
         utm=utm[kept],
         rgb=np.rint(mean_rgb[kept]).astype(np.uint8),
@@ -149,8 +149,7 @@ def _points(
 
 def _observations(
     model: Model,
-    features: Sequence[PhotoFeatures],
-    xy: FloatArray,
+    used: "_Used",
     kept: NDArray[np.bool_],
     options: MapOptions,
 ) -> MapObservations:
@@ -158,13 +157,13 @@ def _observations(
     row_of_point = np.cumsum(kept) - 1
     long_enough = (model.track_lengths() >= options.min_track_length)[model.point_of[rows]]
     descriptors = np.zeros((len(rows), DESCRIPTOR_SIZE), np.uint8)
-    descriptors[long_enough] = _gather(features, model, "descriptors")[rows[long_enough]]
+    descriptors[long_enough] = used.descriptors[rows[long_enough]]
     return MapObservations(
         point_index=row_of_point[model.point_of[rows]],
         image_id=model.photo_of[rows].astype(np.int32),
-        xy=xy[rows].astype(np.float32),
-        scale=_gather(features, model, "scale")[rows],
-        angle=_gather(features, model, "angle")[rows],
+        xy=used.xy[rows],
+        scale=used.scale[rows],
+        angle=used.angle[rows],
         has_descriptor=long_enough,
         descriptors=descriptors,
     )
@@ -186,11 +185,38 @@ def _well_placed(
     return np.asarray(sigma <= options.max_sigma_over_distance * nearest)
 
 
-def _gather(features: Sequence[PhotoFeatures], model: Model, name: str) -> NDArray[Any]:
-    """The named array's rows of all observations, (m, ...)."""
-    arrays = [f.rgb if name == "rgb" else getattr(f.features, name) for f in features]
-    starts = np.cumsum([0, *(len(a) for a in arrays)])
-    return np.concatenate(arrays)[starts[model.photo_of] + model.keypoint_of]
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Used:
+    """Features of all observations, in their order: xy (m, 2), scale (m,), angle (m,), descriptors (m, 128)
+    and the colour under each (m, 3)."""
+
+    xy: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    angle: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]
+    fingerprint: str
+
+
+def _used_features(features: Sequence[PhotoFeatures], model: Model) -> _Used:
+    """One pass through the photos, one photo's features in memory at a time."""
+    count = len(model.photo_of)
+    used = _Used(
+        xy=np.zeros((count, 2), np.float32),
+        scale=np.zeros(count, np.float32),
+        angle=np.zeros(count, np.float32),
+        descriptors=np.zeros((count, DESCRIPTOR_SIZE), np.uint8),
+        rgb=np.zeros((count, 3), np.uint8),
+        fingerprint=features[0].features.fingerprint,
+    )
+    order = np.argsort(model.photo_of, kind="stable")
+    ends = np.cumsum(np.bincount(model.photo_of, minlength=len(features)))
+    for k, rows in enumerate(np.split(order, ends[:-1])):
+        photo, keypoints = features[k], model.keypoint_of[rows]
+        used.rgb[rows] = photo.rgb[keypoints]
+        for name in ("xy", "scale", "angle", "descriptors"):
+            getattr(used, name)[rows] = getattr(photo.features, name)[keypoints]
+    return used
 
 
 def _mean(values: FloatArray, group: NDArray[np.int64], counts: NDArray[np.int64]) -> FloatArray:

@@ -1,20 +1,22 @@
 """Stage: matches of each pair of photos, verified by two-view geometry, one file a pair."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.index.codebook import use_threads
 from featuredb.index.nearest import nearest
 from ingest.colmap_bridge import TwoView, verify_pair
-from ingest.executor import Executor, Progress, no_progress
+from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.extract import read_features
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.pairs import Pair
-from ingest.workspace import Workspace, read_arrays, write_arrays
+from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
 _DESCRIPTOR_LENGTH = 512.0  # of 8-bit RootSIFT
 
@@ -43,22 +45,6 @@ class MatchOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MatchTask:
-    """One pair; travels to a worker."""
-
-    features_a: Path
-    features_b: Path
-    camera_a: Camera
-    camera_b: Camera
-    focal_known: bool
-    target: Path
-    options: MatchOptions
-
-    def __str__(self) -> str:
-        return self.target.stem
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoView:
     """What matching needs of a photo: its digest, features file and camera as EXIF has it."""
 
@@ -69,46 +55,95 @@ class PhotoView:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MatchTask:
+    """One photo with some others; travels to a worker.
+
+    Attributes:
+        name: of the first photo.
+        photo: whose features are read once.
+        others: the photos that it is matched with, and the file of each pair.
+    """
+
+    name: str
+    photo: PhotoView
+    others: tuple[tuple[PhotoView, Path], ...]
+    options: MatchOptions
+
+    def __str__(self) -> str:
+        return f"{self.name} with {len(self.others)} others"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
     """What the stage did.
 
     Attributes:
-        geometries: two-view geometries of the pairs with enough verified matches.
+        inliers: number of verified matches of the pairs that have enough of them.
+        files: where every pair's geometry lies.
         reused: pairs that were matched already.
+        lost: why some pairs could not be matched.
     """
 
-    geometries: dict[Pair, TwoView]
-    reused: int
+    inliers: dict[Pair, int]
+    files: dict[Pair, Path]
+    reused: int = 0
+    lost: tuple[Lost, ...] = ()
+
+    def __or__(self, other: "Matched") -> "Matched":
+        """Both."""
+        return Matched(
+            inliers=self.inliers | other.inliers,
+            files=self.files | other.files,
+            reused=self.reused + other.reused,
+            lost=self.lost + other.lost,
+        )
+
+    def geometry(self, pair: Pair) -> TwoView:
+        """The two-view geometry of a pair, read from its file."""
+        return TwoView(**read_arrays(self.files[pair]))
 
 
 def match_pairs(
-    views: list[PhotoView],
-    pairs: list[Pair],
+    views: Sequence[PhotoView],
+    pairs: Sequence[Pair],
     workspace: Workspace,
     options: MatchOptions,
     executor: Executor,
     progress: Progress = no_progress,
+    names: Sequence[str] | None = None,
 ) -> Matched:
-    """Match and verify every pair that is not done yet."""
+    """Match and verify every pair that is not done yet.
+
+    Args:
+        names: of the photos, for messages.
+    """
     files = {pair: _match_file(views[pair[0]], views[pair[1]], workspace, options) for pair in pairs}
+    todo: dict[int, list[Pair]] = {}
+    counts: dict[Pair, int] = {}
+    for pair, file in files.items():
+        if file.exists():
+            counts[pair] = len(read_array(file, "inliers"))
+        else:
+            todo.setdefault(pair[0], []).append(pair)
     tasks = [
         MatchTask(
-            features_a=views[i].features,
-            features_b=views[j].features,
-            camera_a=views[i].camera,
-            camera_b=views[j].camera,
-            focal_known=views[i].focal_known and views[j].focal_known,
-            target=target,
+            name=names[i] if names is not None else views[i].sha256,
+            photo=views[i],
+            others=tuple((views[j], files[i, j]) for _, j in own),
             options=options,
         )
-        for (i, j), target in files.items()
-        if not target.exists()
+        for i, own in todo.items()
     ]
-    executor.map("match", _match_one, tasks, progress)
-    loaded = {pair: TwoView(**read_arrays(path)) for pair, path in files.items()}
+    reused = len(counts)
+    outcomes = executor.map("match", _match_one, tasks, progress)
+    for own, outcome in zip(todo.values(), outcomes, strict=True):
+        if not isinstance(outcome, Lost):
+            counts |= dict(zip(own, outcome, strict=True))
     return Matched(
-        geometries={p: view for p, view in loaded.items() if len(view.inliers) >= options.min_inliers},
-        reused=len(files) - len(tasks),
+        inliers={p: counts[p] for p in files if counts.get(p, 0) >= options.min_inliers},
+        files=files,
+        reused=reused,
+        lost=tuple(o for o in outcomes if isinstance(o, Lost)),
     )
 
 
@@ -138,24 +173,30 @@ def _distinct_nearest(
     return np.where(good, rows[:, 0], -1)
 
 
-def _match_one(task: MatchTask) -> int:
-    """Match one pair and write its file; the number of verified matches."""
+def _match_one(task: MatchTask) -> list[int]:
+    """Match one photo with its others and write a file for each; the numbers of verified matches."""
     use_threads(1)
-    a = read_features(task.features_a).features
-    b = read_features(task.features_b).features
+    features = read_features(task.photo.features).features
+    return [_match_pair(task, features, other, target) for other, target in task.others]
+
+
+def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) -> int:
+    if target.exists():  # a worker that died had come so far
+        return len(read_array(target, "inliers"))
+    b = read_features(other.features).features
     matches = mutual_matches(a.descriptors, b.descriptors, task.options)
     side = max(a.width, a.height, b.width, b.height)
     view = verify_pair(
-        task.camera_a,
+        task.photo.camera,
         a.xy,
-        task.camera_b,
+        other.camera,
         b.xy,
         matches,
-        focal_known=task.focal_known,
+        focal_known=task.photo.focal_known and other.focal_known,
         max_error_px=task.options.max_error_px * max(1.0, side / task.options.error_reference_side_px),
         seed=task.options.seed,
     )
-    write_arrays(task.target, view.arrays())
+    write_arrays(target, view.arrays())
     return len(view.inliers)
 
 

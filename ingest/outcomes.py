@@ -57,12 +57,16 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
 
 
 def photo_outcomes(
-    photos: Sequence[Photo], result: Reconstructed, stop_after: Stage | None
+    photos: Sequence[Photo],
+    result: Reconstructed,
+    registered: Mapping[str, PhotoOutcome],
+    stop_after: Stage | None,
 ) -> tuple[PhotoOutcome, ...]:
-    """Every file of the folder for the report, sorted by name."""
-    registered: dict[str, PhotoOutcome] = {}
-    for component in result.components:
-        registered |= _registered(component, result)
+    """Every file of the folder for the report, sorted by name.
+
+    Args:
+        registered: of the photos of all components, by name, see `registered_photos`.
+    """
     return tuple(
         registered.get(photo.name) or _left_out(photo, result, stop_after)
         for photo in sorted(photos, key=lambda p: p.name)
@@ -76,6 +80,8 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
         code, reason = "unreadable", result.unreadable[photo.name]
     elif photo.status == "ok" and stop_after is not None:
         code, reason = "stopped", f"the ingest stopped after {stop_after}, as asked"
+    elif photo.status == "ok" and photo.name in result.lost:
+        code, reason = "lost", result.lost[photo.name]
     elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
         code, reason = "no_matches", "no other photo shows the same place"
     elif photo.status == "ok":
@@ -86,7 +92,7 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
     )
 
 
-def _registered(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
+def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
     """The photos of one component; those of a refused one are in no map, and have its reason."""
     feature_map = component.feature_map
     if feature_map is None:

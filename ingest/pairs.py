@@ -1,7 +1,13 @@
-"""Stage: which photos to match with which. The number of pairs grows linearly with that of photos."""
+"""Stage: which photos to match with which. The number of pairs grows linearly with that of photos.
+
+Positions, times and looks each propose neighbours. None is a proof: positions may be wrong by kilometres and
+cameras' clocks by hours, different places look alike. What two photos truly share, matching finds out, and
+then photos that were matched with the same third one are tried (`more_pairs`).
+"""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +16,11 @@ from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.index.codebook import kmeans
-from featuredb.index.nearest import nearest
+from featuredb.index.photo_index import most_similar
 from ingest.photo import Photo
 
 Pair = tuple[int, int]
+_Ranked = tuple[int, int, int]  # rank among the proposals of one photo, the photo, the other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,81 +32,82 @@ class PairOptions:
             neighbourhoods below would choose about 24 * 12 of them anyway, and may miss one that matters.
         gps_neighbours: nearest photos by GPS, each photo. A block flight sees a point from some nine
             photos at 70 % overlap; twelve leaves room for GPS errors.
-        gps_radius_m: no pair is chosen by GPS beyond this distance; oblique photos still overlap there.
-        time_neighbours: following photos by capture time, each photo.
-        retrieval_neighbours: most similar photos by aggregated descriptor, for photos without GPS.
-        codebook_size: visual words of the aggregated descriptor.
-        codebook_samples: descriptors that train it.
-        features_per_photo: strongest features aggregated per photo.
-        seed: of sampling and k-means.
+        gps_radius_m: no pair is chosen by GPS beyond this distance, and twice the deviation of the
+            positions' difference; oblique photos still overlap there.
+        precise_sigma_m: photos whose position is worse have their neighbours within that distance chosen by
+            look, since the nearest by position are as good as any.
+        time_neighbours: following photos of the same owner and camera by capture time, each photo.
+        look_neighbours: photos most similar by aggregated descriptor, each photo with a precise position:
+            positions can be wrong. Most of them are GPS neighbours anyway.
+        retrieval_neighbours: the same for photos without a precise position; tools/retrieval_recall.py
+            prints the share of overlapping pairs that this finds.
+        features_per_photo: strongest features that the aggregated descriptor is made of.
+        pairs_per_photo: at most so many, best proposals first: a photo that everybody finds similar, a
+            blank one for example, is matched with no more.
+        more_neighbours: photos that overlap a photo's verified neighbours, tried afterwards.
     """
 
     exhaustive_max_photos: int = 24
     gps_neighbours: int = 12
     gps_radius_m: float = 300.0
+    precise_sigma_m: float = 10.0
     time_neighbours: int = 2
+    look_neighbours: int = 4
     retrieval_neighbours: int = 12
-    codebook_size: int = 64
-    codebook_samples: int = 100_000
-    features_per_photo: int = 1000
-    seed: int = 0
+    features_per_photo: int = 3000
+    pairs_per_photo: int = 60
+    more_neighbours: int = 6
+
+    def needs_vectors(self, photos: int) -> bool:
+        """Whether `choose_pairs` looks at aggregated descriptors."""
+        return (
+            photos > self.exhaustive_max_photos and max(self.look_neighbours, self.retrieval_neighbours) > 0
+        )
 
 
 def choose_pairs(
-    photos: Sequence[Photo], descriptors: Sequence[NDArray[np.uint8]], options: PairOptions
+    photos: Sequence[Photo], vectors: NDArray[np.float16] | None, options: PairOptions
 ) -> list[Pair]:
     """Pairs (i, j), i < j, of rows of `photos`, sorted.
 
     Args:
         photos: usable photos.
-        descriptors: of each photo, (n, 128) uint8, strongest first.
+        vectors: aggregated descriptor of each, (n, d) of unit length; None where they are not looked at.
     """
     if len(photos) <= options.exhaustive_max_photos:
         return list(itertools.combinations(range(len(photos)), 2))
-    pairs = set(_gps_pairs(photos, options)) | set(_time_pairs(photos, options))
-    without_gps = [i for i, photo in enumerate(photos) if photo.gps is None]
-    if without_gps:
-        pairs |= set(_retrieval_pairs(without_gps, descriptors, options))
-    return sorted(pairs)
+    proposals = [*_time_pairs(photos, options), *_gps_pairs(photos, vectors, options)]
+    if vectors is not None:
+        proposals += _look_pairs(photos, vectors, options)
+    return _bounded(proposals, options.pairs_per_photo, ())
 
 
-def aggregate(descriptors: Sequence[NDArray[np.uint8]], options: PairOptions) -> FloatArray:
-    """One vector of unit length per photo, (n, codebook_size * 128).
+def more_pairs(
+    photos: int, inliers: Mapping[Pair, int], tried: Iterable[Pair], options: PairOptions
+) -> list[Pair]:
+    """Pairs not tried yet of photos that overlap the same others, those with most in common first.
 
-    VLAD with intra-normalisation (Jegou et al. 2010, Arandjelovic and Zisserman 2013) over a codebook
-    trained on these very photos.
+    Args:
+        photos: number of photos.
+        inliers: verified matches of the pairs that have enough.
     """
-    strongest = [d[: options.features_per_photo].astype(np.float32) for d in descriptors]
-    everything = np.concatenate(strongest)
-    generator = np.random.default_rng(options.seed)
-    count = min(len(everything), options.codebook_samples)
-    words = min(options.codebook_size, max(1, count // 40))  # k-means wants tens of samples a cluster
-    samples = everything[np.sort(generator.choice(len(everything), count, replace=False))]
-    codebook = kmeans(samples, words, options.seed)
-    vectors = np.zeros((len(strongest), words * everything.shape[1]))
-    half_norm = 0.5 * (codebook**2).sum(axis=1)
-    for row, photo in enumerate(strongest):
-        word = np.argmax(photo @ codebook.T - half_norm, axis=1) if len(photo) else np.zeros(0, int)
-        residuals = np.zeros_like(codebook)
-        np.add.at(residuals, word, photo - codebook[word])
-        residuals /= np.maximum(np.linalg.norm(residuals, axis=1, keepdims=True), 1e-12)
-        vectors[row] = residuals.ravel() / max(float(np.linalg.norm(residuals)), 1e-12)
-    return vectors
-
-
-def _gps_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterable[Pair]:
-    """Each photo with its nearest ones on the ground plan, within the radius."""
-    rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
-    if len(rows) < 2:
-        return
-    plan = gps_positions([photos[i] for i in rows])[:, :2]
-    distances, neighbours = cKDTree(plan).query(
-        plan, k=min(options.gps_neighbours + 1, len(rows)), distance_upper_bound=options.gps_radius_m
-    )
-    for i, (found, near) in enumerate(zip(np.atleast_2d(distances), np.atleast_2d(neighbours), strict=True)):
-        for distance, j in zip(found, near, strict=True):
-            if np.isfinite(distance) and j != i:
-                yield _ordered(rows[i], rows[int(j)])
+    if photos <= options.exhaustive_max_photos:
+        return []
+    neighbours: dict[int, list[tuple[int, int]]] = {}
+    for (i, j), count in inliers.items():
+        neighbours.setdefault(i, []).append((j, count))
+        neighbours.setdefault(j, []).append((i, count))
+    known = set(tried)
+    proposals: list[_Ranked] = []
+    for i, mine in sorted(neighbours.items()):
+        common: Counter[int] = Counter()
+        for j, to_j in mine:
+            for k, from_j in neighbours[j]:
+                if k != i and _ordered(i, k) not in known:
+                    common[k] += min(to_j, from_j)
+        best = sorted(common.items(), key=lambda item: (-item[1], item[0]))
+        proposals += [(rank, i, k) for rank, (k, _) in enumerate(best[: options.more_neighbours])]
+    return _bounded(proposals, options.pairs_per_photo, known)
 
 
 def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
@@ -117,31 +124,99 @@ def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> F
     return frame.enu_from_geodetic(geodetic)
 
 
-def _time_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterable[Pair]:
-    """Each photo with those taken next. Without any time, by name: cameras number their files."""
+def _bounded(proposals: Sequence[_Ranked], most: int, tried: Iterable[Pair]) -> list[Pair]:
+    """Proposed pairs, best ranks first, as long as both photos have fewer than `most`."""
+    degree = Counter(row for pair in tried for row in pair)
+    chosen: set[Pair] = set()
+    for _, i, j in sorted(proposals):
+        pair = _ordered(i, j)
+        if pair not in chosen and degree[i] < most and degree[j] < most:
+            chosen.add(pair)
+            degree[i] += 1
+            degree[j] += 1
+    return sorted(chosen)
+
+
+def _gps_pairs(
+    photos: Sequence[Photo], vectors: NDArray[np.float16] | None, options: PairOptions
+) -> Iterator[_Ranked]:
+    """Each photo with its nearest ones on the ground plan, or the most similar ones of those in reach."""
+    rows = [i for i, photo in enumerate(photos) if photo.gps is not None]
+    if len(rows) < 2:
+        return
+    plan = gps_positions([photos[i] for i in rows])[:, :2]
+    sigmas = np.array([gps.sigma_horizontal_m for i in rows if (gps := photos[i].gps) is not None])
+    tree = cKDTree(plan)
+    count = min(options.gps_neighbours + 1, len(rows))
+    distances, nearest = _nearest(tree, plan, count)
+    for me, (found, near) in enumerate(zip(distances, nearest, strict=True)):
+        if vectors is not None and sigmas[me] > options.precise_sigma_m:
+            near = _alike_in_reach(me, rows, plan, sigmas, tree, vectors, options)
+        else:
+            reach = options.gps_radius_m + 2.0 * np.hypot(sigmas[me], sigmas[near])
+            near = near[found <= reach]
+        others = [int(k) for k in near if k != me]
+        for rank, other in enumerate(others[: options.gps_neighbours]):
+            yield rank, rows[me], rows[other]
+
+
+# Photos in reach that are compared by look: in a crowd, the nearest of them.
+_MOST_IN_REACH = 400
+
+
+def _alike_in_reach(
+    me: int,
+    rows: Sequence[int],
+    plan: FloatArray,
+    sigmas: FloatArray,
+    tree: cKDTree,
+    vectors: NDArray[np.float16],
+    options: PairOptions,
+) -> NDArray[np.int64]:
+    """Photos that may be in reach by their positions, most similar first; at most 400 are looked at."""
+    distances, neighbours = _nearest(tree, plan[me : me + 1], min(_MOST_IN_REACH, len(plan)))
+    near = neighbours[0]
+    near = near[distances[0] <= options.gps_radius_m + 2.0 * np.hypot(sigmas[me], sigmas[near])]
+    own = vectors[rows[me]].astype(np.float32)
+    cosines = vectors[[rows[k] for k in near]].astype(np.float32) @ own
+    return np.asarray(near[np.lexsort((near, -cosines))])
+
+
+def _nearest(tree: cKDTree, points: FloatArray, k: int) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Distances and rows (n, k), k > 1, of the tree's nearest points."""
+    distances, rows = tree.query(points, k=k)
+    return np.asarray(distances, dtype=np.float64), np.asarray(rows, dtype=np.int64)
+
+
+def _time_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterator[_Ranked]:
+    """Each photo with those that its owner's camera took next."""
     # Times with and without offset do not compare; the camera's own clock is what orders photos.
-    timed = [
-        (p.camera_key, p.capture_time.replace(tzinfo=None), p.name, i)
+    timed = sorted(
+        (p.owner, p.camera_key, p.capture_time.replace(tzinfo=None), p.name, i)
         for i, p in enumerate(photos)
         if p.capture_time is not None
-    ]
-    order = [i for *_, i in sorted(timed)]
-    for place, i in enumerate(order):
-        for j in order[place + 1 : place + 1 + options.time_neighbours]:
-            yield _ordered(i, j)
+    )
+    for place, (owner, camera, *_, i) in enumerate(timed):
+        for rank, (other, its, *_, j) in enumerate(timed[place + 1 : place + 1 + options.time_neighbours]):
+            if (other, its) == (owner, camera):
+                yield rank, i, j
 
 
-def _retrieval_pairs(
-    rows: Sequence[int], descriptors: Sequence[NDArray[np.uint8]], options: PairOptions
-) -> Iterable[Pair]:
-    """Each of the given photos with those whose aggregated descriptor is nearest."""
-    vectors = aggregate(descriptors, options)
-    count = min(options.retrieval_neighbours + 1, len(vectors))
-    _, neighbours = nearest(vectors[list(rows)], vectors, count)
-    for i, near in zip(rows, neighbours, strict=True):
-        for j in near:
-            if int(j) not in (i, -1):
-                yield _ordered(i, int(j))
+def _look_pairs(
+    photos: Sequence[Photo], vectors: NDArray[np.float16], options: PairOptions
+) -> Iterator[_Ranked]:
+    """Each photo with those whose aggregated descriptor is nearest, wherever they are."""
+    for precise, count in ((True, options.look_neighbours), (False, options.retrieval_neighbours)):
+        rows = [i for i, p in enumerate(photos) if _is_precise(p, options) == precise]
+        found, _ = most_similar(vectors, np.array(rows, dtype=np.int64), count)
+        for i, near in zip(rows, found.tolist(), strict=True):
+            for rank, j in enumerate(near):
+                if j >= 0:
+                    yield rank, i, j
+
+
+def _is_precise(photo: Photo, options: PairOptions) -> bool:
+    return photo.gps is not None and photo.gps.sigma_horizontal_m <= options.precise_sigma_m
 
 
 def _ordered(i: int, j: int) -> Pair:

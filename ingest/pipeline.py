@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -13,15 +13,23 @@ from typing import Any
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HEIGHT_DATUMS
+from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.store import Database
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
-from ingest.outcomes import map_outcome, photo_outcomes
+from ingest.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.photo import Photo
-from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, make_maps
+from ingest.reconstruction import (
+    Component,
+    MapMakingOptions,
+    Reconstructed,
+    Stage,
+    place_models,
+    reconstruct_photos,
+)
 from ingest.register.control.model import Survey
-from ingest.report import IngestReport, MapOutcome
+from ingest.report import IngestReport, MapOutcome, PhotoOutcome
 from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder
 from ingest.stage_clock import StageClock
 from ingest.workspace import Workspace, default_root, remove_leftovers
@@ -29,7 +37,9 @@ from ingest.workspace import Workspace, default_root, remove_leftovers
 logger = logging.getLogger(__name__)
 
 # Part of every map id; raised when the same photos and options would give another map.
-_MAP_VERSION = "photos-1"
+_MAP_VERSION = "photos-2"
+# Some hundred megabytes as rows of the tables; what a folder of a few hundred photos makes is one commit.
+_OBSERVATIONS_PER_COMMIT = 1_000_000
 _LIBRARIES = ("featuredb", "pycolmap", "opencv-contrib-python-headless", "numpy", "faiss-cpu")
 
 
@@ -43,11 +53,13 @@ class IngestOptions:
         gps_sigma_m: standard deviation of all positions, instead of what EXIF suggests; horizontal and
             vertical.
         name: of the maps, for people; default the folder's name.
-        workers: processes of extraction and matching; 1 runs everything in this process.
+        workers: processes; 1 runs everything in this process.
+        dask: address of a Dask scheduler, whose workers run the tasks instead.
         work: work folder; default inside the database (see ingest.workspace.default_root).
         stop_after: end after that stage and keep its results for the next run.
         survey: control points, which place the maps instead of the photos' GPS. A map's id does not depend
             on them: it is the photos' and the options', wherever it is placed.
+        vocabulary: for retrieval, instead of the one that comes with featuredb.
     """
 
     scan: ScanOptions = field(default_factory=ScanOptions)
@@ -55,9 +67,11 @@ class IngestOptions:
     gps_sigma_m: tuple[float, float] | None = None
     name: str = ""
     workers: int = field(default_factory=lambda: max(1, os.cpu_count() or 1))
+    dask: str | None = None
     work: Path | None = None
     stop_after: Stage | None = None
     survey: Survey | None = None
+    vocabulary: Vocabulary | None = None
 
     def __post_init__(self) -> None:
         if self.workers < 1:
@@ -75,7 +89,8 @@ class IngestOptions:
     @property
     def fingerprint(self) -> str:
         """Digest of what a map depends on besides the photos; not of the number of workers."""
-        return digest(_MAP_VERSION, options_fingerprint(self.making), repr(self.gps_sigma_m))[:16]
+        parts = [_MAP_VERSION, options_fingerprint(self.making), repr(self.gps_sigma_m)]
+        return digest(*parts, (self.vocabulary or shipped_vocabulary()).digest)[:16]
 
 
 def ingest_photos(
@@ -103,31 +118,32 @@ def ingest_photos(
     if options.stop_after == "scan":
         result = Reconstructed(stopped_after="scan")
     else:
-        with _executor(options) as executor:
-            result = make_maps(
+        with executor_of(options, shared=(root, folder)) as executor:
+            result = reconstruct_photos(
                 photos,
                 workspace,
                 options.making,
                 executor,
-                identity=lambda number: _identity(folder, options, job_id, number),
                 progress=progress,
                 clock=clock,
                 stop_after=options.stop_after,
-                survey=options.survey,
+                vocabulary=options.vocabulary,
             )
-    with clock.stage("commit"):
-        outcomes = _commit(database, result, options)
+    with clock.stage("build"):
+        outcomes, registered = _place_and_commit(
+            database, result, options, lambda number: _identity(folder, options, job_id, number), progress
+        )
     return IngestReport(
         job_id=job_id,
         database=database.url,
         folder=str(folder),
         started=started,
-        options=dataclasses.asdict(dataclasses.replace(options, survey=None)),
+        options=dataclasses.asdict(dataclasses.replace(options, survey=None, vocabulary=None)),
         versions=library_versions(),
-        pairs=result.pairs,
-        verified_pairs=result.verified_pairs,
+        pairs=len(result.pairs),
+        verified_pairs=len(result.inliers),
         stages=clock.timings,
-        photos=photo_outcomes(scanned.photos, result, options.stop_after),
+        photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
         warnings=_warnings(result, outcomes, options),
     )
@@ -168,8 +184,18 @@ def _with_sigmas(photos: Sequence[Photo], options: IngestOptions) -> list[Photo]
 
 
 @contextmanager
-def _executor(options: IngestOptions) -> Iterator[Executor]:
-    if options.workers == 1:
+def executor_of(options: IngestOptions, shared: Sequence[Path]) -> Iterator[Executor]:
+    """The executor that the options ask for.
+
+    Args:
+        shared: folders that all workers must see, the work folder first.
+    """
+    if options.dask is not None:
+        from ingest.executor.dask_cluster import DaskExecutor
+
+        with DaskExecutor(options.dask, shared=shared) as dask:
+            yield dask
+    elif options.workers == 1:
         yield InProcessExecutor()
     else:
         with PoolExecutor(options.workers) as pool:
@@ -187,6 +213,7 @@ def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) ->
             "job": job_id,
             "component": number,
             "versions": library_versions(),
+            "vocabulary": (options.vocabulary or shipped_vocabulary()).digest,
             "options": _plain(dataclasses.asdict(options.making)),
         },
     )
@@ -201,15 +228,48 @@ def _plain(value: Any) -> Any:
     return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
 
 
-def _commit(database: Database, result: Reconstructed, options: IngestOptions) -> tuple[MapOutcome, ...]:
-    """Make all placed maps visible in one commit; what became of each component."""
+def _place_and_commit(
+    database: Database,
+    result: Reconstructed,
+    options: IngestOptions,
+    identity: Callable[[int], MapIdentity],
+    progress: Progress,
+) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome]]:
+    """Place the models and make the maps visible; what became of each component and of its photos.
+
+    Maps are committed together until they are large: then the next ones go into another commit, so that
+    memory does not grow with the photos.
+    """
+    outcomes: list[MapOutcome] = []
+    registered: dict[str, PhotoOutcome] = {}
+    if options.stop_after not in (None, "build", "commit"):
+        return (), {}
+    batch: list[Component] = []
+    for component in place_models(result, options.making, identity=identity, survey=options.survey):
+        batch.append(component)
+        if sum(len(c.model.point_of) for c in batch) > _OBSERVATIONS_PER_COMMIT:
+            outcomes += _commit(database, batch, options)
+            registered |= _registered_all(batch, result)
+            batch = []
+    outcomes += _commit(database, batch, options)
+    registered |= _registered_all(batch, result)
+    progress("build", len(outcomes), len(outcomes))
+    return tuple(outcomes), registered
+
+
+def _registered_all(batch: Sequence[Component], result: Reconstructed) -> dict[str, PhotoOutcome]:
+    return {name: o for component in batch for name, o in registered_photos(component, result).items()}
+
+
+def _commit(database: Database, batch: Sequence[Component], options: IngestOptions) -> list[MapOutcome]:
+    """Make the placed maps visible in one commit; what became of each component."""
     created: dict[str, bool] = {}
-    maps = [c.feature_map for c in result.components if c.feature_map is not None]
-    if maps and options.stop_after in (None, "commit"):
+    maps = [c.feature_map for c in batch if c.feature_map is not None]
+    if options.stop_after == "build":
+        return []
+    if maps:
         created = {r.map_id: r.created for r in database.commit_maps(maps)}
-    elif options.stop_after == "build":
-        return ()
-    return tuple(map_outcome(c, created, options.making) for c in result.components)
+    return [map_outcome(c, created, options.making) for c in batch]
 
 
 def _warnings(
@@ -219,7 +279,7 @@ def _warnings(
         return (f"Stopped after {options.stop_after}, as asked; nothing beyond it was done.",)
     if not outcomes:
         return (
-            f"No reconstruction: {result.verified_pairs} of {result.pairs} pairs of photos have enough "
+            f"No reconstruction: {len(result.inliers)} of {len(result.pairs)} pairs of photos have enough "
             "verified matches. Photos of one place must overlap by more than half.",
         )
     if options.survey is not None and any(o.status == "already_there" for o in outcomes):

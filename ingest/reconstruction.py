@@ -1,11 +1,13 @@
 """From usable photos to placed feature maps: extract, pair, match, reconstruct, place, build.
 
 Each step leaves its result in the work folder, under a key of what it was made of; a step that finds
-its result there does nothing.
+its result there does nothing. What is in memory at a time does not grow with the photos but for tables of
+a few hundred bytes each: features and models are read when they are needed.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -15,18 +17,23 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.maps.feature_map import FeatureMap, Placement
-from ingest.colmap_bridge import Model, SfmPhoto, TwoView
+from ingest.clusters.graph import ClusterOptions, find_clusters
+from ingest.clusters.join import JoinOptions
+from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
+from ingest.colmap_bridge import Model
 from ingest.executor import Executor, Progress, no_progress
-from ingest.extract import PhotoFeatures, extract_photos, features_key, load_features
+from ingest.extract import FeatureFiles, PhotoFeatures, extract_photos, features_key, read_keypoints
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
-from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions
+from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions, more_pairs
 from ingest.photo import Photo
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.sfm import SfmOptions, SfmTask, reconstruct
+from ingest.retrieval.aggregate import aggregate_photos
+from ingest.sfm import SfmOptions, SfmView
 from ingest.stage_clock import StageClock
 from ingest.workspace import Workspace
 
@@ -51,6 +58,8 @@ class MapMakingOptions:
     extractor: ExtractorOptions = field(default_factory=ExtractorOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     matching: MatchOptions = field(default_factory=MatchOptions)
+    clusters: ClusterOptions = field(default_factory=ClusterOptions)
+    joining: JoinOptions = field(default_factory=JoinOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
     maps: MapOptions = field(default_factory=MapOptions)
@@ -90,19 +99,28 @@ class Reconstructed:
     """What came of the photos.
 
     Attributes:
-        components: largest first.
+        usable: photos whose features are there; all rows below are theirs.
+        features: of each of them, read when asked for.
+        reconstruction: models on disk.
+        components: placed models, largest cluster first; empty until they are placed.
         unreadable: photos by name whose pixels could not be read, with the reason.
+        lost: photos by name whose tasks ended every worker that ran them, with the reason.
         features_per_photo: number of features by photo name.
-        pairs, verified_pairs: pairs tried, and those with enough verified matches.
+        pairs: pairs tried, by row.
+        inliers: verified matches of the pairs that have enough of them.
         matches_per_photo: verified matches by photo name, summed over its pairs.
         stopped_after: the stage after which the caller wanted to stop, or None.
     """
 
+    usable: tuple[Photo, ...] = ()
+    features: FeatureFiles = field(default_factory=lambda: FeatureFiles(()))
+    reconstruction: Reconstruction = field(default_factory=Reconstruction)
     components: tuple[Component, ...] = ()
     unreadable: dict[str, str] = field(default_factory=dict)
+    lost: dict[str, str] = field(default_factory=dict)
     features_per_photo: dict[str, int] = field(default_factory=dict)
-    pairs: int = 0
-    verified_pairs: int = 0
+    pairs: tuple[Pair, ...] = ()
+    inliers: dict[Pair, int] = field(default_factory=dict)
     matches_per_photo: dict[str, int] = field(default_factory=dict)
     stopped_after: Stage | None = None
 
@@ -115,59 +133,96 @@ def make_maps(
     *,
     identity: Callable[[int], MapIdentity],
     progress: Progress = no_progress,
-    clock: StageClock | None = None,
-    stop_after: Stage | None = None,
     survey: Survey | None = None,
 ) -> Reconstructed:
-    """Reconstruct and place photos.
+    """Reconstruct and place photos; all maps at once in memory. See `reconstruct_photos`, `place_models`."""
+    done = reconstruct_photos(photos, workspace, options, executor, progress=progress)
+    return replace(done, components=tuple(place_models(done, options, identity=identity, survey=survey)))
+
+
+def reconstruct_photos(
+    photos: Sequence[Photo],
+    workspace: Workspace,
+    options: MapMakingOptions,
+    executor: Executor,
+    *,
+    progress: Progress = no_progress,
+    clock: StageClock | None = None,
+    stop_after: Stage | None = None,
+    vocabulary: Vocabulary | None = None,
+) -> Reconstructed:
+    """Features, pairs, matches, clusters and models of photos.
 
     Args:
         photos: usable ones, in a fixed order.
-        identity: of the map of the component with that number.
         stop_after: end there; what is done is kept for the next run.
-        survey: control points, which then place the maps instead of GPS.
+        vocabulary: for retrieval; the one that comes with featuredb if None.
     """
     clock = clock or StageClock()
     with clock.stage("extract") as counts:
         extracted = extract_photos(list(photos), workspace, options.extractor, executor, progress)
         counts |= {"reused": extracted.reused, "total": len(photos)}
-    usable = [p for p in photos if p.name not in extracted.unreadable]
+    usable = tuple(p for p in photos if p.name not in extracted.unreadable)
+    fingerprint = features_key(options.extractor)
+    features = FeatureFiles([workspace.features(fingerprint, p.sha256) for p in usable])
+    done = Reconstructed(usable=usable, features=features, unreadable=extracted.unreadable)
     if stop_after == "extract":
-        return Reconstructed(unreadable=extracted.unreadable, stopped_after="extract")
+        return replace(done, stopped_after="extract")
 
-    features = [load_features(workspace, options.extractor, p) for p in usable]
     cameras, camera_rows = photo_cameras(usable, options)
+    views = _views(usable, features, cameras, camera_rows)
+    words = vocabulary or shipped_vocabulary()
     with clock.stage("pairs"):
-        pairs = choose_pairs(usable, [f.features.descriptors for f in features], options.pairs)
+        vectors = None
+        if options.pairs.needs_vectors(len(usable)):
+            most = options.pairs.features_per_photo
+            vectors = aggregate_photos(features.paths, words, most, workspace, executor, progress)
+        pairs = choose_pairs(usable, vectors, options.pairs)
     with clock.stage("match") as counts:
-        matched = _match(usable, cameras, camera_rows, pairs, workspace, options, executor, progress)
-        counts |= {"reused": matched.reused, "total": len(pairs)}
-    done = Reconstructed(
-        unreadable=extracted.unreadable,
-        features_per_photo={p.name: len(f.features) for p, f in zip(usable, features, strict=True)},
-        pairs=len(pairs),
-        verified_pairs=len(matched.geometries),
-        matches_per_photo=_matches_per_photo(usable, matched.geometries),
+        names = [photo.name for photo in usable]
+        matched = match_pairs(views, pairs, workspace, options.matching, executor, progress, names)
+        more = more_pairs(len(usable), matched.inliers, pairs, options.pairs)
+        if more:
+            matched = matched | match_pairs(
+                views, more, workspace, options.matching, executor, progress, names
+            )
+        counts |= {"reused": matched.reused, "total": len(matched.files)}
+    done = replace(
+        done,
+        features_per_photo={
+            p.name: len(read_keypoints(f)) for p, f in zip(usable, features.paths, strict=True)
+        },
+        pairs=tuple(matched.files),
+        inliers=matched.inliers,
+        matches_per_photo=_matches_per_photo(usable, matched.inliers),
     )
     if stop_after == "match":
         return replace(done, stopped_after="match")
 
-    frame = local_frame_of(usable)
     with clock.stage("reconstruct") as counts:
-        task = _sfm_task(usable, features, cameras, camera_rows, matched.geometries, frame)
-        folder = workspace.job / f"models-{task.key(options.sfm)}"
-        counts |= {"reused": int(folder.is_dir()), "total": 1}
-        models = reconstruct(task, folder, options.sfm, progress)
-    if stop_after == "reconstruct":
-        return replace(done, stopped_after="reconstruct")
+        made = _reconstruct(done, cameras, camera_rows, matched, workspace, options, executor, progress)
+        counts |= {"reused": made.reused, "total": made.blocks}
+    lost = {usable[row].name: reason for row, reason in made.lost.items()}
+    stopped: Stage | None = "reconstruct" if stop_after == "reconstruct" else None
+    return replace(done, reconstruction=made, lost=lost, stopped_after=stopped)
 
-    with clock.stage("build"):
-        components = [
-            _component(model, usable, features, identity(number), options, survey)
-            for number, model in enumerate(models)
-        ]
-    progress("build", len(components), len(components))
-    return replace(done, components=tuple(components))
+
+def place_models(
+    done: Reconstructed,
+    options: MapMakingOptions,
+    *,
+    identity: Callable[[int], MapIdentity],
+    survey: Survey | None = None,
+) -> Iterator[Component]:
+    """Place every model and build its map; one at a time, so that the caller can commit and forget it.
+
+    Args:
+        identity: of the map of the component with that number.
+        survey: control points, which then place the maps instead of GPS.
+    """
+    for number, model in enumerate(done.reconstruction.models()):
+        features = done.features.of(model.rows)
+        yield _component(model, done.usable, features, identity(number), options, survey)
 
 
 def photo_cameras(
@@ -214,49 +269,51 @@ def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     )
 
 
-def _match(
+def _views(
     photos: Sequence[Photo],
+    features: FeatureFiles,
     cameras: Sequence[tuple[Camera, bool]],
     camera_rows: Sequence[int],
-    pairs: list[Pair],
+) -> list[PhotoView]:
+    return [
+        PhotoView(sha256=photo.sha256, features=path, camera=cameras[row][0], focal_known=cameras[row][1])
+        for photo, path, row in zip(photos, features.paths, camera_rows, strict=True)
+    ]
+
+
+def _reconstruct(
+    done: Reconstructed,
+    cameras: Sequence[tuple[Camera, bool]],
+    camera_rows: Sequence[int],
+    matched: Matched,
     workspace: Workspace,
     options: MapMakingOptions,
     executor: Executor,
     progress: Progress,
-) -> Matched:
-    fingerprint = features_key(options.extractor)
-    views = [
-        PhotoView(
-            sha256=photo.sha256,
-            features=workspace.features(fingerprint, photo.sha256),
-            camera=cameras[row][0],
-            focal_known=cameras[row][1],
-        )
-        for photo, row in zip(photos, camera_rows, strict=True)
+) -> Reconstruction:
+    photos, smallest = done.usable, options.sfm.min_model_photos
+    clusters = find_clusters(len(photos), matched.inliers, smallest, options.clusters)
+    views: list[SfmView] = [
+        SfmView(name=photo.name, camera_row=row, features=path)
+        for photo, row, path in zip(photos, camera_rows, done.features.paths, strict=True)
     ]
-    return match_pairs(views, pairs, workspace, options.matching, executor, progress)
-
-
-def _sfm_task(
-    photos: Sequence[Photo],
-    features: Sequence[PhotoFeatures],
-    cameras: Sequence[tuple[Camera, bool]],
-    camera_rows: Sequence[int],
-    geometries: dict[Pair, TwoView],
-    frame: LocalFrame | None,
-) -> SfmTask:
-    positions, sigmas = _priors(photos, frame)
-    sfm_photos = [
-        SfmPhoto(
-            name=photo.name,
-            camera_row=camera_rows[i],
-            keypoints=features[i].features.xy,
-            prior_position=positions[i] if np.isfinite(sigmas[i]).all() else None,
-            prior_covariance=np.diag(sigmas[i] ** 2),
-        )
-        for i, photo in enumerate(photos)
-    ]
-    return SfmTask(cameras=tuple(cameras), photos=tuple(sfm_photos), geometries=geometries)
+    for cluster in clusters:  # a frame for each: they may lie in different towns
+        chosen = [photos[row] for row in cluster.rows]
+        positions, sigmas = _priors(chosen, local_frame_of(chosen))
+        for row, position, sigma in zip(cluster.rows, positions.tolist(), sigmas.tolist(), strict=True):
+            if np.isfinite(sigma).all():
+                views[row] = replace(views[row], prior_position=tuple(position), prior_sigma_m=tuple(sigma))
+    return reconstruct_clusters(
+        clusters,
+        cameras,
+        views,
+        {pair: matched.files[pair] for pair in matched.inliers},
+        workspace,
+        options.sfm,
+        executor,
+        joining=options.joining,
+        progress=progress,
+    )
 
 
 def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
@@ -281,7 +338,12 @@ def _component(
     options: MapMakingOptions,
     survey: Survey | None,
 ) -> Component:
-    """Place one model and build its map where the placement is accepted."""
+    """Place one model and build its map where the placement is accepted.
+
+    Args:
+        photos: all usable ones.
+        features: of the model's.
+    """
     chosen = [photos[r] for r in model.rows]
     frame = local_frame_of(chosen)  # its own: components may lie in different towns
     positions, sigmas = _priors(chosen, frame)
@@ -297,8 +359,7 @@ def _component(
         reason=placed.message,
     )
     if survey is not None:
-        chosen_features = [features[r] for r in model.rows]
-        return _by_control(component, frame, chosen_features, identity, options, survey)
+        return _by_control(component, frame, features, identity, options, survey)
     if (
         placed.reason is not None
         or frame is None
@@ -313,9 +374,7 @@ def _component(
         residual_rms_m=placed.residual_rms_m,
         evidence=_evidence(placed, [chosen[i] for i in with_gps]),
     )
-    feature_map = build_map(
-        model, placement, frame, chosen, [features[r] for r in model.rows], identity, options.maps
-    )
+    feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
     if feature_map is None:
         return replace(
             component,
@@ -361,9 +420,9 @@ def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
     return placed.figures | {"residuals_enu_m": residuals, "outlier_photos": outliers}
 
 
-def _matches_per_photo(photos: Sequence[Photo], geometries: dict[Pair, TwoView]) -> dict[str, int]:
-    totals = dict.fromkeys((p.name for p in photos), 0)
-    for (i, j), view in geometries.items():
-        totals[photos[i].name] += len(view.inliers)
-        totals[photos[j].name] += len(view.inliers)
-    return totals
+def _matches_per_photo(photos: Sequence[Photo], inliers: Mapping[Pair, int]) -> dict[str, int]:
+    totals: Counter[str] = Counter(dict.fromkeys((p.name for p in photos), 0))
+    for (i, j), count in inliers.items():
+        totals[photos[i].name] += count
+        totals[photos[j].name] += count
+    return dict(totals)

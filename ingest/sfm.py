@@ -2,16 +2,18 @@
 
 import hashlib
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from featuredb.geometry.camera import Camera
 from ingest.colmap_adjust import AdjustOptions, adjust_models
-from ingest.colmap_bridge import Model, SfmPhoto, TwoView, read_models, run_incremental, write_database
-from ingest.executor import Progress, no_progress
-from ingest.workspace import atomic_folder
+from ingest.colmap_bridge import Model, SfmPhoto, TwoView, run_incremental, write_database
+from ingest.extract import read_keypoints
+from ingest.workspace import atomic_folder, read_arrays
 
 PriorUse = Literal["none", "bundle"]
 
@@ -50,67 +52,103 @@ class SfmOptions:
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SfmView:
+    """A photo of a reconstruction: what travels to a worker, which reads the rest from files.
+
+    Attributes:
+        name: unique.
+        camera_row: row of the cameras.
+        features: its features file, whose name is a digest of what it was made of.
+        prior_position: camera centre in a local metric frame, or None.
+        prior_sigma_m: standard deviations of the position.
+    """
+
+    name: str
+    camera_row: int
+    features: Path
+    prior_position: tuple[float, float, float] | None = None
+    prior_sigma_m: tuple[float, float, float] | None = None
+
+    def photo(self) -> SfmPhoto:
+        """With its keypoints."""
+        sigma = self.prior_sigma_m
+        return SfmPhoto(
+            name=self.name,
+            camera_row=self.camera_row,
+            keypoints=read_keypoints(self.features),
+            prior_position=None if self.prior_position is None else np.array(self.prior_position),
+            prior_covariance=None if sigma is None else np.diag(np.array(sigma) ** 2),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SfmTask:
-    """All that structure from motion needs.
+    """All that structure from motion of some photos needs; travels to a worker.
 
     Attributes:
         cameras: with whether the focal length is known from EXIF.
-        photos: their keypoints, cameras and priors.
-        geometries: two-view geometries of pairs of rows of `photos`.
+        views: the photos.
+        matches: files of the verified pairs of rows of `views`, sorted.
+        options: how they are reconstructed.
     """
 
     cameras: tuple[tuple[Camera, bool], ...]
-    photos: tuple[SfmPhoto, ...]
-    geometries: Mapping[tuple[int, int], TwoView]
+    views: tuple[SfmView, ...]
+    matches: tuple[tuple[int, int, Path], ...]
+    options: SfmOptions
 
-    def key(self, options: SfmOptions) -> str:
-        """Digest (16 characters) of the content: equal keys give equal models."""
-        content = hashlib.sha256(repr((self.cameras, options)).encode())
-        for photo in self.photos:
-            content.update(repr((photo.name, photo.camera_row)).encode())
-            content.update(photo.keypoints.tobytes())
-            if photo.prior_position is not None and photo.prior_covariance is not None:
-                content.update(photo.prior_position.tobytes() + photo.prior_covariance.tobytes())
-        for pair, view in sorted(self.geometries.items()):
-            content.update(repr(pair).encode() + view.inliers.tobytes())
-        return content.hexdigest()[:16]
+    def __str__(self) -> str:
+        return f"{len(self.views)} photos around {self.views[0].name}"
+
+    @property
+    def side_px(self) -> int:
+        """Longest side of all photos."""
+        return max(max(camera.width, camera.height) for camera, _ in self.cameras)
+
+    def key(self) -> str:
+        """Digest (24 characters) of the content: equal keys give equal models."""
+        content = hashlib.sha256(repr((self.cameras, self.options)).encode())
+        for view in self.views:
+            made_of = (view.features.parent.name, view.features.name)
+            content.update(repr((view.name, view.camera_row, made_of)).encode())
+            content.update(repr((view.prior_position, view.prior_sigma_m)).encode())
+        for i, j, file in self.matches:
+            content.update(repr((i, j, file.parent.parent.name, file.name)).encode())
+        return content.hexdigest()[:24]
+
+    def write_database(self, path: Path) -> tuple[SfmPhoto, ...]:
+        """COLMAP's database of the photos and their pairs; the photos as they were read."""
+        photos = tuple(view.photo() for view in self.views)
+        geometries = {(i, j): TwoView(**read_arrays(file)) for i, j, file in self.matches}
+        write_database(path, self.cameras, photos, geometries)
+        return photos
 
 
-def reconstruct(
-    task: SfmTask, folder: Path, options: SfmOptions, progress: Progress = no_progress
-) -> list[Model]:
-    """Reconstruct, or read what an earlier run left in `folder`.
-
-    Returns:
-        Models with at least `min_model_photos` photos, largest first. A photo is in one model only.
-    """
-    if not folder.is_dir():
-        with atomic_folder(folder) as temporary:
-            _map(task, temporary, options, progress)
-    progress("reconstruct", len(task.photos), len(task.photos))
-    return disjoint(read_models(folder), options.min_model_photos)
-
-
-def _map(task: SfmTask, folder: Path, options: SfmOptions, progress: Progress) -> None:
-    if not task.geometries:
+def reconstruct(task: SfmTask, folder: Path) -> None:
+    """Reconstruct into `folder`, one numbered COLMAP model each connected part; nothing if it is there."""
+    if folder.is_dir():
         return
-    side = max(max(camera.width, camera.height) for camera, _ in task.cameras)
-    registered = 2  # COLMAP tells of each photo after the first pair
-
-    def on_photo() -> None:
-        nonlocal registered
-        registered = min(registered + 1, len(task.photos) - 1)
-        progress("reconstruct", registered, len(task.photos))
-
-    with tempfile.TemporaryDirectory(prefix="featuredb-sfm-") as scratch:
+    with atomic_folder(folder) as output, tempfile.TemporaryDirectory(prefix="featuredb-sfm-") as scratch:
+        if not task.matches:
+            return
+        options = task.options
         database = Path(scratch) / "colmap.db"
-        write_database(database, task.cameras, task.photos, task.geometries)
-        run_incremental(database, Path(scratch), folder, mapping_settings(options, side), on_photo)
-        # A SIFT keypoint is good to about half a pixel of the image that it was found on.
-        scale_px = 0.5 * max(1.0, side / options.error_reference_side_px)
-        adjust = replace(options.adjust, refine_focal=options.adjust.refine_focal and options.refine_focal)
-        adjust_models(folder, database, task.photos, scale_px, adjust)
+        photos = task.write_database(database)
+        run_incremental(
+            database, Path(scratch), output, mapping_settings(options, task.side_px), lambda: None
+        )
+        adjust_models(output, database, photos, loss_scale_px(task), adjust_options(options))
+
+
+def loss_scale_px(task: SfmTask) -> float:
+    """A SIFT keypoint is good to about half a pixel of the image that it was found on."""
+    return 0.5 * max(1.0, task.side_px / task.options.error_reference_side_px)
+
+
+def adjust_options(options: SfmOptions) -> AdjustOptions:
+    """Of the final adjustment: the focal length is free there only if it is anywhere."""
+    return replace(options.adjust, refine_focal=options.adjust.refine_focal and options.refine_focal)
 
 
 def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:

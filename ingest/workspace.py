@@ -2,8 +2,8 @@
 
 Every file is keyed by what it was made of (digests of the photos' bytes, fingerprints of the options),
 written under a temporary name, flushed to the disk and then renamed: a file that is there is complete.
-Per-photo and per-pair results are shared by all jobs of a database; what depends on the whole photo set
-lies in the job's own folder.
+All jobs of a database share them: photos that come later reuse what the earlier ones left, up to whole
+reconstructions of neighbourhoods in which nothing changed.
 """
 
 import hashlib
@@ -40,14 +40,17 @@ class Workspace:
     root: Path
     job_id: str
 
-    @property
-    def job(self) -> Path:
-        """Results that depend on the whole set of photos."""
-        return self.root / "jobs" / self.job_id
-
     def features(self, fingerprint: str, sha256: str) -> Path:
         """The features of one photo under the given extractor options."""
         return self.root / "features" / fingerprint / f"{sha256}.npz"
+
+    def aggregated(self, vocabulary: str, fingerprint: str, sha256: str) -> Path:
+        """The aggregated descriptor of one photo by a vocabulary."""
+        return self.root / "aggregated" / vocabulary / fingerprint / sha256[:2] / f"{sha256}.npz"
+
+    def models(self, key: str) -> Path:
+        """Reconstructions of a set of photos, by a digest of all that they are made of."""
+        return self.root / "models" / key[:2] / key
 
     def matches(self, fingerprint: str, sha256_a: str, sha256_b: str) -> Path:
         """The verified matches of one pair under the given options."""
@@ -139,6 +142,17 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return {name: archive[name] for name in archive.files}
     except (OSError, ValueError, BadZipFile) as error:
         raise IngestError(f"{path}: expected a stage's npz file, {error}; delete it and run again") from error
+
+
+def read_array(path: Path, name: str) -> NDArray[Any]:
+    """One array of an npz file that `write_arrays` wrote; the others are not read."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return np.asarray(archive[name])
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise IngestError(
+            f"{path}: expected a stage's npz file with {name!r}, {error}; delete it and run again"
+        ) from error
 
 
 def remove_leftovers(root: Path) -> int:

@@ -66,10 +66,11 @@ def _inliers(groups: list[list[Photo]], out: Path, workers: int) -> list[tuple[b
     with PoolExecutor(workers) as executor:
         extract_photos(photos, workspace, making.extractor, executor)
         matched = match_pairs(views, pairs, workspace, making.matching, executor)
-    return [
-        (group_of[i] == group_of[j], int(view.candidates), len(view.inliers))
-        for (i, j), view in matched.geometries.items()
-    ]
+    counts = []
+    for i, j in matched.inliers:
+        view = matched.geometry((i, j))
+        counts.append((group_of[i] == group_of[j], int(view.candidates), len(view.inliers)))
+    return counts
 
 
 def _write(counts: list[tuple[bool, int, int]], out: Path) -> None:

@@ -8,11 +8,11 @@ import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model, SfmPhoto
+from ingest.colmap_bridge import Model
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.photo import Photo
 from ingest.reconstruction import MapMakingOptions, local_frame_of, photo_cameras
-from ingest.sfm import SfmOptions, SfmTask, disjoint, mapping_settings
+from ingest.sfm import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
 
 _PHOTO = Photo(
@@ -88,18 +88,21 @@ def test_pixel_thresholds_grow_with_the_image() -> None:
 
 
 def test_keys_follow_the_content() -> None:
-    photo = SfmPhoto(name="a.jpg", camera_row=0, keypoints=np.zeros((3, 2), np.float32))
-    task = SfmTask(cameras=((CAMERA, True),), photos=(photo,), geometries={})
-    moved = replace(photo, keypoints=photo.keypoints + np.float32(1))
-    placed = replace(photo, prior_position=np.zeros(3), prior_covariance=np.eye(3))
-    keys = {
-        task.key(SfmOptions()),
-        task.key(SfmOptions(seed=1)),
-        replace(task, photos=(moved,)).key(SfmOptions()),
-        replace(task, photos=(placed,)).key(SfmOptions()),
-    }
-    assert len(keys) == 4
-    assert task.key(SfmOptions()) == replace(task, photos=(replace(photo),)).key(SfmOptions())
+    view = SfmView(name="a.jpg", camera_row=0, features=Path("work/features/sift/aa.npz"))
+    task = SfmTask(cameras=((CAMERA, True),), views=(view,), matches=(), options=SfmOptions())
+    others = [
+        replace(task, options=SfmOptions(seed=1)),
+        replace(task, views=(replace(view, features=Path("work/features/sift/bb.npz")),)),
+        replace(task, views=(replace(view, features=Path("work/features/other/aa.npz")),)),
+        replace(
+            task, views=(replace(view, prior_position=(0.0, 0.0, 0.0), prior_sigma_m=(1.0, 1.0, 1.0)),)
+        ),
+        replace(task, matches=((0, 1, Path("work/matches/ratio/aa/aa_bb.npz")),)),
+    ]
+    assert len({task.key(), *(other.key() for other in others)}) == 6
+    # Where the work folder lies does not matter.
+    elsewhere = replace(view, features=Path("/mnt/features/sift/aa.npz"))
+    assert replace(task, views=(elsewhere,)).key() == task.key()
 
 
 def test_fingerprints_tell_options_apart_and_digests_do_not_run_together() -> None:

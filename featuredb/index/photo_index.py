@@ -1,0 +1,44 @@
+"""Photos that look alike, among many, by their aggregated descriptors."""
+
+import faiss
+import numpy as np
+from numpy.typing import NDArray
+
+_CHUNK = 1024  # queries at a time: bounds the float32 copies
+
+
+def most_similar(
+    vectors: NDArray[np.float16], rows: NDArray[np.int64], k: int
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """The k photos most similar to each of some photos, without themselves, best first.
+
+    An exhaustive search: 5,000 photos with 4,096 numbers each take seconds, and its share of an ingest's time
+    is below one percent up to some 50,000. Photos without any features (zeros) find and are found by none.
+
+    Args:
+        vectors: (n, d) of all photos, of unit length.
+        rows: (m,) photos that ask.
+
+    Returns:
+        Rows (m, k) int64, -1 where there are fewer, and cosines (m, k) float32.
+    """
+    found = np.full((len(rows), k), -1, np.int64)
+    cosines = np.full((len(rows), k), -1.0, np.float32)
+    count = min(k + 1, len(vectors))
+    if count < 2 or not len(rows):
+        return found, cosines
+    base = vectors.astype(np.float32)
+    before = faiss.omp_get_max_threads()
+    faiss.omp_set_num_threads(1)  # see featuredb.index.nearest
+    try:
+        for start in range(0, len(rows), _CHUNK):
+            own = rows[start : start + _CHUNK]
+            score, row = faiss.knn(base[own], base, count, metric=faiss.METRIC_INNER_PRODUCT)
+            for place, (me, near, cosine) in enumerate(zip(own, row, score, strict=True), start=start):
+                good = (near != me) & (cosine > 0.0)
+                best = near[good][:k]
+                found[place, : len(best)] = best
+                cosines[place, : len(best)] = cosine[good][:k]
+    finally:
+        faiss.omp_set_num_threads(before)
+    return found, cosines

@@ -1,0 +1,154 @@
+"""Visual words that many photos' descriptors have in common, and one vector for each photo made of them.
+
+VLAD (Jegou et al., Aggregating local descriptors into a compact image representation, 2010) over descriptors
+reduced by principal components, with residuals of unit length (Delhumeau et al., Revisiting the VLAD image
+representation, 2013) and intra-normalisation (Arandjelovic and Zisserman, All about VLAD, 2013).
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.geometry.arrays import frozen_array
+from featuredb.index.codebook import kmeans
+
+_SHIPPED = "vocabulary.npz"
+_ARRAYS = ("mean", "projection", "words")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Vocabulary:
+    """Trained once, never changed: vectors of different vocabularies cannot be compared.
+
+    Attributes:
+        mean: (128,) float32 of the descriptors.
+        projection: (128, d) float32, orthonormal columns: their first principal components.
+        words: (k, d) float32 cluster centres of the projected descriptors.
+    """
+
+    mean: NDArray[np.float32]
+    projection: NDArray[np.float32]
+    words: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        k, d = np.shape(self.words) if np.ndim(self.words) == 2 else (0, 0)
+        shapes = {"mean": (DESCRIPTOR_SIZE,), "projection": (DESCRIPTOR_SIZE, d), "words": (k, d)}
+        for name, shape in shapes.items():
+            value = frozen_array(f"Vocabulary.{name}", getattr(self, name), shape, np.float32)
+            object.__setattr__(self, name, value)
+        if not k or not d:
+            raise InvalidValueError("Vocabulary.words: expected (k, d) with k, d > 0, found none")
+
+    @property
+    def size(self) -> int:
+        """Length of a photo's vector."""
+        return self.words.size
+
+    @property
+    def digest(self) -> str:
+        """16 hex digits that name this vocabulary."""
+        content = hashlib.sha256()
+        for name in _ARRAYS:
+            array = getattr(self, name)
+            content.update(repr(array.shape).encode() + array.tobytes())
+        return content.hexdigest()[:16]
+
+    def aggregate(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """One vector (size,) of unit length for a photo's descriptors (n, 128); zeros where there are none."""
+        total = np.zeros_like(self.words)
+        if len(descriptors):
+            projected = (descriptors.astype(np.float32) - self.mean) @ self.projection
+            half_norm = 0.5 * (self.words**2).sum(axis=1)
+            word = np.argmax(projected @ self.words.T - half_norm, axis=1)
+            np.add.at(total, word, _unit(projected - self.words[word]))
+        vector = _unit(total).ravel()
+        return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-12), dtype=np.float32)
+
+    def to_bytes(self) -> bytes:
+        """As an npz file."""
+        buffer = BytesIO()
+        np.savez(buffer, **{name: getattr(self, name) for name in _ARRAYS})
+        return buffer.getvalue()
+
+
+def train_vocabulary(
+    descriptors: Sequence[NDArray[np.uint8]],
+    *,
+    words: int = 128,
+    dimensions: int = 32,
+    per_photo: int = 1500,
+    seed: int = 0,
+) -> Vocabulary:
+    """Principal components and k-means of some descriptors of each photo, with fixed random choices.
+
+    Args:
+        descriptors: (n, 128) of each photo.
+        per_photo: descriptors taken of each.
+
+    Raises:
+        InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
+    """
+    generator = np.random.default_rng(seed)
+    parts = []
+    for photo in descriptors:
+        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
+        parts.append(photo[np.sort(rows)].astype(np.float32))
+    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
+    if len(samples) < 40 * words:
+        raise InvalidValueError(
+            f"train_vocabulary: expected at least {40 * words} descriptors for {words} words, found "
+            f"{len(samples)}; give more photos"
+        )
+    mean = samples.mean(axis=0, dtype=np.float64)
+    _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
+    projection = vectors[:, ::-1][:, :dimensions]
+    projection = projection * np.sign(projection[np.abs(projection).argmax(axis=0), np.arange(dimensions)])
+    projected = ((samples - mean) @ projection).astype(np.float32)
+    return Vocabulary(
+        mean=mean.astype(np.float32),
+        projection=projection.astype(np.float32),
+        words=kmeans(projected, words, seed, iterations=25).astype(np.float32),
+    )
+
+
+def shipped_vocabulary() -> Vocabulary:
+    """The one that comes with featuredb; tools/train_vocabulary.py made it."""
+    data = resources.files("featuredb.index").joinpath("data", _SHIPPED).read_bytes()
+    return _read(data, _SHIPPED)
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """A vocabulary that `to_bytes` wrote.
+
+    Raises:
+        InvalidValueError: the file cannot be read or is something else.
+    """
+    try:
+        return _read(path.read_bytes(), str(path))
+    except OSError as error:
+        raise InvalidValueError(f"{path}: expected a vocabulary, found: {error.strerror or error}") from error
+
+
+def _read(data: bytes, name: str) -> Vocabulary:
+    try:
+        with np.load(BytesIO(data), allow_pickle=False) as archive:
+            arrays: dict[str, Any] = {key: archive[key] for key in _ARRAYS}
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise InvalidValueError(f"{name}: expected a vocabulary (npz), found: {error}") from error
+    return Vocabulary(**arrays)
+
+
+def _unit(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rows of unit length; zeros stay."""
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(rows / np.maximum(lengths, 1e-12), dtype=np.float32)

@@ -1,0 +1,310 @@
+"""Stage: structure from motion of clusters. Blocks are tasks, joining a cluster's blocks is one more."""
+
+import logging
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from ingest.clusters.graph import Block, Cluster
+from ingest.clusters.join import Joined, JoinOptions, join
+from ingest.colmap_adjust import adjust_posed
+from ingest.colmap_bridge import Model, read_models, write_posed
+from ingest.executor import Executor, Lost, Progress, no_progress
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.pairs import Pair
+from ingest.sfm import (
+    SfmOptions,
+    SfmTask,
+    SfmView,
+    adjust_options,
+    disjoint,
+    loss_scale_px,
+    reconstruct,
+)
+from ingest.workspace import Workspace, atomic_folder
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelFiles:
+    """The reconstructions of one cluster, on disk.
+
+    Attributes:
+        folder: of numbered COLMAP models.
+        rows: (n,) photos by the rows that the models name.
+        min_photos: smaller models do not count.
+    """
+
+    folder: Path
+    rows: tuple[int, ...]
+    min_photos: int
+
+    def load(self) -> list[Model]:
+        """Models, largest first, whose `rows` are those of all photos. A photo is in one of them only."""
+        rows = np.array(self.rows, dtype=np.int64)
+        models = disjoint(read_models(self.folder), self.min_photos)
+        return [replace(model, rows=rows[model.rows]) for model in models]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reconstruction:
+    """What the stage did.
+
+    Attributes:
+        clusters: one entry each cluster, largest cluster first.
+        reused: blocks that were reconstructed already.
+        blocks: all blocks.
+        lost: photos by row whose block or cluster could not be reconstructed, with the reason.
+    """
+
+    clusters: tuple[ModelFiles, ...] = ()
+    reused: int = 0
+    blocks: int = 0
+    lost: dict[int, str] = field(default_factory=dict)
+
+    def models(self) -> Iterator[Model]:
+        """All models, one cluster's in memory at a time."""
+        for cluster in self.clusters:
+            yield from cluster.load()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _BlockTask:
+    """One block; travels to a worker."""
+
+    sfm: SfmTask
+    folder: Path
+
+    def __str__(self) -> str:
+        return str(self.sfm)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _JoinTask:
+    """A cluster of several blocks; travels to a worker.
+
+    Attributes:
+        sfm: of all photos of the cluster.
+        blocks: folder of each block's models.
+        rows: of each block, into the views of `sfm`; what its models' rows count.
+        own: of each block, those that are in no other block.
+        folder: where the result goes.
+    """
+
+    sfm: SfmTask
+    blocks: tuple[Path, ...]
+    rows: tuple[tuple[int, ...], ...]
+    own: tuple[frozenset[int], ...]
+    options: JoinOptions
+    folder: Path
+
+    def __str__(self) -> str:
+        return f"{len(self.blocks)} blocks, {self.sfm}"
+
+
+def reconstruct_clusters(
+    clusters: Sequence[Cluster],
+    cameras: Sequence[tuple[Camera, bool]],
+    views: Sequence[SfmView],
+    matches: Mapping[Pair, Path],
+    workspace: Workspace,
+    options: SfmOptions,
+    executor: Executor,
+    *,
+    joining: JoinOptions,
+    progress: Progress = no_progress,
+) -> Reconstruction:
+    """Reconstruct clusters, or find what an earlier run left of them.
+
+    Args:
+        cameras: with whether the focal length is known beforehand.
+        views: all photos; clusters name their rows.
+        matches: files of the verified pairs.
+    """
+    tasks_of = _Tasks(cameras, views, matches)
+    whole = [tasks_of.make(c.rows, options) for c in clusters]
+    rough = replace(options, adjust=replace(options.adjust, fuller_lens=False))
+    block_tasks: list[list[_BlockTask]] = []
+    for cluster, task in zip(clusters, whole, strict=True):
+        # Of several blocks the lens is for the whole cluster to tell.
+        alone = len(cluster.blocks) == 1
+        sfms = [task] if alone else [tasks_of.make(b.rows, rough) for b in cluster.blocks]
+        block_tasks.append([_BlockTask(sfm=s, folder=workspace.models(s.key())) for s in sfms])
+
+    todo = [t for tasks in block_tasks for t in tasks if not t.folder.is_dir()]
+    todo.sort(key=lambda t: -len(t.sfm.views))  # the longest first, so that no worker is late with it
+    outcomes = executor.map("reconstruct", _reconstruct_block, todo, progress)
+    failed = {t.folder: o.reason for t, o in zip(todo, outcomes, strict=True) if isinstance(o, Lost)}
+
+    joins = [
+        _join_task(cluster, task, tasks, failed, workspace, joining)
+        for cluster, task, tasks in zip(clusters, whole, block_tasks, strict=True)
+        if len(cluster.blocks) > 1
+    ]
+    waiting = [j for j in joins if not j.folder.is_dir()]
+    joined = executor.map("join", _join_blocks, waiting, progress)
+    failed |= {t.folder: o.reason for t, o in zip(waiting, joined, strict=True) if isinstance(o, Lost)}
+    return _collected(clusters, block_tasks, joins, failed, options, reused=_count(block_tasks) - len(todo))
+
+
+def _count(tasks: Sequence[Sequence[object]]) -> int:
+    return sum(len(t) for t in tasks)
+
+
+def _collected(
+    clusters: Sequence[Cluster],
+    block_tasks: Sequence[Sequence[_BlockTask]],
+    joins: Sequence[_JoinTask],
+    failed: Mapping[Path, str],
+    options: SfmOptions,
+    reused: int,
+) -> Reconstruction:
+    """Where each cluster's models are, and what is lost."""
+    results: list[ModelFiles] = []
+    lost: dict[int, str] = {}
+    joined = iter(joins)
+    for cluster, tasks in zip(clusters, block_tasks, strict=True):
+        for block, task in zip(cluster.blocks, tasks, strict=True):
+            if task.folder in failed:
+                lost |= dict.fromkeys(block.own, failed[task.folder])
+        folder = next(joined).folder if len(cluster.blocks) > 1 else tasks[0].folder
+        if folder in failed:
+            lost |= dict.fromkeys(cluster.rows, failed[folder])
+        else:
+            results.append(ModelFiles(folder=folder, rows=cluster.rows, min_photos=options.min_model_photos))
+    return Reconstruction(clusters=tuple(results), reused=reused, blocks=_count(block_tasks), lost=lost)
+
+
+class _Tasks:
+    """Makes the task of some photos, with their cameras and pairs numbered anew."""
+
+    def __init__(
+        self,
+        cameras: Sequence[tuple[Camera, bool]],
+        views: Sequence[SfmView],
+        matches: Mapping[Pair, Path],
+    ) -> None:
+        self._cameras, self._views = cameras, views
+        self._of_photo: dict[int, list[tuple[int, Path]]] = {}
+        for (i, j), file in sorted(matches.items()):
+            self._of_photo.setdefault(i, []).append((j, file))
+
+    def make(self, rows: Sequence[int], options: SfmOptions) -> SfmTask:
+        """Structure from motion of the photos of these rows, which rise."""
+        used = sorted({self._views[row].camera_row for row in rows})
+        place = {row: k for k, row in enumerate(rows)}
+        return SfmTask(
+            cameras=tuple(self._cameras[c] for c in used),
+            views=tuple(
+                replace(self._views[row], camera_row=used.index(self._views[row].camera_row)) for row in rows
+            ),
+            matches=tuple(
+                (place[i], place[j], file)
+                for i in rows
+                for j, file in self._of_photo.get(i, ())
+                if j in place
+            ),
+            options=options,
+        )
+
+
+def _join_task(
+    cluster: Cluster,
+    sfm: SfmTask,
+    tasks: Sequence[_BlockTask],
+    failed: Mapping[Path, str],
+    workspace: Workspace,
+    options: JoinOptions,
+) -> _JoinTask:
+    place = {row: k for k, row in enumerate(cluster.rows)}
+
+    def rows(of: Sequence[int]) -> tuple[int, ...]:
+        return tuple(place[row] for row in of)
+
+    good: list[tuple[Block, _BlockTask]] = [
+        (b, t) for b, t in zip(cluster.blocks, tasks, strict=True) if t.folder not in failed
+    ]
+    key = digest(sfm.key(), options_fingerprint(options), *(t.folder.name for _, t in good))[:24]
+    return _JoinTask(
+        sfm=sfm,
+        blocks=tuple(t.folder for _, t in good),
+        rows=tuple(rows(b.rows) for b, _ in good),
+        own=tuple(frozenset(rows(b.own)) for b, _ in good),
+        options=options,
+        folder=workspace.models(key),
+    )
+
+
+def _reconstruct_block(task: _BlockTask) -> None:
+    reconstruct(task.sfm, task.folder)
+
+
+def _join_blocks(task: _JoinTask) -> None:
+    """Join the models of a cluster's blocks and adjust each of what comes of it."""
+    if task.folder.is_dir():
+        return
+    models, own = _block_models(task)
+    with (
+        atomic_folder(task.folder) as output,
+        tempfile.TemporaryDirectory(prefix="featuredb-join-") as scratch,
+    ):
+        if not models:
+            return
+        database = Path(scratch) / "colmap.db"
+        photos = task.sfm.write_database(database)
+        taken: set[int] = set()
+        for number, group in enumerate(join(models, task.options)):
+            poses = {r: p for r, p in _poses(group, models, own).items() if r not in taken}
+            if len(poses) < task.sfm.options.min_model_photos:
+                continue
+            folder = output / str(number)
+            folder.mkdir()
+            write_posed(folder, _cameras(group, models, task.sfm), photos, poses)
+            kept = adjust_posed(
+                folder, database, photos, loss_scale_px(task.sfm), adjust_options(task.sfm.options)
+            )
+            taken |= {int(row) for row in kept}
+
+
+def _block_models(task: _JoinTask) -> tuple[list[Model], list[frozenset[int]]]:
+    """All models of all blocks with the cluster's rows, and the block's own rows beside each."""
+    models, own = [], []
+    for folder, rows, mine in zip(task.blocks, task.rows, task.own, strict=True):
+        number: NDArray[np.int64] = np.array(rows, dtype=np.int64)
+        for model in disjoint(read_models(folder), task.sfm.options.min_model_photos):
+            models.append(replace(model, rows=number[model.rows]))
+            own.append(mine)
+    return models, own
+
+
+def _poses(group: Joined, models: Sequence[Model], own: Sequence[frozenset[int]]) -> dict[int, Rigid3]:
+    """Pose of every photo of the group: of the block whose own it is, where that has registered it."""
+    poses: dict[int, Rigid3] = {}
+    for mine in (True, False):
+        for member, sim in zip(group.members, group.first_from, strict=True):
+            for row, pose in zip(models[member].rows.tolist(), models[member].cam_from_sfm, strict=True):
+                if row not in poses and (row in own[member]) == mine:
+                    poses[row] = sim.act_on_pose(pose)
+    return dict(sorted(poses.items()))
+
+
+def _cameras(group: Joined, models: Sequence[Model], sfm: SfmTask) -> list[Camera]:
+    """Cameras of the cluster, each as the member with most of its photos has it."""
+    cameras = [camera for camera, _ in sfm.cameras]
+    most = [0] * len(cameras)
+    for member in group.members:
+        model = models[member]
+        counts = np.bincount(model.camera_of, minlength=len(model.cameras))
+        for row, index in zip(model.rows.tolist(), model.camera_of.tolist(), strict=True):
+            camera_row = sfm.views[row].camera_row
+            if counts[index] > most[camera_row]:
+                most[camera_row] = int(counts[index])
+                cameras[camera_row] = model.cameras[index]
+    return cameras
