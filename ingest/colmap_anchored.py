@@ -5,7 +5,7 @@ Like ingest.colmap_bridge and ingest.colmap_adjust this module knows pycolmap's 
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,7 @@ def adjust_anchored(
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
     """
-    observation = np.ones(len(model.point_of), dtype=np.bool_)
+    observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     state = model
     for _ in range(options.rounds):
@@ -102,7 +102,7 @@ def adjust_anchored(
         observation, kept = _fitting(state, keypoints, fixed, options)
         observation &= _in_tracks(state, observation)
     return Anchored(
-        model=_only(state, observation),
+        model=with_observations(state, observation),
         fixed_kept=kept,
         old_point=np.unique(state.point_of[observation]),
     )
@@ -143,18 +143,12 @@ def _adjusted(
     xyz = model.xyz.copy()
     for point, point_id in free_ids.items():
         xyz[point] = reconstruction.point3D(point_id).xyz
-    return Model(
+    poses = [reconstruction.image(k + 1).cam_from_world().matrix() for k in range(len(model.rows))]
+    return replace(
+        model,
         cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c + 1)) for c in range(len(model.cameras))),
-        rows=model.rows,
-        camera_of=model.camera_of,
-        cam_from_sfm=tuple(
-            Rigid3.from_matrix(np.asarray(reconstruction.image(k + 1).cam_from_world().matrix()))
-            for k in range(len(model.rows))
-        ),
+        cam_from_sfm=tuple(Rigid3.from_matrix(np.asarray(pose)) for pose in poses),
         xyz=xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        keypoint_of=model.keypoint_of,
     )
 
 
@@ -260,14 +254,11 @@ def _in_tracks(model: Model, observation: NDArray[np.bool_]) -> NDArray[np.bool_
     return np.asarray(counts[model.point_of] >= 2)
 
 
-def _only(model: Model, observation: NDArray[np.bool_]) -> Model:
-    """The model with the chosen observations and the points that they see."""
+def with_observations(model: Model, observation: NDArray[np.bool_]) -> Model:
+    """The model with the chosen observations (m,) and the points that they see."""
     points, point_of = np.unique(model.point_of[observation], return_inverse=True)
-    return Model(
-        cameras=model.cameras,
-        rows=model.rows,
-        camera_of=model.camera_of,
-        cam_from_sfm=model.cam_from_sfm,
+    return replace(
+        model,
         xyz=model.xyz[points],
         point_of=point_of.reshape(-1),
         photo_of=model.photo_of[observation],

@@ -6,7 +6,7 @@ localised photo is never enough.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_anchored import triangulate_posed
+from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, triangulate_posed
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.localised import in_frame
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
@@ -77,10 +77,10 @@ class PairCheck:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Group:
-    """Photos that vouch for each other, as a model in metres.
+    """Photos that vouch for each other.
 
     Attributes:
-        model: poses and lenses of the localisations, points triangulated from their matches.
+        model: of their matches alone, with the lenses of the localisations; near their poses.
         new: rows that are new; the other rows of the model are photos of existing maps.
         checks: of the pairs that agree.
     """
@@ -254,7 +254,11 @@ def _triangulated(
     geometries: Mapping[tuple[int, int], TwoView],
     features_of: FeaturesOf,
 ) -> Model:
-    """A model of the group's poses with points from its verified matches; rows are those of the photos."""
+    """A model of the group from its verified matches; rows are those of the photos.
+
+    The localisations' poses are the start; then the model is adjusted to its matches alone, in a gauge of its
+    own. Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
+    """
     place = {r: k for k, r in enumerate(rows)}
     sfm = [
         SfmPhoto(name=str(r), camera_row=k, keypoints=features_of(r).features.xy) for k, r in enumerate(rows)
@@ -265,13 +269,7 @@ def _triangulated(
         [photos[r].cam_from_local for r in rows],
         {(place[a], place[b]): view for (a, b), view in geometries.items()},
     )
-    return Model(
-        cameras=model.cameras,
-        rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64),
-        camera_of=model.camera_of,
-        cam_from_sfm=model.cam_from_sfm,
-        xyz=model.xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        keypoint_of=model.keypoint_of,
-    )
+    keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
+    lenses = range(len(model.cameras))
+    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses, AnchoredOptions()).model
+    return replace(free, rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64))

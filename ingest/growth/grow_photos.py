@@ -73,7 +73,14 @@ def grow_photos(
     for group in groups:
         members = {r: p for r, p in {**bystanders, **lone}.items() if r in set(group.model.rows.tolist())}
         outcome = grow_component(
-            group.model, photos, features_of, members, areas, identity(group.new), options.grow
+            group.model,
+            photos,
+            features_of,
+            members,
+            areas,
+            identity(group.new),
+            options.grow,
+            needed=group.new,
         )
         if isinstance(outcome, GrownMap):
             maps.append(outcome)

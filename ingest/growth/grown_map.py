@@ -13,7 +13,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
-from ingest.colmap_anchored import Anchored, FixedPoints
+from featuredb.maps.move import covariance_in_frame
+from ingest.colmap_anchored import Anchored, FixedPoints, with_observations
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors, find_anchors
@@ -21,7 +22,6 @@ from ingest.growth.localised import in_frame
 from ingest.growth.placement import (
     Held,
     PlacementOptions,
-    covariance_in,
     largest_sigma_m,
     map_agreements,
     place_by_maps,
@@ -58,14 +58,18 @@ def grow_component(
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
     options: GrowOptions | None = None,
+    needed: Sequence[int] = (),
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
+
+    Photos whose own localisation contradicts the placement are left out of the map.
 
     Args:
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
         identity: of the new map.
+        needed: rows of photos without which there is nothing to add.
     """
     options = options or GrowOptions()
     rows = tuple(int(r) for r in model.rows)
@@ -85,15 +89,24 @@ def grow_component(
         return Refused(
             reason=placement.reason or "", message=placement.message, rows=rows, gates=placement.gates
         )
-    good = anchors.take(np.flatnonzero(held.used))
+    if needed and set(needed) <= set(placement.disagreeing):
+        return Refused(
+            reason="PHOTOS_DISAGREE",
+            message="the new photos contradict the placement that photos of existing maps give them",
+            rows=rows,
+            gates=placement.gates,
+        )
+    outside = [rows.index(r) for r in placement.disagreeing]
+    good = anchors.take(np.flatnonzero(held.used & ~np.isin(anchors.photo_of, outside)))
     adjusted, fixed, sharp = refine_with_maps(
-        model, placement.local_from_sfm, good, constant, keypoints, options.refine
+        without_photos(model, outside), placement.local_from_sfm, good, constant, keypoints, options.refine
     )
     gate = gates.held_share(adjusted.fixed_kept, options.min_held_share)
     placement = replace(placement, gates=(*placement.gates, gate))
     if not gate.passes:
         return Refused(reason=gate.reason, message=gate.message, rows=rows, gates=placement.gates)
     complete = with_existing(adjusted, fixed, good.take(sharp), placement.parents)
+    complete = only_photos(complete, [k for k in range(len(rows)) if k not in outside])
     return assemble(complete, placement, held, photos, features_of, near, identity, options)
 
 
@@ -108,6 +121,28 @@ def _meeting_place(
     main = next(a.area for a in areas if a.area.frame == frame)
     datum = main.maps[0].height_datum
     return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
+
+
+def without_photos(model: Model, photos: Sequence[int]) -> Model:
+    """The model without these photos' observations; points keep at least two. The photos stay, with poses."""
+    seen = ~np.isin(model.photo_of, photos)
+    seen &= np.bincount(model.point_of[seen], minlength=len(model.xyz))[model.point_of] >= 2
+    return with_observations(model, seen)
+
+
+def only_photos(model: Model, photos: Sequence[int]) -> Model:
+    """The model of the chosen photos; the others must have no observations."""
+    number = np.full(len(model.rows), -1, dtype=np.int64)
+    number[list(photos)] = np.arange(len(photos))
+    cameras, camera_of = np.unique(model.camera_of[list(photos)], return_inverse=True)
+    return replace(
+        model,
+        cameras=tuple(model.cameras[int(c)] for c in cameras),
+        rows=model.rows[list(photos)],
+        camera_of=camera_of.reshape(-1),
+        cam_from_sfm=tuple(model.cam_from_sfm[k] for k in photos),
+        photo_of=number[model.photo_of],
+    )
 
 
 def with_existing(adjusted: Anchored, fixed: FixedPoints, anchors: Anchors, parents: Sequence[str]) -> Model:
@@ -242,7 +277,7 @@ def drift_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFram
         flat = feature_map.placement.evidence.get(GROWTH, {}).get("covariance_relative")
         if flat is not None:
             own: FloatArray = np.asarray(flat, dtype=np.float64).reshape(7, 7)
-            covariance += weight / total * covariance_in(own, feature_map.frame, frame)
+            covariance += weight / total * covariance_in_frame(own, feature_map.frame, frame)
     return covariance
 
 

@@ -86,12 +86,12 @@ def localise_photo(
     Args:
         camera: known intrinsics, of an image that a map holds for example; None: as the photo tells.
     """
-    usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
-    if not usable:
-        return "NO_COVERAGE: no active map has descriptors of this extractor"
     settings = replace(
         options.localise, extractor=replace(options.localise.extractor, upright=_is_upright(features))
     )
+    usable = [a for a in areas if a.area.extractor_fingerprint == features.fingerprint]
+    if not usable or features.fingerprint != settings.extractor.fingerprint:
+        return "NO_COVERAGE: no active map has descriptors of this photo's extractor"
     few = features.take(np.arange(min(options.max_features, len(features))))
     request = LocaliseRequest(
         camera=camera, camera_key=photo.camera_key or None, exif_focal_px=photo.focal_px, prior=photo.gps

@@ -16,6 +16,7 @@ from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.move import covariance_in_frame
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
@@ -357,17 +358,9 @@ def parents_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFr
     total = sum(weight for _, weight in parents)
     covariance = np.zeros((7, 7))
     for feature_map, weight in parents:
-        moved = covariance_in(feature_map.placement.covariance, feature_map.frame, frame)
+        moved = covariance_in_frame(feature_map.placement.covariance, feature_map.frame, frame)
         covariance += weight / total * moved
     return covariance
-
-
-def covariance_in(covariance: FloatArray, old: LocalFrame, new: LocalFrame) -> FloatArray:
-    """Covariance (7, 7) of a left perturbation in one local frame, for another."""
-    if old == new:
-        return np.asarray(covariance)
-    adjoint = Sim3.from_rigid3(new.enu_from(old)).adjoint()
-    return np.asarray(adjoint @ covariance @ adjoint.T)
 
 
 def map_agreements(placement: MapsPlacement, held: Anchors) -> tuple[MapAgreement, ...]:

@@ -1,7 +1,7 @@
 """Step: the reconstruction adjusted, with lenses and points of existing maps held where they are."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,13 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
+from ingest.colmap_anchored import (
+    Anchored,
+    AnchoredOptions,
+    FixedPoints,
+    adjust_anchored,
+    with_observations,
+)
 from ingest.colmap_bridge import Model
 from ingest.growth.anchors import Anchors
 from ingest.growth.values import LocalisedPhoto
@@ -60,16 +66,7 @@ def adopt_lenses(
             adopted.append(c)
     if not adopted:
         return model, ()
-    with_lenses = Model(
-        cameras=tuple(cameras),
-        rows=model.rows,
-        camera_of=model.camera_of,
-        cam_from_sfm=model.cam_from_sfm,
-        xyz=model.xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        keypoint_of=model.keypoint_of,
-    )
+    with_lenses = replace(model, cameras=tuple(cameras))
     adjusted = adjust_anchored(with_lenses, keypoints, FixedPoints.none(), adopted, options.adjust)
     return adjusted.model, tuple(adopted)
 
@@ -110,15 +107,10 @@ def refine_with_maps(
 
 def in_metres(model: Model, local_from_sfm: Sim3) -> Model:
     """The model in the local frame."""
-    return Model(
-        cameras=model.cameras,
-        rows=model.rows,
-        camera_of=model.camera_of,
+    return replace(
+        model,
         cam_from_sfm=tuple(local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm),
         xyz=local_from_sfm.act(model.xyz),
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        keypoint_of=model.keypoint_of,
     )
 
 
@@ -129,17 +121,7 @@ def without_anchored(model: Model, anchors: Anchors) -> Model:
     free = ~np.isin(model.photo_of * size + model.keypoint_of, held)
     counts = np.bincount(model.point_of[free], minlength=len(model.xyz))
     free &= counts[model.point_of] >= 2
-    points, point_of = np.unique(model.point_of[free], return_inverse=True)
-    return Model(
-        cameras=model.cameras,
-        rows=model.rows,
-        camera_of=model.camera_of,
-        cam_from_sfm=model.cam_from_sfm,
-        xyz=model.xyz[points],
-        point_of=point_of.reshape(-1),
-        photo_of=model.photo_of[free],
-        keypoint_of=model.keypoint_of[free],
-    )
+    return with_observations(model, free)
 
 
 def _sigma_px(model: Model, anchors: Anchors) -> FloatArray:

@@ -1,0 +1,332 @@
+"""Growth on a small made-up world whose truth is known: placed, refined, refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.maps.move import move_map
+from ingest.colmap_anchored import with_observations
+from ingest.growth.grow_photos import grow_photos
+from ingest.growth.grown_map import grow_component
+from ingest.growth.localised import localise_photos
+from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
+from reloc.candidates import IndexedArea
+from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
+from tests.support.scenes import (
+    CAMERA,
+    EASTING,
+    EPSG,
+    HEIGHT,
+    NORTHING,
+    box_points,
+    indexed,
+    looking_at,
+    random_descriptors,
+    ring,
+    scene_map,
+)
+
+FRAME = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
+KEY = "scene|camera"
+RNG = np.random.default_rng(7)
+WORLD = box_points(RNG, 900)  # 50 x 50 m, 12 m high
+EAST = WORLD + np.array([38.0, 0.0, 0.0])  # beyond the map's points
+POINTS = np.concatenate([WORLD, EAST])
+DESCRIPTORS = random_descriptors(RNG, len(POINTS))
+
+
+def walk(count: int = 6, start_m: float = 2.0, step_m: float = 6.0) -> list[Rigid3]:
+    """Cameras that walk east and look at the box and beyond."""
+    return [
+        looking_at(np.array([start_m + step_m * k, -48.0, 30.0]), np.array([6.0 + step_m * k, 0.0, 3.0]))
+        for k in range(count)
+    ]
+
+
+def existing(map_id: str = "old", *, sigma_m: float = 0.5) -> FeatureMap:
+    placed = np.diag([1e-8, 1e-8, 1e-8, 1e-8, sigma_m**2, sigma_m**2, sigma_m**2])
+    return scene_map(
+        points=WORLD,
+        descriptors=DESCRIPTORS[: len(WORLD)],
+        poses=ring(10),
+        map_id=map_id,
+        camera_keys=(KEY,),
+        placement_covariance=placed,
+        fingerprint=FINGERPRINT,
+        point_covariance=(4e-4, 0.0, 0.0, 4e-4, 0.0, 4e-4),
+    )
+
+
+@pytest.fixture(scope="module")
+def area() -> IndexedArea:
+    return indexed(existing())
+
+
+@pytest.fixture(scope="module")
+def new() -> NewPhotos:
+    return take_photos(np.random.default_rng(3), POINTS, DESCRIPTORS, walk(), camera_key=KEY)
+
+
+@pytest.fixture(scope="module")
+def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
+    found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
+    assert not reasons
+    return found
+
+
+def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
+    truth = np.array([new.poses[int(r)].center for r in grown.model.rows])
+    to_frame = grown.feature_map.frame.enu_from(FRAME)
+    return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)
+
+
+def test_each_photo_is_localised_by_itself(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    for row, photo in localised.items():
+        offset = photo.cam_from_local.center - new.poses[row].center
+        sigma = np.sqrt(np.diag(photo.covariance)[3:])
+        assert np.linalg.norm(offset) < 0.1
+        assert (np.abs(offset) < 5 * sigma).all()
+        # Every inlier names the point that it is: the world row of the feature, as the map's row.
+        assert (new.world_of[row][photo.feature_rows] == photo.point_of).mean() > 0.99
+        assert photo.map_ids == ("old",)
+
+
+def test_a_reconstruction_is_placed_and_becomes_a_map(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    grown = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    feature_map = grown.feature_map
+    assert centers_error(grown, new).max() < 0.05
+    assert feature_map.status == "quarantined"
+    assert feature_map.generation == 1
+    assert feature_map.parents == ("old",)
+    assert feature_map.placement.method == "map"
+    assert feature_map.height_datum == "ellipsoidal"
+    growth = feature_map.placement.evidence["growth"]
+    assert growth["steps"] == 1
+    assert growth["anchors"] == ["old"]
+    assert all(gate["passes"] for gate in growth["gates"].values())
+    assert 0.0 < growth["drift_m"] < 0.5
+    # On Earth it is as uncertain as its parent, and a little more.
+    earth = np.sqrt(np.diag(feature_map.placement.covariance)[4:])
+    assert (earth > 0.5).all()
+    assert (earth < 0.6).all()
+    # It reaches beyond the old map's points, and its points are where the world's are.
+    placed = feature_map.points_local(FRAME)
+    assert np.quantile(placed[:, 0], 0.95) > 35.0
+    nearest = np.array([np.linalg.norm(POINTS - p, axis=1).min() for p in placed[::25]])
+    assert np.median(nearest) < 0.1
+
+
+def test_the_bound_of_drift_holds(area: IndexedArea) -> None:
+    """Independent photos, matches and noise: no point of the map is further off than the map says (95 %)."""
+    beyond = 0
+    for seed in range(4):
+        rng = np.random.default_rng(100 + seed)
+        new = take_photos(rng, POINTS, DESCRIPTORS, walk(4), camera_key=KEY)
+        found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+        grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
+        assert isinstance(grown, GrownMap)
+        bound = grown.feature_map.placement.evidence["growth"]["drift_m"]
+        beyond += int(centers_error(grown, new).max() > bound)
+    assert beyond <= 1
+
+
+def test_one_localised_photo_is_not_enough(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    grown = grow_component(new.model, new.photos, new.features_of, {2: localised[2]}, [area], identity())
+    assert isinstance(grown, Refused)
+    assert grown.reason == "TOO_FEW_AGREE"
+
+
+def test_nothing_localised(new: NewPhotos, area: IndexedArea) -> None:
+    grown = grow_component(new.model, new.photos, new.features_of, {}, [area], identity())
+    assert isinstance(grown, Refused)
+    assert grown.reason == "NOT_LOCALISED"
+
+
+def test_photos_that_contradict_each_other_are_refused(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    """Half of the photos' poses shuffled: what they see is elsewhere than the model says."""
+    turned = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.6, 3.0, -8.0, 0.0]))
+    wrong = {
+        r: p
+        if r % 2
+        else replace(
+            p,
+            cam_from_local=turned.act_on_pose(p.cam_from_local),
+            points=turned.act(p.points + 4.0 * (r + 1)),
+        )
+        for r, p in localised.items()
+    }
+    grown = grow_component(new.model, new.photos, new.features_of, wrong, [area], identity())
+    assert isinstance(grown, Refused)
+    assert grown.reason == "PHOTOS_DISAGREE"
+
+
+def test_a_photo_that_contradicts_the_others_is_left_out(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    turned = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.6, 3.0, -8.0, 0.0]))
+    liar = replace(
+        localised[1],
+        cam_from_local=turned.act_on_pose(localised[1].cam_from_local),
+        points=turned.act(localised[1].points),
+    )
+    grown = grow_component(new.model, new.photos, new.features_of, {**localised, 1: liar}, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert grown.placement.disagreeing == (1,)
+    assert 1 not in grown.model.rows
+    assert centers_error(grown, new).max() < 0.05
+
+
+def test_a_look_alike_elsewhere_makes_it_ambiguous(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    """Two of five photos see the same block 200 m north: another placement that holds together."""
+    away = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([0.0, 200.0, 0.0]))
+    there = {
+        r: replace(p, cam_from_local=away.act_on_pose(p.cam_from_local), points=away.act(p.points))
+        for r, p in localised.items()
+        if r in (0, 1)
+    }
+    some = {r: localised[r] for r in (2, 3, 4)} | there
+    grown = grow_component(new.model, new.photos, new.features_of, some, [area], identity())
+    assert isinstance(grown, Refused)
+    assert {g.name for g in grown.gates if not g.passes} >= {"runner_up"}
+
+
+def prior(pose: Rigid3, offset: tuple[float, float] = (0.0, 0.0), sigma_m: float = 5.0) -> GeoPrior:
+    lat, lon, _ = FRAME.geodetic_from_enu(pose.center + np.array([*offset, 0.0]))
+    return GeoPrior(
+        latitude_deg=float(lat),
+        longitude_deg=float(lon),
+        height_m=None,
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=20.0,
+    )
+
+
+@pytest.mark.parametrize(("liars", "refused"), [(1, False), (5, True)])
+def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> None:
+    """One photo that lies about its place does not matter; most of them do."""
+    poses = walk(6)
+    gps = [prior(p, (150.0, 0.0) if k < liars else (2.0, 1.0)) for k, p in enumerate(poses)]
+    new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, poses, camera_key=KEY, gps=gps)
+    found, _ = localise_photos(new.photos, range(6), new.features_of, [area])
+    assert len(found) == 6
+    assert [found[r].by_prior for r in range(6)] == [r >= liars for r in range(6)]
+    grown = grow_component(new.model, new.photos, new.features_of, found, [area], identity())
+    if refused:
+        assert isinstance(grown, Refused)
+        assert grown.reason == "CONTRADICTS_GPS"
+    else:
+        assert isinstance(grown, GrownMap), grown
+
+
+def test_photos_blind_for_what_they_should_show(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    """A reconstruction that shows a corner of the place where it should show all of it: behind a wall."""
+
+    kept: dict[int, LocalisedPhoto] = {}
+    hidden = np.zeros(len(new.model.point_of), dtype=np.bool_)
+    for r, photo in localised.items():
+        near = np.argsort(np.linalg.norm(photo.pixels - np.median(photo.pixels, axis=0), axis=1))[:40]
+        kept[r] = replace(
+            photo,
+            feature_rows=photo.feature_rows[near],
+            pixels=photo.pixels[near],
+            map_of=photo.map_of[near],
+            point_of=photo.point_of[near],
+            points=photo.points[near],
+            point_covariance=photo.point_covariance[near],
+        )
+        of_old = np.flatnonzero(new.world_of[r] < len(WORLD))
+        gone = np.setdiff1d(of_old, photo.feature_rows[near])
+        hidden |= (new.model.photo_of == r) & np.isin(new.model.keypoint_of, gone)
+    bare = with_observations(new.model, ~hidden & (new.model.track_lengths()[new.model.point_of] >= 2))
+    grown = grow_component(bare, new.photos, new.features_of, kept, [area], identity())
+    assert isinstance(grown, Refused)
+    assert "visibility" in {g.name for g in grown.gates if not g.passes}
+
+
+def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
+    """Structure from motion of a few photos found a focal length 12 % too short; the map knows the camera."""
+    poses = walk(4)
+    new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, poses, camera_key=KEY)
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    wrong = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(790.0, 500.0, 400.0, 0.03))
+    bent = replace(new.model, cameras=(wrong,))
+    grown = grow_component(bent, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert grown.model.cameras[0] == CAMERA
+    assert centers_error(grown, new).max() < 0.05
+
+
+def test_two_maps_that_differ_say_so(new: NewPhotos) -> None:
+    """The other map shows the east, placed 0.4 m off; the new photos overlap both."""
+    shift = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([0.0, 0.4, 0.0]))
+    east = scene_map(
+        points=EAST,
+        descriptors=DESCRIPTORS[len(WORLD) :],
+        poses=[
+            looking_at(p.center + np.array([38.0, 0.0, 0.0]), np.array([38.0, 0.0, 3.0])) for p in ring(10)
+        ],
+        map_id="east",
+        camera_keys=(KEY,),
+        fingerprint=FINGERPRINT,
+        point_covariance=(4e-4, 0.0, 0.0, 4e-4, 0.0, 4e-4),
+        seed=4,
+    )
+    both = indexed(existing(), move_map(east, shift))
+    found, _ = localise_photos(new.photos, range(len(new.photos)), new.features_of, [both])
+    grown = grow_component(new.model, new.photos, new.features_of, found, [both], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert set(grown.feature_map.parents) == {"old", "east"}
+    (said,) = grown.agreements
+    assert said.distance_m == pytest.approx(0.4, abs=0.15)
+    assert said.sigmas > 3.0
+    offset = said.a_from_b.act(np.array([20.0, 0.0, 3.0])) - np.array([20.0, 0.0, 3.0])
+    sign = 1.0 if said.map_b == "old" else -1.0
+    assert sign * offset[1] == pytest.approx(0.4, abs=0.15)
+    assert "differ by 0." in str(said)
+
+
+def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> None:
+    """No reconstruction at all: localised photos whose matches fit their poses become a map."""
+    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity(f"g{rows[0]}"))
+    assert not grown.waiting
+    (made,) = grown.maps
+    assert sorted(made.model.rows.tolist()) == [0, 1, 2]
+    assert centers_error(made, new).max() < 0.1
+    assert np.quantile(made.feature_map.points_local(FRAME)[:, 0], 0.9) > 25.0
+
+
+def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
+    found, _ = localise_photos(new.photos, [0], new.features_of, [area])
+    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
+    assert not grown.maps
+    assert grown.waiting[0].startswith("ALONE")
+
+
+def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, area: IndexedArea) -> None:
+    found, _ = localise_photos(new.photos, range(2), new.features_of, [area])
+    away = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.05, 1.5, 0.0, 0.0]))
+    found[1] = replace(found[1], cam_from_local=away.act_on_pose(found[1].cam_from_local))
+    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
+    assert not grown.maps
+    assert set(grown.waiting) == {0, 1} or [r.reason for r in grown.refused] == ["TOO_FEW_AGREE"]

@@ -1,0 +1,94 @@
+"""Every gate of growth: a figure that passes, one that does not, and what stands between them."""
+
+import numpy as np
+import pytest
+
+from ingest.growth import gates
+
+
+def test_one_photo_is_never_enough() -> None:
+    assert not gates.agreeing_photos(1, 2).passes
+    assert gates.agreeing_photos(1, 2).reason == "TOO_FEW_AGREE"
+    assert gates.agreeing_photos(2, 2).passes
+
+
+def test_a_third_of_the_photos_may_disagree() -> None:
+    assert gates.disagreeing_share(2, 1, 0.34).passes
+    refused = gates.disagreeing_share(2, 2, 0.34)
+    assert not refused.passes
+    assert refused.figure == 0.5
+    assert "2 of 4" in refused.message
+    assert gates.disagreeing_share(0, 0, 0.34).passes  # nobody disagrees; agreeing_photos asks the rest
+
+
+def test_shared_points() -> None:
+    assert not gates.shared_points(29, 30).passes
+    assert gates.shared_points(30, 30).passes
+
+
+def test_spread_is_relative_to_the_viewing_distance() -> None:
+    assert gates.spread(0.9, 50.0, 0.02).passes
+    assert not gates.spread(0.9, 40.0, 0.02).passes
+    assert not gates.spread(0.1, 0.0, 0.02).passes  # no distance, no statement
+
+
+def test_residuals() -> None:
+    assert gates.residuals(0.4, 50.0, 0.01).passes
+    assert not gates.residuals(0.6, 50.0, 0.01).passes
+    assert not gates.residuals(float("nan"), 50.0, 0.01).passes
+
+
+def test_runner_up() -> None:
+    assert gates.runner_up(2, 4, 0.5).passes
+    assert not gates.runner_up(3, 4, 0.5).passes
+    assert not gates.runner_up(0, 0, 0.5).passes
+
+
+def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
+    spread = np.tile(np.eye(2) * 25.0, (3, 1, 1))
+    liar = np.array([[3.0, 1.0], [-2.0, 4.0], [5000.0, 0.0]])
+    assert gates.geotags(liar, spread, 0.5).passes
+    assert gates.geotags(liar[2:], spread[2:], 0.5).passes  # alone, too
+    most = np.array([[3.0, 1.0], [400.0, 0.0], [5000.0, 0.0]])
+    refused = gates.geotags(most, spread, 0.5)
+    assert not refused.passes
+    assert refused.figure == pytest.approx(2 / 3)
+    assert gates.geotags(np.zeros((0, 2)), np.zeros((0, 2, 2)), 0.5).passes
+
+
+def test_geotags_count_by_their_own_sigma() -> None:
+    """Chi-square of (20, 0) is 16 at a sigma of 5 m and 25 at 4 m; the limit is 18.42."""
+    offsets = np.array([[20.0, 0.0], [20.0, 0.0]])
+    assert gates.geotags(offsets, np.tile(np.eye(2) * 25.0, (2, 1, 1)), 0.5).passes
+    assert not gates.geotags(offsets, np.tile(np.eye(2) * 16.0, (2, 1, 1)), 0.5).passes
+
+
+def test_photos_that_do_not_show_what_they_should() -> None:
+    assert gates.visibility(np.array([0.9, 0.8, 0.1]), 0.2, 0.34).passes
+    refused = gates.visibility(np.array([0.9, 0.1, 0.0]), 0.2, 0.34)
+    assert not refused.passes
+    assert refused.reason == "NOT_VISIBLE"
+    assert gates.visibility(np.zeros(0), 0.2, 0.34).passes
+
+
+def test_held_share() -> None:
+    assert gates.held_share(np.array([True, True, False]), 0.5).passes
+    assert not gates.held_share(np.array([True, False, False]), 0.5).passes
+    assert not gates.held_share(np.zeros(0, dtype=np.bool_), 0.5).passes
+
+
+def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
+    """Tables of chi-square: 99.73 % lies below 9, 11.83 and 20.06 for 1, 2 and 6 degrees of freedom."""
+    assert gates.sigmas_limit(3.0, 1) == pytest.approx(9.0)
+    assert gates.sigmas_limit(3.0, 2) == pytest.approx(11.829, abs=1e-3)
+    assert gates.sigmas_limit(3.0, 6) == pytest.approx(20.062, abs=1e-3)
+
+
+def test_first_refusal_and_json() -> None:
+    asked = (gates.agreeing_photos(3, 2), gates.shared_points(5, 30), gates.residuals(9.0, 10.0, 0.01))
+    refusal = gates.first_refusal(asked)
+    assert refusal is not None
+    assert refusal.name == "shared_points"
+    assert gates.first_refusal(asked[:1]) is None
+    assert asked[1].as_json() == {"figure": 5.0, "limit": 30, "passes": False}
+    assert gates.runner_up(0, 0, 0.5).as_json()["figure"] is None
