@@ -1,0 +1,280 @@
+"""`featuredb grow` from contributed photos to answers, over the test hills; truth is known."""
+
+import json
+import shutil
+import threading
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ingest.growing as growing_module
+from featuredb.cli.main import main
+from featuredb.errors import StoreError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.store import Database
+from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidates import contribute, list_candidates
+from ingest.growing import grow_candidates, watch_and_grow
+from ingest.growth.confirmation import ConfirmationOptions
+from ingest.growth.growth_report import GrowthReport
+from reloc.localiser import Localiser
+from reloc.result import LocaliseRequest
+from tests.support.hill_photos import CAMERA, FRAME
+from tests.support.hill_walk import NOW, WEST_M, Shot, anchored_database, error_m, give, growing, step_of
+
+_EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
+
+
+@pytest.fixture(scope="module")
+def anchored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an anchored database, to be copied."""
+    folder = tmp_path_factory.mktemp("anchored")
+    anchored_database(folder)
+    return folder / "db"
+
+
+@pytest.fixture
+def database(anchored: Path, tmp_path: Path) -> Database:
+    shutil.copytree(anchored, tmp_path / "db")
+    return Database.open(tmp_path / "db")
+
+
+@pytest.fixture(scope="module")
+def shots() -> list[Shot]:
+    """Three photos of Anna's, three of Ben's, of one place."""
+    return step_of(_EAST_M)
+
+
+@pytest.fixture(scope="module")
+def given(anchored: Path, shots: list[Shot], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The anchored database with all six photos waiting, and their features and matches done."""
+    folder = tmp_path_factory.mktemp("given") / "db"
+    shutil.copytree(anchored, folder)
+    database = Database.open(folder)
+    give(database, shots)
+    scratch = folder.parent / "scratch"
+    shutil.copytree(folder, scratch)
+    grow_candidates(Database.open(scratch), growing())
+    for part in ("features", "matches", "jobs", "candidates"):
+        if (scratch / "_work" / part).is_dir():
+            shutil.copytree(scratch / "_work" / part, folder / "_work" / part, dirs_exist_ok=True)
+    return folder
+
+
+def _copy(folder: Path, to: Path) -> Database:
+    shutil.copytree(folder, to / "db", dirs_exist_ok=True)
+    return Database.open(to / "db")
+
+
+def _states(database: Database) -> dict[str, str]:
+    return {c.candidate_id: c.state for c in list_candidates(database)}
+
+
+def _ask(database: Database, shot: Shot) -> float | None:
+    """Error in metres of the answer to a photo, None without one."""
+    result = Localiser.open(database).localise(
+        decode_gray(shot.data, INGEST_LIMITS), LocaliseRequest(camera=CAMERA)
+    )
+    if result.pose is None:
+        return None
+    center = FRAME.enu_from(result.pose.frame).act(result.pose.cam_from_local.center)
+    return float(np.linalg.norm(center - shot.cam_from_local.center))
+
+
+def test_photos_of_one_wait_for_another_and_then_both_are_in(database: Database, shots: list[Shot]) -> None:
+    beyond = step_of(_EAST_M + 9.0, owners=("stranger",), each=1)[0]
+    asked_before = _ask(database, beyond)
+    anna = give(database, shots[:3])
+    first = grow_candidates(database, growing())
+    assert [(m.status, m.reason_code) for m in first.maps] == [("quarantined", "ONE_SOURCE")]
+    assert first.count("quarantined") == 3
+    assert {p.reason_code for p in first.photos} == {"ONE_SOURCE"}
+    assert set(_states(database).values()) == {"used"}
+    # Nothing has changed for those who ask.
+    assert _ask(database, beyond) == asked_before
+
+    ben = give(database, shots[3:])
+    second = grow_candidates(database, growing())
+    assert len(second.promoted) == 2
+    assert _states(database) == dict.fromkeys([*anna, *ben], "used")
+    for map_id in second.promoted:
+        summary = database.snapshot().get(map_id)
+        assert summary.status == "active"
+        assert error_m(database, shots, map_id) < min(0.1, summary.drift_m + 0.05)
+        assert (summary.generation, summary.method) == (1, "map")
+    error = _ask(database, beyond)
+    assert error is not None
+    assert error < 0.2
+    assert asked_before is None or error < asked_before + 0.05
+
+
+def test_two_owners_at_once_are_promoted_in_one_run(given: Path, tmp_path: Path, shots: list[Shot]) -> None:
+    database = _copy(given, tmp_path)
+    report = grow_candidates(database, growing())
+    assert report.count("promoted") == 6
+    assert report.rounds == 2
+    entry = report.maps[0]
+    assert (entry.status, entry.steps) == ("active", 1)
+    assert all(gate["passes"] for gate in entry.gates.values())
+    assert {"agreeing_photos", "residuals", "runner_up", "visibility", "drift", "sources", "canaries"} <= set(
+        entry.gates
+    )
+    evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
+    assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
+    assert {s["owner"] for s in evidence["sources"]} == {"anna", "ben"}
+    assert json.loads(json.dumps(report.as_json()))["version"] == database.poll_version()
+    text = report.as_text()
+    assert "6 in active maps" in text
+    assert f"map {entry.map_id}: active" in text
+    # Run again: nothing waits, nothing changes.
+    version = database.poll_version()
+    again = grow_candidates(database, growing())
+    assert again.photos == ()
+    assert database.poll_version() == version
+
+
+def test_beyond_the_budget_nothing_is_taken_and_photos_wait(given: Path, tmp_path: Path) -> None:
+    database = _copy(given, tmp_path)
+    version = database.poll_version()
+    report = grow_candidates(database, growing(budget_m=0.005))
+    assert {p.reason_code for p in report.photos} == {"DRIFT_BUDGET"}
+    assert {m.reason_code for m in report.maps} == {"DRIFT_BUDGET"}
+    assert database.poll_version() == version
+    assert set(_states(database).values()) == {"waiting"}
+    # With a larger budget, an anchor that came near for example, they go in.
+    assert grow_candidates(database, growing()).count("promoted") == 6
+
+
+def test_a_map_that_was_retired_does_not_come_back(given: Path, tmp_path: Path) -> None:
+    database = _copy(given, tmp_path)
+    map_id = grow_candidates(database, growing()).promoted[0]
+    database.retire(map_id, "the photos are not ours")
+    assert set(_states(database).values()) == {"waiting"}
+    report = grow_candidates(database, growing())
+    assert {(p.outcome, p.reason_code) for p in report.photos} == {("refused", "RETIRED_MAP")}
+    assert set(_states(database).values()) == {"refused"}
+    assert database.snapshot().get(map_id).status == "retired"
+
+
+def test_a_run_that_dies_is_finished_by_the_next(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = _copy(given, tmp_path)
+    version = database.poll_version()
+
+    def dies(*args: object, **more: object) -> None:
+        raise StoreError("the power went out")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "commit_map", dies)
+        with pytest.raises(StoreError, match="power"):
+            grow_candidates(database, growing())
+    assert database.poll_version() == version
+    assert set(_states(database).values()) == {"waiting"}  # used by a map that is not there
+    with monkeypatch.context() as patch:
+        patch.setattr(Database, "set_status", dies)
+        with pytest.raises(StoreError, match="power"):
+            grow_candidates(database, growing())
+    assert {m.status for m in database.snapshot().maps()} == {"active", "quarantined"}
+    report = grow_candidates(database, growing())
+    assert len(report.promoted) == 1
+    assert set(_states(database).values()) == {"used"}
+
+
+def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
+    database: Database, shots: list[Shot]
+) -> None:
+    rng = np.random.default_rng(3)
+    noise = rng.integers(0, 255, (480, 640), dtype=np.uint8)
+    good, copy = (
+        shots[0],
+        Shot(data=shots[0].data + b"\0", cam_from_local=shots[0].cam_from_local, owner="eve"),
+    )
+    nowhere = Shot(data=_jpeg(noise), cam_from_local=good.cam_from_local, owner="eve")
+    broken = Shot(data=good.data[:5000], cam_from_local=good.cam_from_local, owner="eve")
+    ids = give(database, [good, copy, nowhere, broken])
+    report = grow_candidates(database, growing())
+    fates = {p.name: (p.outcome, p.reason_code) for p in report.photos}
+    assert fates[ids[0]] == ("waiting", "ALONE")  # a single localised photo is never enough
+    assert fates[ids[2]][0] == "waiting"
+    assert fates[ids[2]][1] in ("TOO_FEW_MATCHES", "TOO_FEW_INLIERS")
+    assert fates[ids[1]][0] == "refused"
+    assert fates[ids[3]][0] == "refused"
+    assert _states(database)[ids[0]] == "waiting"
+    later = grow_candidates(database, growing(give_up_days=30), now=NOW + timedelta(days=31))
+    assert {p.reason_code for p in later.photos} == {"GAVE_UP"}
+    assert "waiting" not in _states(database).values()
+
+
+def _jpeg(picture: np.ndarray) -> bytes:
+    import cv2
+
+    return bytes(cv2.imencode(".jpg", picture)[1])
+
+
+def test_a_worker_grows_when_photos_arrive_and_survives_errors(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    database = _copy(given, tmp_path)
+    stop, reports, calls = threading.Event(), [], []
+    real = growing_module.grow_candidates
+
+    def sometimes(*args: object, **more: object) -> GrowthReport:
+        calls.append(1)
+        if len(calls) == 1:
+            raise StoreError("the store is away for a moment")
+        return real(*args, **more)  # type: ignore[arg-type]
+
+    def heard(report: GrowthReport) -> None:
+        reports.append(report)
+        stop.set()
+
+    monkeypatch.setattr(growing_module, "grow_candidates", sometimes)
+    worker = threading.Thread(
+        target=watch_and_grow, args=(database, growing(), stop, heard), kwargs={"poll_s": 0.05}
+    )
+    worker.start()
+    worker.join(120)
+    assert not worker.is_alive()
+    assert len(calls) == 2
+    assert reports[0].count("promoted") == 6
+
+
+def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _copy(given, tmp_path)
+    url, report = str(tmp_path / "db"), tmp_path / "report.json"
+    photo = tmp_path / "known.jpg"
+    photo.write_bytes(step_of(WEST_M, owners=("x",), each=1)[0].data)
+    assert main(["canary", url, "add", str(photo), "--note", "over the survey"]) == 0
+    assert main(["canary", url, "list"]) == 0
+    assert "known.jpg" in capsys.readouterr().out
+    assert main(["grow", url, "--trust", "anna", "--max-features", "1500", "--report", str(report)]) == 0
+    assert "6 in active maps" in capsys.readouterr().out
+    told = json.loads(report.read_text())
+    assert told["maps"][0]["gates"]["canaries"]["passes"]
+    assert "1 known queries" in told["maps"][0]["reason"]
+    assert main(["canary", url, "run"]) == 0
+    assert "right" in capsys.readouterr().out
+    map_id = told["maps"][0]["map_id"]
+    assert main(["promote", url, map_id, "--reason", "again"]) == 0
+    assert main(["canary", url, "remove", "known.jpg"]) == 0
+
+
+def test_a_trusted_owner_alone(database: Database, shots: list[Shot]) -> None:
+    give(database, shots[:3])
+    options = growing(confirmation=ConfirmationOptions(trusted_owners=("anna",)))
+    assert grow_candidates(database, options).count("promoted") == 3
+
+
+def test_an_empty_inbox_is_no_error(database: Database) -> None:
+    version = database.poll_version()
+    report = grow_candidates(database, growing())
+    assert report.photos == ()
+    assert database.poll_version() == version
+    contribute(
+        database,
+        [Contribution(image=b"no image", width=1, height=1, owner="x", licence="y", received_at=NOW)],
+    )
+    assert [p.outcome for p in grow_candidates(database, growing()).photos] == ["refused"]
