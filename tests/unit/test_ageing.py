@@ -127,7 +127,8 @@ def test_localised_photos_tell_what_they_found(field: FeatureMap) -> None:
     seen = field.observations
     other = np.isin(seen.point_index, gone)
     descriptors = seen.descriptors.copy()
-    descriptors[other] = np.roll(descriptors[other], 64, axis=1)
+    cells = descriptors[other].reshape(-1, 16, 8)
+    descriptors[other] = np.roll(cells, 4, axis=2).reshape(-1, 128)  # dark where it was bright
     changed = replace(field, observations=replace(seen, descriptors=descriptors))
     area = build_area([changed])
     indexed = [IndexedArea(area=area, index=build_index(area.descriptors))]
