@@ -7,7 +7,6 @@ surface is seen at a grazing angle (structure-projection paper, 3.1: "not all de
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,28 +62,56 @@ class SurfaceHits:
     sigma_ray_m: FloatArray
     depths: FloatArray
 
+    def rows(self, chosen: NDArray[np.intp]) -> "SurfaceHits":
+        return SurfaceHits(
+            valid=self.valid[chosen],
+            points=self.points[chosen],
+            normals=self.normals[chosen],
+            sigma_ray_m=self.sigma_ray_m[chosen],
+            depths=self.depths[chosen],
+        )
+
 
 def reliable_depth(rendering: Rendering, options: DepthFilterOptions) -> NDArray[np.bool_]:
-    """(h, w) bool: depths that are neither across a silhouette nor beyond the far plane.
+    """(h, w) bool: depths that are neither across a silhouette nor beyond the far plane."""
+    pixels = np.indices(rendering.depth.shape)
+    return _reliable_at(rendering, pixels[0], pixels[1], sample_stride(rendering), options)
+
+
+def _reliable_at(
+    rendering: Rendering,
+    row: NDArray[np.int64],
+    column: NDArray[np.int64],
+    stride: int,
+    options: DepthFilterOptions,
+) -> NDArray[np.bool_]:
+    """Whether the depths of pixels are neither across a silhouette nor beyond the far plane.
 
     The step across a silhouette is told from a slope by inverse depth, which is affine over the image of a
     plane: its second differences vanish there and stand out at a discontinuity.
     """
-    seen = rendering.valid & (rendering.depth <= options.max_depth_m)
-    inverse = np.where(seen, 1.0 / np.where(seen, rendering.depth, 1.0), 0.0).astype(np.float32)
-    reach = (options.window // 2 + 1) * sample_stride(rendering)
-    kernel = np.zeros((2 * reach + 1, 1), np.float32)
-    kernel[0, 0] = kernel[-1, 0] = 0.5
-    kernel[reach, 0] = -1.0
-    bend = np.maximum(np.abs(cv2.filter2D(inverse, -1, kernel)), np.abs(cv2.filter2D(inverse, -1, kernel.T)))
-    flat = bend * np.where(seen, rendering.depth, 0.0) <= options.max_step_rel
-    return np.asarray(seen & flat)
+    height, width = rendering.depth.shape
+    reach = (options.window // 2 + 1) * stride
+
+    def nearness(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.float32]:
+        # Beyond a border the picture is mirrored about its last pixel.
+        r, c = height - 1 - np.abs(height - 1 - np.abs(r)), width - 1 - np.abs(width - 1 - np.abs(c))
+        depth = rendering.depth[r, c]
+        seen = depth <= options.max_depth_m  # not where it is NaN
+        return np.where(seen, 1.0 / np.where(seen, depth, 1.0), 0.0).astype(np.float32)
+
+    own = nearness(row, column)
+    down = np.abs(0.5 * (nearness(row - reach, column) + nearness(row + reach, column)) - own)
+    across = np.abs(0.5 * (nearness(row, column - reach) + nearness(row, column + reach)) - own)
+    return np.asarray((own > 0.0) & (np.maximum(down, across) <= options.max_step_rel * own))
 
 
 def sample_stride(rendering: Rendering) -> int:
     """Pixels that are half the distance of neighbouring scan points in the rendering, at least 1."""
-    shown = rendering.index[rendering.index >= 0]
-    points = np.count_nonzero(np.bincount(shown)) if len(shown) else 0
+    index = rendering.index
+    shown = np.zeros(int(index.max(initial=-1)) + 2, dtype=bool)
+    shown[index] = True  # -1 is the last
+    points = int(np.count_nonzero(shown[:-1]))
     pixels = np.count_nonzero(rendering.valid)
     return max(1, round(0.5 * (pixels / points) ** 0.5)) if points else 1
 
@@ -97,14 +124,13 @@ def surface_at(
     The plane is that of the scan points that the window around the pixel shows, so that the hit lies on the
     surface and not at the depth of the nearest splat's centre.
     """
-    good = reliable_depth(rendering, options)
-    height, width = good.shape
+    height, width = rendering.depth.shape
     column, row = np.floor(pixels).astype(np.int64).T
     stride = sample_stride(rendering)
     reach = options.window // 2 * stride
     inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
     rows = np.flatnonzero(inside)
-    rows = rows[good[row[rows], column[rows]]]
+    rows = rows[_reliable_at(rendering, row[rows], column[rows], stride, options)]
     offset = np.arange(-reach, reach + 1, stride)
     window = (
         row[rows, None, None] + offset[None, :, None],
@@ -119,7 +145,7 @@ def surface_at(
     first = np.concatenate(
         [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
     )
-    shown = (rendering.index >= 0).sum() / max(int(rendering.valid.sum()), 1)
+    shown = np.count_nonzero(rendering.index >= 0) / max(int(np.count_nonzero(rendering.valid)), 1)
     enough = (first.sum(axis=1) >= options.min_window_points) & (
         near.mean(axis=1) >= options.min_window_share * shown
     )
@@ -145,11 +171,7 @@ def _intersect(
     if len(rows) == 0:
         return hits
     pose = rendering.cam_from_local
-    neighbours = cloud.xyz[np.maximum(index, 0)].astype(np.float64)
-    count = weight.sum(axis=1)
-    mean = (neighbours * weight[:, :, None]).sum(axis=1) / count[:, None]
-    centred = (neighbours - mean[:, None]) * weight[:, :, None]
-    values, vectors = np.linalg.eigh(np.swapaxes(centred, 1, 2) @ centred / count[:, None, None])
+    mean, count, values, vectors = _principal_axes(cloud, index, weight)
     normal = vectors[:, :, 0]
     rays_cam = np.column_stack([rendering.camera.unproject(pixels[rows]), np.ones(len(rows))])
     rays = rays_cam @ pose.rotation
@@ -173,3 +195,19 @@ def _intersect(
     sigma[rows] = rough[ok] / cosine[ok]
     depths[rows] = depth
     return hits
+
+
+def _principal_axes(
+    cloud: PointCloud, index: NDArray[np.int32], weight: NDArray[np.bool_]
+) -> tuple[FloatArray, NDArray[np.int64], FloatArray, FloatArray]:
+    """Mean (n, 3), number (n,), variances (n, 3) and axes (n, 3, 3) of the points chosen in each row."""
+    # A window shows fewer points than it has samples: those are moved to the front, and the rest left out.
+    count = weight.sum(axis=1)
+    front = np.argsort(~weight, axis=1, kind="stable")[:, : int(count.max())]
+    chosen = np.arange(front.shape[1]) < count[:, None]
+    points = cloud.xyz[np.where(chosen, np.take_along_axis(index, front, axis=1), 0)].astype(np.float64)
+    mean = (chosen[:, None, :] @ points)[:, 0] / count[:, None]
+    points -= mean[:, None]
+    points *= chosen[:, :, None]
+    values, vectors = np.linalg.eigh(np.swapaxes(points, 1, 2) @ points / count[:, None, None])
+    return mean, count, values, vectors

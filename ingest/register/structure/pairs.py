@@ -125,24 +125,33 @@ def _pairs_of_frame(
     )
     hits = surface_at(rendering, cloud, pixels, options.depth)
     distance = np.linalg.norm(hits.points - pose.center, axis=1)
-    largest = np.sqrt(np.linalg.eigvalsh(uncertainty[points])[:, -1])
-    kept = hits.valid & (largest <= options.max_point_sigma_rel * np.where(hits.valid, distance, 0.0))
-    own, by_frame = _errors(hits, pose, camera, options)
+    kept = np.flatnonzero(hits.valid)
+    kept = kept[_no_larger(uncertainty[points[kept]], options.max_point_sigma_rel * distance[kept])]
+    own, by_frame = _errors(hits.rows(kept), pose, camera, options)
     grid = np.minimum(
         (pixels / (small.width, small.height) * options.cells).astype(np.int64), options.cells - 1
     )
     cell = row * options.cells**2 + grid[:, 1] * options.cells + grid[:, 0]
     return Pairs(
         point_index=points[kept],
-        frame_of=np.full(int(kept.sum()), row, dtype=np.int64),
+        frame_of=np.full(len(kept), row, dtype=np.int64),
         source=source[points[kept]],
         target=hits.points[kept],
         normals=hits.normals[kept],
-        covariance=own[kept] + uncertainty[points[kept]],
-        by_frame=by_frame[kept],
+        covariance=own + uncertainty[points[kept]],
+        by_frame=by_frame,
         cell_of=cell[kept],
         frame_covariance=covariance[None],
     )
+
+
+def _no_larger(covariance: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
+    """(n,) bool: whether the largest standard deviation of covariances (n, 3, 3) is at most sigma (n,)."""
+    trace, limit = np.trace(covariance, axis1=1, axis2=2), sigma**2
+    small = trace <= limit  # the largest eigenvalue is between a third of the trace and the trace
+    open_ = np.flatnonzero(~small & (trace <= 3.0 * limit))
+    small[open_] = np.linalg.eigvalsh(covariance[open_])[:, -1] <= limit[open_]
+    return np.asarray(small)
 
 
 def _errors(

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.sim3 import Sim3
 
 _CHI2_3_95 = 7.815  # 95 % of the squared Mahalanobis length of three normal coordinates
 _CHI2_3_MEDIAN = 2.366
+_SETTLED = 0.003  # standard deviations of a step; rounds that follow add up to a few times as much at most
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,9 +110,12 @@ def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray, options: Similarity
     rows = (
         np.arange(n) if n <= options.score_pairs else generator.choice(n, options.score_pairs, replace=False)
     )
-    placed = np.einsum("kij,nj->kni", scale[:, None, None] * rotation, pairs.source[rows])
-    squared = ((placed + translation[:, None] - pairs.target[rows]) ** 2).sum(axis=2)
-    cost = np.minimum(squared / tolerance_m[rows] ** 2, 1.0).sum(axis=1)
+    off = (scale[:, None, None] * rotation).reshape(-1, 3) @ pairs.source[rows].T  # (3 k, n)
+    off += translation.reshape(-1, 1)
+    off = off.reshape(-1, 3, len(rows))
+    off -= pairs.target[rows].T
+    off *= off
+    cost = np.minimum(off.sum(axis=1) / tolerance_m[rows] ** 2, 1.0).sum(axis=1)
     best = int(np.argmin(cost))
     return Sim3(scale=float(scale[best]), rotation=rotation[best], translation=translation[best])
 
@@ -149,25 +153,25 @@ def refine_similarity(start: Sim3, pairs: Pairs, options: SimilarityOptions) -> 
     more than its pose allows, and the inverse of the normal equations is an honest covariance. Pairs carry
     Geman-McClure weights at their robust spread; how far neighbours err alike dilutes them all.
     """
-    information: FloatArray = np.asarray(np.linalg.inv(pairs.covariance), dtype=np.float64)
+    whitened = _whitened(pairs)
     sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
     dilution = 1.0
     for _ in range(2):  # the dilution is known after the first
         for _ in range(options.rounds):
-            residual = _residuals(sim, frames, pairs)
-            weights, spread = _weights(residual, information)
-            normal, gradient = _equations(sim, frames, residual, pairs, information, weights / dilution)
+            residual = whitened.residuals(_residuals(sim, frames, pairs))
+            weights, spread = _weights(residual)
+            normal, gradient = _equations(sim, frames, residual, pairs, whitened, weights / dilution)
             step = np.linalg.solve(normal, gradient)
             sim = Sim3.exp(step[:7]) @ sim
             frames = frames + step[7:].reshape(-1, 6)
-            if np.abs(step[4:7]).max() < 1e-5 and np.abs(step[:4]).max() < 1e-8:
+            if step @ normal @ step < _SETTLED**2:
                 break
-        factor = _neighbours_factor(residual, information, weights, pairs, spread)
+        factor = _neighbours_factor(residual, weights, pairs, spread)
         dilution = max(spread, 1.0) ** 2 * factor
-    normal, _ = _equations(sim, frames, residual, pairs, information, weights / dilution)
+    normal, _ = _equations(sim, frames, residual, pairs, whitened, weights / dilution)
     covariance = np.linalg.inv(normal)[:7, :7]
     residual = _residuals(sim, frames, pairs)
-    squared = np.einsum("ni,nij,nj->n", residual, information, residual)
+    squared = (whitened.residuals(residual) ** 2).sum(axis=1)
     return SimilarityFit(
         target_from_source=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
@@ -186,10 +190,40 @@ def _residuals(sim: Sim3, frames: FloatArray, pairs: Pairs) -> FloatArray:
     return np.asarray(pairs.target + moved - sim.act(pairs.source))
 
 
-def _weights(residual: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
-    squared = np.einsum("ni,nij,nj->n", residual, information, residual)
+def _weights(whitened: FloatArray) -> tuple[FloatArray, float]:
+    """Weights (n,) of whitened residuals (n, 3), and their spread."""
+    squared = (whitened**2).sum(axis=1)
     spread = float(np.sqrt(max(np.median(squared) / _CHI2_3_MEDIAN, 1e-12)))
     return 1.0 / (1.0 + squared / (_CHI2_3_95 * spread**2)) ** 2, spread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Whitened:
+    """What turns residuals into ones of unit covariance.
+
+    Attributes:
+        root: (n, 3, 3), its transpose times itself is the inverse of a pair's covariance.
+        design: of each frame (14, m, 3), root times the derivatives by the similarity (7) and by the frame
+            (6), and the residual; the first four and the last are filled in anew in each round.
+        rows: of each frame, those of its pairs.
+    """
+
+    root: FloatArray
+    design: list[FloatArray]
+    rows: list[NDArray[np.intp]]
+
+    def residuals(self, residual: FloatArray) -> FloatArray:
+        return np.asarray((self.root @ residual[:, :, None])[:, :, 0])
+
+
+def _whitened(pairs: Pairs) -> _Whitened:
+    root = np.swapaxes(np.linalg.cholesky(np.linalg.inv(pairs.covariance)), 1, 2)
+    rows = [np.flatnonzero(pairs.frame_of == frame) for frame in range(len(pairs.frame_covariance))]
+    design = [np.empty((14, len(own), 3)) for own in rows]
+    for own, columns in zip(rows, design, strict=True):
+        columns[4:7] = np.moveaxis(root[own], 2, 0)
+        columns[7:13] = np.moveaxis(-root[own] @ pairs.by_frame[own], 2, 0)
+    return _Whitened(root=root, design=design, rows=rows)
 
 
 def _equations(
@@ -197,20 +231,32 @@ def _equations(
     frames: FloatArray,
     residual: FloatArray,
     pairs: Pairs,
-    information: FloatArray,
+    whitened: _Whitened,
     weights: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix and gradient over (similarity, frame 0, frame 1, ...), (7 + 6 f)."""
+    """Normal matrix and gradient over (similarity, frame 0, frame 1, ...), (7 + 6 f).
+
+    Args:
+        residual: (n, 3) whitened.
+    """
     size = 7 + 6 * len(frames)
     normal, gradient = np.zeros((size, size)), np.zeros(size)
-    jacobian = point_jacobian(sim.act(pairs.source))
+    placed, weight = sim.act(pairs.source), np.sqrt(weights)
     for frame, prior in enumerate(pairs.frame_covariance):
+        rows, design = whitened.rows[frame], whitened.design[frame]
+        x, y, z = (axis[:, None] for axis in placed[rows].T)
+        by_x, by_y, by_z = design[4:7]
+        # root @ point_jacobian(x, y, z), of which the last three columns stay as they are.
+        design[0] = by_x * x + by_y * y + by_z * z
+        design[1] = by_z * y - by_y * z
+        design[2] = by_x * z - by_z * x
+        design[3] = by_y * x - by_x * y
+        design[13] = residual[rows]
+        weighted = (design * weight[rows, None]).reshape(14, -1)
+        product = weighted @ weighted.T
         at = np.r_[0:7, 7 + 6 * frame : 13 + 6 * frame]
-        rows = pairs.frame_of == frame
-        both = np.concatenate([jacobian[rows], -pairs.by_frame[rows]], axis=2)
-        weighted = (weights[rows, None, None] * information[rows]) @ both
-        normal[np.ix_(at, at)] += np.tensordot(both, weighted, axes=([0, 1], [0, 1]))
-        gradient[at] += np.einsum("nij,ni->j", weighted, residual[rows])
+        normal[np.ix_(at, at)] += product[:13, :13]
+        gradient[at] += product[:13, 13]
         knowledge = np.linalg.inv(prior)
         own = at[7:]
         normal[np.ix_(own, own)] += knowledge
@@ -218,13 +264,14 @@ def _equations(
     return normal, gradient
 
 
-def _neighbours_factor(
-    residual: FloatArray, information: FloatArray, weights: FloatArray, pairs: Pairs, spread: float
-) -> float:
-    """Design effect: variance of weighted sums over cells, over that of independent errors; at least 1."""
+def _neighbours_factor(residual: FloatArray, weights: FloatArray, pairs: Pairs, spread: float) -> float:
+    """Design effect: variance of weighted sums over cells, over that of independent errors; at least 1.
+
+    Args:
+        residual: (n, 3) whitened.
+    """
     cell = np.unique(pairs.cell_of, return_inverse=True)[1]
-    root = np.linalg.cholesky(information)
-    whitened = np.sqrt(weights)[:, None] * np.einsum("nji,nj->ni", root, residual) / spread
+    whitened = np.sqrt(weights)[:, None] * residual / spread
     sums = np.stack([np.bincount(cell, weights=whitened[:, k]) for k in range(3)], axis=1)
     expected = float((whitened**2).sum())
     cells = len(sums)
