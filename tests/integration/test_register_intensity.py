@@ -16,9 +16,11 @@ from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from ingest.register.frame.confirmation import confirm_pose
 from ingest.register.frame.dense_templates import dense_matches
+from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
+from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
 
 CAMERA = Camera(
@@ -35,12 +37,17 @@ def _patchwork(rng: np.random.Generator, cells: int) -> NDArray[np.float64]:
     return values[nearest].reshape(cells, cells)
 
 
-@lru_cache(maxsize=2)
-def _ground(seed: int) -> tuple[PointCloud, PointCloud]:
-    """The same place as laser and as light see it: (scan with speckle, dense cloud with other contrast)."""
+@lru_cache(maxsize=3)
+def _ground(seed: int, period: int | None = None) -> tuple[PointCloud, PointCloud]:
+    """The same place as laser and as light see it: (scan with speckle, dense cloud with other contrast).
+
+    With a period its pattern repeats itself after so many cells.
+    """
     rng = np.random.default_rng(seed)
     cells = 520
     material = _patchwork(rng, cells)
+    if period is not None:
+        material = np.tile(material[:period, :period], (4, 4))[:cells, :cells]
     y, x = np.mgrid[:cells, :cells] * 0.13 - 33.8
     z = 1.5 * np.sin(x / 9.0) * np.cos(y / 7.0)
     high = np.zeros((cells, cells))
@@ -71,8 +78,8 @@ def _pose(east: float, north: float, up: float, heading_deg: float, tilt_deg: fl
 TRUTH = _pose(3.0, -4.0, 42.0, 25.0, 12.0)
 
 
-def _photo(seed: int) -> NDArray[np.uint8]:
-    seen = render(_ground(seed)[1], CAMERA, TRUTH)
+def _photo(seed: int, period: int | None = None) -> NDArray[np.uint8]:
+    seen = render(_ground(seed, period)[1], CAMERA, TRUTH)
     assert seen.intensity is not None
     noisy = cv2.GaussianBlur(seen.intensity.astype(np.float32), (0, 0), 0.7)
     noisy += np.random.default_rng(99).normal(0, 4, noisy.shape).astype(np.float32)
@@ -110,6 +117,20 @@ def test_found_from_afar_and_confirmed() -> None:
 def test_another_place_is_not_confirmed() -> None:
     found = register_frame(_photo(0), CAMERA, _prior(), _ground(1)[0], FrameOptions(threads=1))
     assert not found.accepted
+
+
+def test_the_photo_agrees_with_other_places_where_the_pattern_repeats_itself() -> None:
+    """Copies lie 23 m apart, the places that are searched 21 m beside the pose."""
+    found = []
+    for period in (None, 180):
+        photo, scan = _photo(0, period), _ground(0, period)[0]
+        look = first_look(scan, CAMERA, _prior())
+        assert look is not None
+        views = FrameViews(photo, CAMERA, scan, look, FrameOptions(threads=1))
+        found.append(agreement_elsewhere(views, _prior(), TRUTH, "intensity", 2, 100.0))
+    assert all(elsewhere.places == 2 for elsewhere in found)
+    assert found[0].log_nfa < 1.0
+    assert found[1].log_nfa > 5.0
 
 
 def test_a_pose_that_is_a_few_metres_off_is_not_confirmed() -> None:

@@ -49,21 +49,48 @@ def dense_fitted(
     views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
 ) -> FrameHypothesis | None:
     """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few."""
-    found = start
+    found: FrameHypothesis | None = start
     for spacing_px, piece_px in zip(options.spacing_px, options.piece_px, strict=True):
-        side = dense_side_px(views, spacing_px)
-        renderings = views.renders([found.pose.cam_from_local], side)
-        if not renderings:
-            return None
-        matches = near_places(views.gray, views.camera, renderings[0], found.source, piece_px, options)
-        if len(matches) < _MIN_PLACES:
-            return None
-        settings = dense_pose_options(views, options, spacing_px)
-        pose = refine_pose(matches.pixels, matches.points, found.pose, settings)
-        pose = fitted_under_prior(matches, pose, prior, settings, views.options.correlated_inliers)
-        inliers = independent(views.camera, matches.take(pose.inliers))
-        found = replace(found, pose=pose, matches=matches, inliers=inliers)
+        found = found and _fit_round(views, prior, found, options, spacing_px, piece_px)
+    # A pose that is still on its way may look right already: the pieces that lie near have made it.
+    for _ in range(options.more_rounds):
+        before = found
+        found = found and _fit_round(views, prior, found, options, spacing_px, piece_px)
+        if before is None or found is None or _moved_px(views, before, found) < options.settled_px:
+            break
     return found
+
+
+def _fit_round(
+    views: FrameViews,
+    prior: FramePrior,
+    start: FrameHypothesis,
+    options: DenseFitOptions,
+    spacing_px: float,
+    piece_px: int,
+) -> FrameHypothesis | None:
+    renderings = views.renders([start.pose.cam_from_local], dense_side_px(views, spacing_px))
+    if not renderings:
+        return None
+    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, options)
+    if len(matches) < _MIN_PLACES:
+        return None
+    settings = dense_pose_options(views, options, spacing_px)
+    pose = refine_pose(matches.pixels, matches.points, start.pose, settings)
+    pose = fitted_under_prior(matches, pose, prior, settings, views.options.correlated_inliers)
+    inliers = independent(views.camera, matches.take(pose.inliers))
+    return replace(start, pose=pose, matches=matches, inliers=inliers)
+
+
+def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis) -> float:
+    """How far the fit moved its matches in the picture, in the middle, pixels of the render."""
+    here, there = (
+        views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
+    )
+    scale = dense_side_px(views, views.options.dense_fit.spacing_px[-1]) / max(
+        views.camera.width, views.camera.height
+    )
+    return float(np.median(np.linalg.norm(here - there, axis=1))) * scale
 
 
 def dense_pose_options(views: FrameViews, options: DenseFitOptions, spacing_px: float) -> PoseOptions:

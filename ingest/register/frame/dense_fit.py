@@ -30,6 +30,7 @@ class DenseFitOptions:
         spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
             since edges between splats are known better than their spacing.
         piece_px: side of a piece, round by round.
+        more_rounds: at most, like the last one, until the pose moves less than settled_px.
         near_px: a piece's place is looked for this near.
         window_px: radius of the score map against whose spread a place is judged.
         min_score: height of a place in standard deviations of its map. Low: the robust loss weighs them, and
@@ -40,6 +41,8 @@ class DenseFitOptions:
 
     spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
     piece_px: tuple[int, ...] = (28, 40, 40)
+    more_rounds: int = 8
+    settled_px: float = 0.2
     near_px: int = 6
     window_px: int = 12
     min_score: float = 1.5
