@@ -15,6 +15,7 @@ from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import load_or_build
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import Lineage
 from featuredb.store import Database, MapSummary, Snapshot
 from reloc.candidates import IndexedArea
@@ -62,6 +63,7 @@ class Localiser:
         previous: "Localiser | None" = None,
         cache: Path | None = None,
         also: Collection[str] = (),
+        instead: Mapping[str, FeatureMap] | None = None,
     ) -> "Localiser":
         """Load and index the active maps of a snapshot.
 
@@ -70,6 +72,8 @@ class Localiser:
             previous: areas that have not changed since are taken over from it.
             cache: folder for index files of large areas; None: indexes live in memory only.
             also: quarantined maps that take part as if they were active: a trial before they are.
+            instead: states of maps, by id, that take part in the place of those in the database: a trial
+                before they are committed.
 
         Raises:
             StoreError: the database cannot be read.
@@ -80,9 +84,13 @@ class Localiser:
         active = [m for m in taken if m.descriptors and m.box]
         known = {loaded.key: loaded for loaded in previous._loaded} if previous else {}
         loaded = []
+        trial = instead or {}
         for group in _group(active):
-            key = tuple(sorted(m.write_id for m in group))
-            loaded.append(known[key] if key in known else _load(snapshot, group, key, cache))
+            key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
+            tried = any(m.map_id in trial for m in group)
+            loaded.append(
+                known[key] if key in known and not tried else _load(snapshot, group, key, cache, trial)
+            )
         return cls(loaded, options, snapshot.version, snapshot.lineages())
 
     @property
@@ -163,8 +171,14 @@ class Localiser:
         return chosen
 
 
-def _load(snapshot: Snapshot, group: list[MapSummary], key: tuple[str, ...], cache: Path | None) -> _Loaded:
-    area = build_area([snapshot.load_map(m.map_id) for m in group])
+def _load(
+    snapshot: Snapshot,
+    group: list[MapSummary],
+    key: tuple[str, ...],
+    cache: Path | None,
+    instead: Mapping[str, FeatureMap],
+) -> _Loaded:
+    area = build_area([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
     index = load_or_build(area.descriptors, area.digest, cache)
     _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
     return _Loaded(

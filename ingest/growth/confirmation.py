@@ -149,7 +149,7 @@ def confirm(
     shared = _shared_points(feature_map, witnesses)
     agree = np.zeros_like(shared, dtype=np.bool_)
     enough = (shared >= options.min_shared_points) & (
-        _parallax(feature_map, witnesses) >= options.min_parallax
+        parallax(feature_map, witnesses) >= options.min_parallax
     )
     for i, j in np.argwhere(np.triu(enough, 1)).tolist():
         agree[i, j] = agree[j, i] = independent(everyone[i], everyone[j], options.independent_by)
@@ -222,7 +222,7 @@ def _shared_points(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> NDA
     return np.asarray((sees @ sees.T).toarray(), dtype=np.int64)
 
 
-def _parallax(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> FloatArray:
+def parallax(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
     points = feature_map.points_local()
     seen = feature_map.observations

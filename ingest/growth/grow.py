@@ -20,7 +20,7 @@ from featuredb.store.candidates import mark_used
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
-from ingest.growth.drift import drift_gate, rows_within, with_drift
+from ingest.growth.budget import drift_gate, rows_within, with_drift
 from ingest.growth.grow_photos import GrowPhotosOptions, grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate

@@ -3,7 +3,9 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
@@ -11,6 +13,7 @@ from featuredb.store import Database, MapSummary, Snapshot
 from ingest.growth.canaries import CanaryOptions, CanaryRun, run_canaries
 from ingest.growth.confirmation import Confirmation, ConfirmationOptions, confirm
 from ingest.growth.gates import Gate
+from ingest.growth.trusted_points import answering_with, confirmed_points
 from ingest.growth.witnesses import Heard, NewPhotos, WitnessOptions, hear_witnesses
 from reloc.localiser import Localiser
 
@@ -25,12 +28,35 @@ class PromotionOptions:
     Attributes:
         max_contradictions: share of the outside photos found in a map that may have their known place
             elsewhere; one look-alike among many is no proof against it.
+        answer_with: "confirmed": only points that independent sources have seen keep their descriptors and
+            answer queries; "all": a photo that is altered in one part brings that part in.
+        min_points: that answer; four times the inliers that an answer needs.
     """
 
     max_contradictions: float = 0.25
+    answer_with: Literal["confirmed", "all"] = "confirmed"
+    min_points: int = 60
     confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
     witnesses: WitnessOptions = field(default_factory=WitnessOptions)
     canaries: CanaryOptions = field(default_factory=CanaryOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Examined:
+    """What others say of a map; `feature_map` has descriptors where they confirm it."""
+
+    feature_map: FeatureMap
+    confirmation: Confirmation
+    gates: tuple[Gate, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Ready:
+    """A map that only the canaries may still refuse, and the write id of its state in the database."""
+
+    map_id: str
+    write_id: str
+    found: Examined
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,22 +106,21 @@ def promote_confirmed(
     options = options or PromotionOptions()
     snapshot = database.snapshot()
     waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
-    ready: list[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]] = []
+    ready: list[_Ready] = []
     outcomes: list[Promotion] = []
     for summary in waiting:
         held_back = _held_back(summary, snapshot, budget_m)
         if held_back is not None:
             outcomes.append(held_back)
             continue
-        feature_map = snapshot.load_map(summary.map_id)
-        confirmation, gates = examine(feature_map, snapshot, options, new)
-        failed = next((gate for gate in gates if not gate.passes), None)
+        found = examine(snapshot.load_map(summary.map_id), snapshot, options, new)
+        failed = next((gate for gate in found.gates if not gate.passes), None)
         if failed is not None:
-            outcomes.append(_stays(summary.map_id, failed.reason, failed.message, gates))
+            outcomes.append(_stays(summary.map_id, failed.reason, failed.message, found.gates))
         else:
-            ready.append((summary, feature_map, confirmation, gates))
+            ready.append(_committed(database, summary, found))
     if ready:
-        outcomes += _promote(database, snapshot, localiser, ready, options)
+        outcomes += _promote(database, localiser, ready, options)
     return outcomes
 
 
@@ -126,16 +151,38 @@ def promote_by_hand(
 
 def examine(
     feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
-) -> tuple[Confirmation, tuple[Gate, ...]]:
+) -> Examined:
     """How far others confirm a map: by its own photos alone if they do, else with photos from outside."""
-    alone = confirm(feature_map, options.confirmation)
+    confirmation = confirm(feature_map, options.confirmation)
     heard = hear_witnesses(
         feature_map, _others(feature_map.map_id, snapshot), new, options.confirmation, options.witnesses
     )
-    found = (
-        alone if alone.confirmed_by_others else confirm(feature_map, options.confirmation, heard.witnesses)
+    if not confirmation.confirmed_by_others:
+        confirmation = confirm(feature_map, options.confirmation, heard.witnesses)
+    part = feature_map
+    if options.answer_with == "confirmed":
+        points = confirmed_points(feature_map, options.confirmation, heard.witnesses)
+        part = answering_with(feature_map, points)
+    gates = (
+        *confirmation.gates,
+        points_gate(part, options.min_points),
+        contradiction_gate(heard, options.max_contradictions),
     )
-    return found, (*found.gates, contradiction_gate(heard, options.max_contradictions))
+    return Examined(feature_map=part, confirmation=confirmation, gates=gates)
+
+
+def points_gate(feature_map: FeatureMap, least: int) -> Gate:
+    """Whether enough points can answer."""
+    seen = feature_map.observations
+    count = len(np.unique(seen.point_index[seen.has_descriptor]))
+    return Gate(
+        name="answering_points",
+        reason="FEW_POINTS",
+        figure=count,
+        limit=least,
+        passes=count >= least,
+        message=f"{count} of its points are seen by independent sources, {least} are needed",
+    )
 
 
 def contradiction_gate(heard: Heard, limit: float) -> Gate:
@@ -209,25 +256,34 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
+def _committed(database: Database, summary: MapSummary, found: Examined) -> _Ready:
+    """The map with the descriptors that it will answer with, still in quarantine; the same place."""
+    seen, described = found.feature_map.observations, summary.descriptors
+    if int(seen.has_descriptor.sum()) == described:
+        return _Ready(map_id=summary.map_id, write_id=summary.write_id, found=found)
+    result = database.commit_map(
+        found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
+    )
+    return _Ready(map_id=summary.map_id, write_id=result.write_id, found=found)
+
+
 def _promote(
     database: Database,
-    snapshot: Snapshot,
     before: Localiser,
-    ready: Sequence[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]],
+    ready: Sequence[_Ready],
     options: PromotionOptions,
 ) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression."""
-    together = _tried(database, before, [m for _, m, _, _ in ready], options)
+    together = _tried(database, before, [r.found.feature_map for r in ready], options)
     if not together.regressions or len(ready) == 1:
-        return _decide(database, snapshot, before, ready, together)
+        return _decide(database, before, ready, together)
     outcomes: list[Promotion] = []
     localiser = before
     for item in ready:
-        run = _tried(database, localiser, [item[1]], options)
-        decided = _decide(database, snapshot, localiser, [item], run)
+        run = _tried(database, localiser, [item.found.feature_map], options)
+        decided = _decide(database, localiser, [item], run)
         outcomes += decided
         if decided[0].promoted:
-            snapshot = database.snapshot()
             localiser = Localiser.open(database, previous=localiser)
     return outcomes
 
@@ -240,27 +296,23 @@ def _tried(
 
 
 def _decide(
-    database: Database,
-    snapshot: Snapshot,
-    before: Localiser,
-    ready: Sequence[tuple[MapSummary, FeatureMap, Confirmation, tuple[Gate, ...]]],
-    run: CanaryRun,
+    database: Database, before: Localiser, ready: Sequence[_Ready], run: CanaryRun
 ) -> list[Promotion]:
     gate = canary_gate(run)
-    ids = [summary.map_id for summary, _, _, _ in ready]
+    ids = [r.map_id for r in ready]
+    gates = {r.map_id: (*r.found.gates, gate) for r in ready}
     if not gate.passes:
-        return [_stays(s.map_id, gate.reason, gate.message, (*gates, gate)) for s, _, _, gates in ready]
-    reason = f"{'; '.join(dict.fromkeys(c.message for _, _, c, _ in ready))}; {run.message}"
-    active = [m.write_id for m in snapshot.maps() if m.status == "active"]
+        return [_stays(m, gate.reason, gate.message, gates[m]) for m in ids]
+    confirmed = "; ".join(dict.fromkeys(r.found.confirmation.message for r in ready))
+    reason = f"{confirmed}; {run.message}"
+    asked = database.snapshot(before.snapshot)
+    active = [m.write_id for m in asked.maps() if m.status == "active"]
     try:
         database.set_status(
-            ids, "active", reason, based_on={s.map_id: s.write_id for s, _, _, _ in ready}, active=active
+            ids, "active", reason, based_on={r.map_id: r.write_id for r in ready}, active=active
         )
     except ConflictError as error:
         _LOG.info("promotion of %s waits: %s", ids, error)
-        return [_stays(s.map_id, "CONFLICT", str(error), (*gates, gate)) for s, _, _, gates in ready]
+        return [_stays(m, "CONFLICT", str(error), gates[m]) for m in ids]
     _LOG.info("promoted %s: %s", ids, reason)
-    return [
-        Promotion(map_id=s.map_id, promoted=True, reason_code="", reason=reason, gates=(*gates, gate))
-        for s, _, _, gates in ready
-    ]
+    return [Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=gates[m]) for m in ids]

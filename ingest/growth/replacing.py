@@ -1,6 +1,5 @@
 """A new anchor re-places what was grown: overlaps measured, graph solved, all maps moved in one commit."""
 
-import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,8 +14,8 @@ from featuredb.maps.feature_map import FeatureMap, MapStatus
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame, in_frame, move_map
 from featuredb.store import Database, Snapshot
-from featuredb.store.commits import write_time
-from ingest.fingerprint import digest, options_fingerprint
+from featuredb.store.canaries import list_canaries
+from ingest.growth.canaries import CanaryOptions, CanaryRun, check_known
 from ingest.growth.map_graph import (
     OWN,
     PlacedMap,
@@ -31,11 +30,11 @@ from ingest.growth.map_graph import (
     place_of,
     placed_maps,
 )
-from ingest.growth.overlaps import Overlap, OverlapOptions, measure_overlap
+from ingest.growth.new_overlaps import NewOverlaps, measure_new, overlaps_to_measure
+from ingest.growth.overlaps import OverlapOptions
 from ingest.growth.pose_graph import GraphSolution, PoseGraphOptions, solve_pose_graph
-from ingest.workspace import read_json, write_json
+from reloc.localiser import Localiser
 
-_LOG = logging.getLogger(__name__)
 # Said of maps whose parent was placed anew, see featuredb.store.changes.
 _FLAG = "was placed anew"
 
@@ -51,6 +50,7 @@ class ReplaceOptions:
 
     gap_m: float = 5.0
     min_move_m: float = 0.01
+    canaries: CanaryOptions = field(default_factory=CanaryOptions)
     overlap: OverlapOptions = field(default_factory=OverlapOptions)
     graph: PoseGraphOptions = field(default_factory=PoseGraphOptions)
 
@@ -75,7 +75,8 @@ class Replacement:
     """What became of the grown maps around new anchors.
 
     Attributes:
-        reason: None, or the pose graph's; `message` for people. Nothing was committed where there is one.
+        reason: None, the pose graph's, or CANARY; `message` for people. Nothing was committed where there
+            is one.
         version: of the database since; -1 where nothing was committed.
         moved: all maps that were committed anew.
         measured: what was said of each new overlap, "map - anchor: ...".
@@ -111,14 +112,6 @@ class Replacement:
         }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Measured:
-    """New overlaps, by the grown map whose evidence will have them."""
-
-    edges: dict[str, list[StoredEdge]]
-    notes: tuple[str, ...]
-
-
 def replace_descendants(
     database: Database, work: Path, options: ReplaceOptions | None = None, *, budget_m: float
 ) -> Replacement | None:
@@ -134,10 +127,10 @@ def replace_descendants(
     options = options or ReplaceOptions()
     snapshot = database.snapshot()
     maps = placed_maps(snapshot)
-    wanted = overlaps_to_measure(maps, options)
+    wanted = overlaps_to_measure(maps, options.gap_m)
     if not wanted:
         return None
-    measured = _measure(snapshot, maps, wanted, work, options)
+    measured = measure_new(snapshot, maps, wanted, work, options.overlap)
     if not measured.edges:
         return None
     members = _members(maps, measured)
@@ -151,79 +144,7 @@ def replace_descendants(
     return _commit(database, snapshot, maps, measured, solution, frame, options, budget_m)
 
 
-def overlaps_to_measure(maps: Mapping[str, PlacedMap], options: ReplaceOptions) -> list[tuple[str, str]]:
-    """Pairs of a grown map and a map that may hold it: parents placed anew, and anchors that came later."""
-    pairs: set[tuple[str, str]] = set()
-    anchors = [m for m in maps.values() if m.is_anchor and m.status == "active"]
-    for me in maps.values():
-        if me.is_anchor:
-            continue
-        places = {edge.map_id: edge.place for edge in me.edges}
-        pairs |= {(me.map_id, m) for m, place in places.items() if m in maps and maps[m].place != place}
-        for anchor in anchors:
-            later = write_time(anchor.write_id) > write_time(me.write_id)
-            if anchor.map_id not in places and later and _touch(me, anchor, options.gap_m):
-                pairs.add((me.map_id, anchor.map_id))
-    return sorted(pairs)
-
-
-def _touch(a: PlacedMap, b: PlacedMap, gap_m: float) -> bool:
-    if not len(a.corners) or not len(b.corners):
-        return False
-    other = a.frame.enu_from(b.frame).act(b.corners)
-    low, high = a.corners.min(axis=0)[:2] - gap_m, a.corners.max(axis=0)[:2] + gap_m
-    return bool((other.min(axis=0)[:2] <= high).all() and (low <= other.max(axis=0)[:2]).all())
-
-
-def _measure(
-    snapshot: Snapshot,
-    maps: Mapping[str, PlacedMap],
-    wanted: list[tuple[str, str]],
-    work: Path,
-    options: ReplaceOptions,
-) -> _Measured:
-    loaded: dict[str, FeatureMap] = {}
-    edges: dict[str, list[StoredEdge]] = {}
-    notes: list[str] = []
-    for map_id, other_id in wanted:
-        key = digest(
-            map_id, maps[map_id].place, other_id, maps[other_id].place, options_fingerprint(options.overlap)
-        )
-        cache = work / "overlaps" / f"{key[:24]}.json"
-        if cache.is_file():
-            edge, note = _from_json(read_json(cache))
-        else:
-            for m in (map_id, other_id):
-                loaded[m] = loaded.get(m) or snapshot.load_map(m)
-            overlap = measure_overlap(loaded[map_id], loaded[other_id], options.overlap)
-            edge, note = _edge(overlap, other_id, maps[other_id].place), overlap.message
-            write_json(cache, {"edge": None if edge is None else edge.as_json(), "note": note})
-        notes.append(f"{map_id} - {other_id}: {note}")
-        if edge is not None:
-            edges.setdefault(map_id, []).append(edge)
-    _LOG.info("overlaps: %s", "; ".join(notes))
-    return _Measured(edges=edges, notes=tuple(notes))
-
-
-def _edge(overlap: Overlap, other_id: str, place: str) -> StoredEdge | None:
-    if overlap.other_from_map is None or overlap.covariance is None:
-        return None
-    return StoredEdge(
-        map_id=other_id,
-        place=place,
-        other_from_map=overlap.other_from_map,
-        covariance=overlap.covariance,
-        shared_points=overlap.shared_points,
-        photos=overlap.photos,
-    )
-
-
-def _from_json(value: Mapping[str, Any]) -> tuple[StoredEdge | None, str]:
-    edge = value.get("edge")
-    return None if edge is None else StoredEdge.from_json(edge), str(value.get("note", ""))
-
-
-def _members(maps: Mapping[str, PlacedMap], measured: _Measured) -> list[str]:
+def _members(maps: Mapping[str, PlacedMap], measured: NewOverlaps) -> list[str]:
     """All maps that the new overlaps have a say in."""
     pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if _holds(maps, e)]
     pairs += [(m, e.map_id) for m, edges in measured.edges.items() for e in edges]
@@ -237,7 +158,7 @@ def _holds(maps: Mapping[str, PlacedMap], edge: StoredEdge) -> bool:
 def _solve(
     maps: Mapping[str, PlacedMap],
     members: list[str],
-    measured: _Measured,
+    measured: NewOverlaps,
     frame: LocalFrame,
     options: ReplaceOptions,
 ) -> GraphSolution:
@@ -250,7 +171,7 @@ def _commit(
     database: Database,
     snapshot: Snapshot,
     maps: Mapping[str, PlacedMap],
-    measured: _Measured,
+    measured: NewOverlaps,
     solution: GraphSolution,
     frame: LocalFrame,
     options: ReplaceOptions,
@@ -283,6 +204,14 @@ def _commit(
         before = growth_of(maps[map_id].evidence).get("drift_m")
         reports.append(MovedMap(map_id=map_id, move_m=ways[map_id], drift_before_m=before, drift_m=drift))
     new = _with_generations(new, maps)
+    canaries = known_canaries_of(database, {m.map_id: m for m in new}, options.canaries)
+    if canaries.regressions:
+        return Replacement(
+            reason="CANARY",
+            message=f"nothing is moved: {canaries.message}",
+            measured=measured.notes,
+            left_out=tuple(str(fit.edge) for fit in solution.left_out),
+        )
     results = database.commit_maps(
         new, replaces=[m.map_id for m in new], based_on={m.map_id: maps[m.map_id].write_id for m in new}
     )
@@ -295,6 +224,17 @@ def _commit(
         left_out=tuple(str(fit.edge) for fit in solution.left_out),
         flagged=tuple(sorted({m for r in results for m in r.flagged})),
     )
+
+
+def known_canaries_of(database: Database, new: Mapping[str, FeatureMap], options: CanaryOptions) -> CanaryRun:
+    """The database's known queries, before and after maps move. Images of the maps would move along."""
+    known = list_canaries(database)
+    if not known:
+        return CanaryRun(checks=(), note="no known queries")
+    before = Localiser.open(database)
+    after = Localiser.open(database, previous=before, instead=new)
+    checks = tuple(check_known(database, canary, before, after, options) for canary in known)
+    return CanaryRun(checks=checks, note=f"{len(known)} known queries")
 
 
 def _way(move: Sim3, corners: FloatArray) -> float:

@@ -1,0 +1,266 @@
+"""Pure parts of trust in growth: graph of maps, drift, cut models, answering points, reports."""
+
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.maps.feature_map import FeatureMap
+from ingest.colmap_bridge import Model
+from ingest.growth.budget import drift_gate
+from ingest.growth.canaries import CanaryCheck, CanaryRun
+from ingest.growth.confirmation import ConfirmationOptions, Source, Witness
+from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
+from ingest.growth.map_graph import (
+    PlacedMap,
+    StoredEdge,
+    corners_of,
+    drift_m,
+    growth_of,
+    no_surer_than,
+    place_of,
+    solve_with_new,
+)
+from ingest.growth.new_overlaps import overlaps_to_measure
+from ingest.growth.overlaps import model_of
+from ingest.growth.promotion import Promotion, canary_gate, contradiction_gate, points_gate
+from ingest.growth.replacing import MovedMap, Replacement
+from ingest.growth.submodel import keep_photos
+from ingest.growth.trusted_points import answering_with, confirmed_points
+from ingest.growth.witnesses import Heard
+from tests.support.scene_strip import EDGE, FRAME, east, strip_map
+
+_ANCHOR = strip_map("A", 20.0, owners=["survey"])
+
+
+def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
+    growth = growth_of(feature_map.placement.evidence)
+    return PlacedMap(
+        map_id=feature_map.map_id,
+        write_id=f"{created_ms:012x}{'0' * 20}",
+        status=feature_map.status,
+        status_reason="",
+        generation=feature_map.generation,
+        parents=feature_map.parents,
+        frame=feature_map.frame,
+        covariance=feature_map.placement.covariance,
+        place=place_of(feature_map),
+        corners=corners_of(feature_map),
+        edges=tuple(StoredEdge.from_json(e) for e in growth.get("edges", ())),
+        evidence=feature_map.placement.evidence,
+    )
+
+
+def test_an_edge_survives_json() -> None:
+    edge = StoredEdge(
+        map_id="x", place="p", other_from_map=Sim3.exp(np.arange(7) * 0.01), covariance=EDGE,
+        shared_points=5, photos=2,
+    )  # fmt: skip
+    again = StoredEdge.from_json(json.loads(json.dumps(edge.as_json())))
+    np.testing.assert_allclose(again.other_from_map.matrix(), edge.other_from_map.matrix(), atol=1e-12)
+    np.testing.assert_array_equal(again.covariance, edge.covariance)
+    assert (again.map_id, again.place, again.shared_points, again.photos) == ("x", "p", 5, 2)
+
+
+def test_a_map_that_moves_has_another_place() -> None:
+    moved = strip_map("A", 20.0, owners=["survey"], move=east(0.01))
+    assert place_of(_ANCHOR) == place_of(strip_map("A", 20.0, owners=["else"]))
+    assert place_of(moved) != place_of(_ANCHOR)
+
+
+def test_drift_of_a_chain_grows_with_its_steps() -> None:
+    """Drift by the graph: the covariance of n edges, at the worst corner of the box."""
+    maps = {"A": _placed(_ANCHOR)}
+    previous, drifts = _ANCHOR, []
+    for k in range(1, 4):
+        feature_map = strip_map(f"m{k}", 20.0 + 25.0 * k, parents=[previous], seed=k)
+        placed = _placed(feature_map)
+        solution = solve_with_new(maps, f"m{k}", list(placed.edges), FRAME)
+        np.testing.assert_allclose(solution.covariance_relative[f"m{k}"], k * EDGE, rtol=1e-6, atol=1e-15)
+        corners = corners_of(feature_map)
+        jacobian = point_jacobian(corners)
+        spread = jacobian @ (k * EDGE) @ np.swapaxes(jacobian, 1, 2)
+        expected = 1.96 * np.sqrt(np.linalg.eigvalsh(spread).max())
+        drifts.append(drift_m(solution.covariance_relative[f"m{k}"], corners))
+        assert drifts[-1] == pytest.approx(expected, rel=1e-6)
+        maps[f"m{k}"] = placed
+        previous = feature_map
+    assert drifts[0] < drifts[1] < drifts[2]
+    assert drift_m(EDGE, np.zeros((0, 3))) == 0.0
+
+
+def test_two_edges_of_the_same_photos_count_once() -> None:
+    """Both hold the map as surely as one fit to both did; independent, they would be twice as sure."""
+    edge = StoredEdge(
+        map_id="A", place="", other_from_map=Sim3.identity(), covariance=EDGE, shared_points=1, photos=1
+    )
+    found = no_surer_than([edge, replace(edge, map_id="B")], EDGE)
+    together = np.linalg.inv(sum(np.linalg.inv(e.covariance) for e in found))
+    np.testing.assert_allclose(together, EDGE, rtol=1e-9)
+    # One that is no surer than the fit stays as it is.
+    assert no_surer_than([edge], EDGE / 2)[0].covariance is edge.covariance
+    loose = no_surer_than([edge, replace(edge, map_id="B")], EDGE / 10)
+    np.testing.assert_array_equal(loose[0].covariance, EDGE)
+
+
+def test_the_drift_gate() -> None:
+    assert drift_gate(0.49, 0.5).passes
+    refused = drift_gate(0.51, 0.5)
+    assert not refused.passes
+    assert refused.reason == "DRIFT_BUDGET"
+    assert "0.51 m" in refused.message
+
+
+def test_which_overlaps_are_measured_anew() -> None:
+    """Anchors that came after a map and touch it; parents that are not where they were; nothing else."""
+    child = strip_map("m", 50.0, parents=[_ANCHOR])
+    far = strip_map("F", 200.0)
+    near = strip_map("N", 75.0)
+
+    def wanted(anchor: FeatureMap, others: dict[FeatureMap, int]) -> list[tuple[str, str]]:
+        maps = {"A": _placed(anchor), "m": _placed(child, 1000)}
+        maps |= {m.map_id: _placed(m, at) for m, at in others.items()}
+        return overlaps_to_measure(maps, 5.0)
+
+    assert wanted(_ANCHOR, {}) == []
+    assert wanted(_ANCHOR, {near: 2000, far: 2000}) == [("m", "N")]
+    assert wanted(_ANCHOR, {near: 500}) == []  # it was there when the map was placed, and did not hold it
+    assert wanted(_ANCHOR, {replace(near, status="quarantined"): 2000}) == []
+    assert wanted(strip_map("A", 20.0, owners=["survey"], move=east(1.0)), {}) == [("m", "A")]
+
+
+def _model() -> Model:
+    feature_map = strip_map("m", 40.0)
+    return model_of(feature_map, feature_map.images)
+
+
+def test_a_model_is_cut_to_the_photos_that_hang_together() -> None:
+    model = _model()
+    assert keep_photos(model, range(8)) is model
+    cut = keep_photos(model, [1, 2, 5])
+    assert cut is not None
+    assert cut.rows.tolist() == [1, 2, 5]
+    assert (cut.track_lengths() >= 2).all()
+    # The same point, seen by the same keypoint of the same photo.
+    for o in (0, len(cut.point_of) // 2, len(cut.point_of) - 1):
+        photo = int(cut.rows[cut.photo_of[o]])
+        same = (model.photo_of == photo) & (model.keypoint_of == cut.keypoint_of[o])
+        np.testing.assert_array_equal(model.xyz[model.point_of[same]][0], cut.xyz[cut.point_of[o]])
+    assert keep_photos(model, [3]) is None
+    assert keep_photos(model, []) is None
+
+
+def test_a_model_falls_apart_where_nothing_is_shared() -> None:
+    """Photos 0 and 1 see the west, 2 to 4 the east; the larger part is kept."""
+    model = _model()
+    west = model.xyz[model.point_of, 0] < 40.0
+    keep = np.where(model.photo_of < 2, west, ~west) & (model.photo_of < 5)
+    apart = replace(
+        model, point_of=model.point_of[keep], photo_of=model.photo_of[keep],
+        keypoint_of=model.keypoint_of[keep],
+    )  # fmt: skip
+    cut = keep_photos(apart, range(5))
+    assert cut is not None
+    assert cut.rows.tolist() == [2, 3, 4]
+
+
+def test_only_points_of_two_sources_answer() -> None:
+    """What only Eve's photos show, though they fit the rest, has no descriptors."""
+    feature_map = strip_map("m", 40.0, owners=["anna", "ben", "eve", "anna"])
+    eve = [i.image_id for i in feature_map.images if i.owner == "eve"]
+    seen = feature_map.observations
+    fake = feature_map.points_local()[:, 0] < 25.0
+    keep = ~fake[seen.point_index] | np.isin(seen.image_id, eve)
+    parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
+    poisoned = replace(feature_map, observations=type(seen)(**parts))
+    points = confirmed_points(poisoned, ConfirmationOptions())
+    assert not points[fake].any()
+    assert points[~fake].mean() > 0.9
+    part = answering_with(poisoned, points)
+    described = np.unique(part.observations.point_index[part.observations.has_descriptor])
+    assert not fake[described].any()
+    assert len(part.points) == len(poisoned.points)
+    assert (part.observations.descriptors[~part.observations.has_descriptor] == 0).all()
+    assert points_gate(part, 60).passes
+    assert not points_gate(part, 10**6).passes
+    # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
+    clean = strip_map("m", 40.0, owners=["anna", "ben"])
+    assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
+    trusted = confirmed_points(poisoned, ConfirmationOptions(trusted_owners=("eve",)))
+    assert trusted[fake].mean() > 0.5
+
+
+def test_a_witness_makes_points_answer() -> None:
+    feature_map = strip_map("m", 40.0, owners=["anna"])
+    rows = np.arange(100, dtype=np.int64)
+    witness = Witness(name="w", source=Source(owner="ben"), center=np.array([0.0, -60.0, 20.0]), points=rows)
+    alone = confirmed_points(feature_map, ConfirmationOptions())
+    found = confirmed_points(feature_map, ConfirmationOptions(), [witness])
+    assert not alone.any()
+    assert found[rows].mean() > 0.9
+    assert not found[100:].any()
+
+
+def test_contradictions_and_canaries_as_gates() -> None:
+    witness = Witness(name="w", source=Source(owner="b"), center=np.zeros(3), points=np.zeros(0, np.int64))
+    fine = Heard(witnesses=(witness,) * 3, contradictions=("one is off",))
+    assert contradiction_gate(fine, 0.25).passes
+    wrong = Heard(witnesses=(witness,), contradictions=("one is off", "two"))
+    assert contradiction_gate(wrong, 0.25).reason == "CONTRADICTED"
+    assert not contradiction_gate(wrong, 0.25).passes
+    assert contradiction_gate(Heard(witnesses=(), contradictions=()), 0.25).passes
+    good = CanaryCheck(name="a", before="right", after="right")
+    bad = CanaryCheck(name="b", before="right", after="lost", regression="no longer localised")
+    assert canary_gate(CanaryRun(checks=(good,), note="")).passes
+    refused = canary_gate(CanaryRun(checks=(good, bad), note=""))
+    assert not refused.passes
+    assert "b: no longer localised" in refused.message
+
+
+def test_a_report_tells_all_in_both_forms() -> None:
+    report = GrowthReport(
+        database="db",
+        started=datetime(2026, 6, 1, tzinfo=UTC),
+        seconds=1.25,
+        rounds=2,
+        version=7,
+        photos=(
+            PhotoFate(name="p", owner="anna", outcome="promoted", map_id="m"),
+            PhotoFate(name="q", owner="eve", outcome="waiting", reason_code="ALONE", reason="alone"),
+        ),
+        maps=(
+            GrownEntry(
+                map_id="m", status="active", reason_code="", reason="2 sources", photos=("p",), points=9,
+                steps=1, drift_m=0.31, budget_m=0.5, agreements=("maps A and B differ by 0.42 m",),
+            ),
+        ),
+        promotions=(
+            Promotion(map_id="m", promoted=True, reason_code="", reason="2 sources"),
+            Promotion(map_id="old", promoted=False, reason_code="ONE_SOURCE", reason="1 of 2"),
+        ),
+        replacements=(
+            Replacement(
+                reason=None, message="1 map placed anew",
+                moved=(MovedMap(map_id="m", move_m=0.2, drift_before_m=0.4, drift_m=0.1),),
+                left_out=("a - b",), flagged=("z",),
+            ),
+        ),
+        notes=("a note",),
+    )  # fmt: skip
+    text = report.as_text()
+    for part in (
+        "1 in active maps", "1 waiting", "ALONE: 1 photos", "1 step from an anchor", "0.31 of 0.50 m",
+        "differ by 0.42 m", "map old: stays in quarantine: ONE_SOURCE", "moved by 0.20 m", "overlap a - b",
+        "note: a note", "quarantined, because nothing holds them any more: z",
+    ):  # fmt: skip
+        assert part in text
+    assert text.count("map m:") == 1
+    assert report.promoted == ("m",)
+    told = json.loads(json.dumps(report.as_json()))
+    assert told["photos"][1]["reason_code"] == "ALONE"
+    assert told["replacements"][0]["moved"][0]["drift_before_m"] == 0.4
+    assert Path(told["database"]).name == "db"
