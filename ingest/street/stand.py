@@ -21,10 +21,10 @@ class StandOptions:
     Attributes:
         step_m: distance of neighbouring places. SIFT bridges 30 degrees or so: at 12 m from a front a step
             of 12 m is 45 degrees between neighbours, half of that from the middle between them.
-        headings: views around each place; at 75 degrees of field of view six overlap by a fifth.
+        headings: views around each place; 75 degrees wide, six overlap by a fifth.
         eye_m: above the ground. pitch_deg: of the views; people hold a camera a little upward.
         free_m: nothing stands within so much of a place ...
-        low_m, high_m: ... between these heights above the ground: kerbs are stepped over, crowns passed under.
+        low_m, high_m: ... between these heights above the ground: kerbs are stepped over, crowns walked under.
     """
 
     step_m: float = 12.0

@@ -23,7 +23,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
+from featuredb.maps.lineage import GROWTH
 from featuredb.render.cloud import PointCloud
+from ingest.growth.map_graph import StoredEdge, corners_of, drift_m, growth_of, place_of
 from ingest.street.stand import StandOptions, standing_places, views_around
 from ingest.street.synthesis import (
     SourcePhoto,
@@ -53,7 +55,8 @@ class StreetOptions:
         same_size: whose sizes on the surface differ by less than this factor, and
         max_angle_rad: whose descriptors differ by no more (COLMAP's 0.7), show one place.
         min_views: of a point; what one view alone shows may be an artefact of its drawing.
-        sigma_m: standard deviation of a point on each axis, at least: scan, aerial poses and drawing.
+        sigma_m: standard deviation of a point on each axis, at least, and of what all share: scan, aerial
+            poses and drawing. turn_sigma: of what all share in rotation (radians) and scale.
     """
 
     width_px: int = 640
@@ -67,6 +70,7 @@ class StreetOptions:
     max_angle_rad: float = 0.7
     min_views: int = 2
     sigma_m: float = 0.06
+    turn_sigma: float = 3e-4
     stand: StandOptions = field(default_factory=StandOptions)
     synthesis: SynthesisOptions = field(default_factory=SynthesisOptions)
 
@@ -221,13 +225,7 @@ def _assembled(aerial: FeatureMap, views: Sequence[_Described], options: StreetO
             has_descriptor=np.ones(len(point), np.bool_),
             **columns,
         ),
-        placement=Placement(
-            method="map",
-            local_from_sfm=Sim3.identity(),
-            covariance=aerial.placement.covariance,
-            residual_rms_m=aerial.placement.residual_rms_m,
-            evidence={"street": {"views": len(views), "sources": len(aerial.images)}},
-        ),
+        placement=_placement(aerial, len(views), options),
         extractor_fingerprint=aerial.extractor_fingerprint,
         status="quarantined",
         generation=aerial.generation + 1,
@@ -235,6 +233,36 @@ def _assembled(aerial: FeatureMap, views: Sequence[_Described], options: StreetO
         source=aerial.source,
         licence=aerial.licence,
         provenance={"street_views_of": aerial.map_id},
+    )
+
+
+def _placement(aerial: FeatureMap, views: int, options: StreetOptions) -> Placement:
+    """That of the aerial map, and what drawing adds, which all points share."""
+    sigmas = np.array([options.turn_sigma] * 4 + [options.sigma_m] * 3)
+    own = np.diag(sigmas**2)
+    edge = StoredEdge(
+        map_id=aerial.map_id,
+        place=place_of(aerial),
+        other_from_map=Sim3.identity(),
+        covariance=own,
+        shared_points=0,
+        photos=len(aerial.images),
+    )
+    growth = growth_of(aerial.placement.evidence)
+    relative = own + np.reshape(growth.get("covariance_relative", np.zeros(49)), (7, 7))
+    return Placement(
+        method="map",
+        local_from_sfm=Sim3.identity(),
+        covariance=aerial.placement.covariance + own,
+        residual_rms_m=aerial.placement.residual_rms_m,
+        evidence={
+            "street": {"views": views, "photos": len(aerial.images)},
+            GROWTH: {
+                "edges": [edge.as_json()],
+                "covariance_relative": relative.ravel().tolist(),
+                "drift_m": drift_m(relative, corners_of(aerial)),
+            },
+        },
     )
 
 
