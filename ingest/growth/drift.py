@@ -1,94 +1,226 @@
-"""How far a grown map may have drifted from its anchors, by the graph of all maps, and what is enough."""
+"""How far the photos of a refined reconstruction may be off, given the existing points that hold it.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+A similarity says how the whole may lie; that a reconstruction bends where nothing holds it any more, it does
+not. That is in the normal equations of the adjustment: poses and lenses with the free points eliminated,
+existing points known to what they are. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 6 and 9.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
-from ingest.growth.confirmation import ConfirmationOptions, confirm, sources_json
-from ingest.growth.gates import Gate
-from ingest.growth.map_graph import (
-    PlacedMap,
-    StoredEdge,
-    corners_of,
-    drift_m,
-    growth_of,
-    no_surer_than,
-    solve_with_new,
-)
-from ingest.growth.values import GrownMap
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.sim3 import point_jacobian
+from ingest.colmap_anchored import FixedPoints, with_observations
+from ingest.colmap_bridge import Model
+from ingest.precision import Linearised, linearise
+
+_REFERENCE_SIDE_PX = 1600.0
 
 
-def drift_gate(drift: float, budget_m: float) -> Gate:
-    """Whether a map is near enough to its anchors."""
-    return Gate(
-        name="drift",
-        reason="DRIFT_BUDGET",
-        figure=drift,
-        limit=budget_m,
-        passes=drift <= budget_m,
-        message=f"it may have drifted {drift:.2f} m from its anchors, {budget_m:.2f} m are allowed; it "
-        "waits for an anchor",
-    )
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftOptions:
+    """How the bending is judged.
 
-
-def with_drift(
-    grown: GrownMap, maps: Mapping[str, PlacedMap], confirmation: ConfirmationOptions, budget_m: float
-) -> tuple[FeatureMap, float, FloatArray]:
-    """The map with its overlaps, drift and covariance by the graph of all maps.
-
-    Returns:
-        The map, its drift (metres), its covariance (7, 7) relative to the anchors.
+    Attributes:
+        keypoint_px: standard deviation of a keypoint on an image of 1600 pixels.
+        adopted_focal_rel, adopted_distortion: what a lens taken from a map may be off: reconstructions of a
+            dozen photos differ by so much between subsets of a flight.
+        own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
+        max_photos: of more, the rest is taken to be no worse; the equations are dense.
+        max_points: free points that take part; fewer know less, so the bound stays one.
     """
-    feature_map = grown.feature_map
-    growth = growth_of(feature_map.placement.evidence)
-    edges = no_surer_than(
-        [
-            replace(StoredEdge.from_json(edge), place=maps[edge["map_id"]].place)
-            for edge in growth.get("edges", ())
-            if edge["map_id"] in maps
-        ],
-        grown.placement.covariance_relative,
-    )
-    covariance = feature_map.placement.covariance
-    relative = np.asarray(growth["covariance_relative"], dtype=np.float64).reshape(7, 7)
-    solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
-    if solution.reason is None and feature_map.map_id in solution.covariance:
-        covariance = solution.covariance[feature_map.map_id]
-        relative = solution.covariance_relative[feature_map.map_id]
-    drift = drift_m(relative, corners_of(feature_map))
-    confirmed = confirm(feature_map, confirmation)
-    gates = {g.name: g.as_json() for g in (*confirmed.gates, drift_gate(drift, budget_m))}
-    growth |= {
-        "drift_m": round(drift, 6),
-        "budget_m": budget_m,
-        "covariance_relative": relative.ravel().tolist(),
-        "edges": [edge.as_json() for edge in edges],
-        "sources": sources_json(confirmed),
-        "gates": {**growth.get("gates", {}), **gates},
-    }
-    placement = replace(
-        feature_map.placement,
-        covariance=covariance,
-        evidence={**feature_map.placement.evidence, GROWTH: growth},
-    )
-    return replace(feature_map, placement=placement, status="quarantined"), drift, relative
+
+    keypoint_px: float = 0.5
+    adopted_focal_rel: float = 0.01
+    adopted_distortion: float = 0.005
+    own_focal_rel: float = 0.15
+    own_distortion: float = 0.1
+    max_photos: int = 300
+    max_points: int = 20_000
 
 
-def rows_within(
-    feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, budget_m: float
-) -> list[int]:
-    """Rows of the photos whose points are within the budget; images come in the order of the rows."""
-    points = feature_map.points_local()
-    seen = feature_map.observations
-    within = []
-    for row, image in zip(rows, feature_map.images, strict=True):
-        own = points[seen.point_index[seen.image_id == image.image_id]]
-        places = np.vstack([own, image.cam_from_local.center[None]])
-        # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
-        if drift_m(relative, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
-            within.append(row)
-    return within
+def inflation(
+    model: Model,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    kept: NDArray[np.bool_],
+    adopted: Sequence[int],
+    covariance: FloatArray,
+    dilution: float,
+    options: DriftOptions,
+) -> float:
+    """By how much a similarity's covariance (7, 7) must grow to hold the positions of all photos; at least 1.
+
+    Args:
+        model: refined, in metres. keypoints: of its photos.
+        fixed: existing points, those observations of `kept` (m,).
+        adopted: cameras whose lens was a map's.
+        dilution: how many times larger the variance of residuals is than independent keypoints would have
+            it, neighbours included.
+    """
+    if len(model.rows) > options.max_photos or not kept.any():
+        return 1.0
+    spread = center_covariances(model, keypoints, fixed, kept, adopted, dilution, options)
+    jacobian = point_jacobian(model.centers())
+    claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    seen = np.union1d(model.photo_of, fixed.photo_of[kept])  # a photo that was left out says nothing
+    ratio = np.linalg.eigvalsh(spread[seen])[:, -1] / np.linalg.eigvalsh(claimed[seen])[:, -1]
+    return float(max(1.0, ratio.max()))
+
+
+def center_covariances(
+    model: Model,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    kept: NDArray[np.bool_],
+    adopted: Sequence[int],
+    dilution: float,
+    options: DriftOptions,
+) -> FloatArray:
+    """(k, 3, 3) square metres, of the photos' centres in the local frame, relative to the existing points."""
+    model = _thinned(model, options)
+    free_xy = np.zeros((len(model.point_of), 2))
+    for k in range(len(model.rows)):
+        mine = model.photo_of == k
+        free_xy[mine] = keypoints[k][model.keypoint_of[mine]]
+    free, free_lens = _derivatives(model, model.xyz, model.point_of, model.photo_of, free_xy)
+    held, held_lens = _derivatives(
+        model, fixed.xyz, fixed.point_of[kept], fixed.photo_of[kept], fixed.pixels[kept]
+    )
+    sides = np.array([max(c.width, c.height) for c in model.cameras])
+    sigma = options.keypoint_px * np.maximum(1.0, sides / _REFERENCE_SIDE_PX)[model.camera_of]
+    size, lenses = 6 * len(model.rows), _lens_columns(model)
+    columns = size + lenses[-1]
+    normal = np.zeros((columns, columns))
+    poses_free = _rows(free, free_lens, model, lenses, size, columns, sigma)
+    poses_held = _rows(held, held_lens, model, lenses, size, columns, sigma)
+    normal += (poses_held.T @ poses_held).toarray() + (poses_free.T @ poses_free).toarray()
+    by_point = _blocks(free.by_point / sigma[free.photo_of][:, None, None], free.point_of, len(model.xyz))
+    normal -= _eliminated(poses_free, by_point, free, sigma)
+    normal /= dilution
+    normal[size:, size:] += np.diag(_lens_knowledge(model, adopted, options))
+    # Photos without observations leave their rows empty; the damping is far below what any photo knows.
+    covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)) + 1e-9 * np.eye(columns))
+    centers = np.empty((len(model.rows), 3, 3))
+    for k, pose in enumerate(model.cam_from_sfm):
+        block = covariance[6 * k + 3 : 6 * k + 6, 6 * k + 3 : 6 * k + 6]
+        centers[k] = pose.rotation.T @ block @ pose.rotation
+    return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)
+
+
+def _thinned(model: Model, options: DriftOptions) -> Model:
+    """The model with at most so many points, evenly chosen."""
+    if len(model.xyz) <= options.max_points:
+        return model
+    chosen = np.zeros(len(model.xyz), dtype=np.bool_)
+    chosen[np.linspace(0, len(model.xyz) - 1, options.max_points).astype(np.int64)] = True
+    return with_observations(model, chosen[model.point_of])
+
+
+def _derivatives(
+    model: Model,
+    xyz: FloatArray,
+    point_of: NDArray[np.int64],
+    photo_of: NDArray[np.int64],
+    xy: FloatArray,
+) -> tuple[Linearised, list[FloatArray]]:
+    """Derivatives by points and poses, and by each camera's lens parameters (m, 2, l) of its observations."""
+    linear = linearise(model.cameras, model.camera_of, model.cam_from_sfm, xyz, point_of, photo_of, xy)
+    lens: list[FloatArray] = []
+    rotations = np.array([p.rotation for p in model.cam_from_sfm])
+    translations = np.array([p.translation for p in model.cam_from_sfm])
+    in_camera = np.einsum("mij,mj->mi", rotations[photo_of], xyz[point_of]) + translations[photo_of]
+    for c, camera in enumerate(model.cameras):
+        rows = model.camera_of[photo_of] == c
+        columns = []
+        for index in camera.lens_parameters():
+            step = 1e-4 * max(abs(camera.params[index]), 1.0)
+            up, down = (_with(camera, index, camera.params[index] + s) for s in (step, -step))
+            columns.append((up.project(in_camera[rows]) - down.project(in_camera[rows])) / (2 * step))
+        lens.append(
+            np.nan_to_num(np.stack(columns, axis=2)) if columns else np.zeros((int(rows.sum()), 2, 0))
+        )
+    return linear, lens
+
+
+def _with(camera: Camera, index: int, value: float) -> Camera:
+    params = list(camera.params)
+    params[index] = value
+    return Camera(model=camera.model, width=camera.width, height=camera.height, params=tuple(params))
+
+
+def _lens_columns(model: Model) -> NDArray[np.int64]:
+    """First column of each camera's lens, and their number at the end."""
+    counts = [len(camera.lens_parameters()) for camera in model.cameras]
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+def _lens_knowledge(model: Model, adopted: Sequence[int], options: DriftOptions) -> FloatArray:
+    """Inverse variances of all lens parameters."""
+    known: list[float] = []
+    for c, camera in enumerate(model.cameras):
+        own = c not in adopted
+        focal = options.own_focal_rel if own else options.adopted_focal_rel
+        distortion = options.own_distortion if own else options.adopted_distortion
+        for index in camera.lens_parameters():
+            is_focal = camera.params[index] > 10.0  # pixels; distortion coefficients are below one
+            known.append(1.0 / ((focal * camera.params[index]) if is_focal else distortion) ** 2)
+    return np.array(known)
+
+
+def _rows(
+    linear: Linearised,
+    lens: Sequence[FloatArray],
+    model: Model,
+    lenses: NDArray[np.int64],
+    size: int,
+    columns: int,
+    sigma: FloatArray,
+) -> sparse.csr_array:
+    """Whitened rows (2 m, columns) of the derivatives by poses and lenses."""
+    scale = 1.0 / sigma[linear.photo_of][:, None, None]
+    poses = _blocks(linear.by_pose * scale, linear.photo_of, len(model.rows))
+    parts = [sparse.hstack([poses, sparse.csr_array((poses.shape[0], columns - size))]).tocsr()]
+    for c, by_lens in enumerate(lens):
+        if by_lens.shape[2] == 0:
+            continue
+        rows = np.flatnonzero(model.camera_of[linear.photo_of] == c)
+        values = by_lens * scale[rows]
+        at = (2 * rows[:, None, None] + np.arange(2)[None, :, None]) + 0 * values.astype(np.int64)
+        column = size + lenses[c] + np.arange(by_lens.shape[2])[None, None, :] + 0 * at
+        parts.append(
+            sparse.csr_array(
+                (values.ravel(), (at.ravel(), column.ravel())), shape=(2 * len(linear.photo_of), columns)
+            )
+        )
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return sparse.csr_array(total)
+
+
+def _blocks(values: FloatArray, group: NDArray[np.int64], count: int) -> sparse.csr_array:
+    """Sparse (2 m, count * d) with the blocks (m, 2, d) at the columns of their groups."""
+    m, _, d = values.shape
+    rows = np.broadcast_to((2 * np.arange(m)[:, None] + np.arange(2))[:, :, None], values.shape)
+    columns = np.broadcast_to(d * group[:, None, None] + np.arange(d), values.shape)
+    finite = np.nan_to_num(values)
+    return sparse.csr_array((finite.ravel(), (rows.ravel(), columns.ravel())), shape=(2 * m, d * count))
+
+
+def _eliminated(
+    poses: sparse.csr_array, by_point: sparse.csr_array, linear: Linearised, sigma: FloatArray
+) -> FloatArray:
+    """What eliminating the free points takes from the normal matrix of poses and lenses."""
+    scaled = np.nan_to_num(linear.by_point) / sigma[linear.photo_of][:, None, None]
+    information = np.zeros((by_point.shape[1] // 3, 3, 3))
+    np.add.at(information, linear.point_of, np.swapaxes(scaled, 1, 2) @ scaled)
+    trace = np.trace(information, axis1=1, axis2=2)
+    inverse = np.linalg.inv(information + (1e-9 * trace + 1e-12)[:, None, None] * np.eye(3))
+    mixed = sparse.csr_array(poses.T @ by_point)
+    return np.asarray((mixed @ sparse.block_diag(inverse, format="csr") @ mixed.T).toarray())

@@ -18,6 +18,7 @@ from ingest.colmap_anchored import Anchored, FixedPoints, with_observations
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors, find_anchors
+from ingest.growth.drift import DriftOptions, inflation
 from ingest.growth.localised import in_frame
 from ingest.growth.placement import (
     Held,
@@ -41,12 +42,14 @@ class GrowOptions:
         min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
             lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
             reconstruction cannot be bent to what the existing maps say.
+        drift: how far the refined reconstruction may bend beyond what holds it.
         maps: what goes into the map; the height datum is that of the parents.
     """
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
     min_held_share: float = 0.5
+    drift: DriftOptions = field(default_factory=DriftOptions)
     maps: MapOptions = field(default_factory=MapOptions)
 
 
@@ -105,9 +108,22 @@ def grow_component(
     placement = replace(placement, gates=(*placement.gates, gate))
     if not gate.passes:
         return Refused(reason=gate.reason, message=gate.message, rows=rows, gates=placement.gates)
+    assert held.fit is not None
+    grown_by = inflation(
+        adjusted.model,
+        keypoints,
+        fixed,
+        adjusted.fixed_kept,
+        constant,
+        held.fit.covariance,
+        max(held.fit.spread, 1.0) ** 2 * held.fit.neighbours_factor,
+        options.drift,
+    )
+    placement = widened(placement, grown_by)
     complete = with_existing(adjusted, fixed, good.take(sharp), placement.parents)
     complete = only_photos(complete, [k for k in range(len(rows)) if k not in outside])
-    return assemble(complete, placement, held, photos, features_of, near, identity, options)
+    more = {"bending": grown_by}
+    return assemble(complete, placement, held, photos, features_of, near, identity, options, more)
 
 
 def _meeting_place(
@@ -121,6 +137,15 @@ def _meeting_place(
     main = next(a.area for a in areas if a.area.frame == frame)
     datum = main.maps[0].height_datum
     return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
+
+
+def widened(placement: MapsPlacement, factor: float) -> MapsPlacement:
+    """The placement with its covariance relative to the existing maps multiplied."""
+    assert placement.covariance is not None
+    assert placement.covariance_relative is not None
+    wider = placement.covariance_relative * factor
+    on_earth = placement.covariance - placement.covariance_relative
+    return replace(placement, covariance_relative=wider, covariance=wider + on_earth)
 
 
 def without_photos(model: Model, photos: Sequence[int]) -> Model:

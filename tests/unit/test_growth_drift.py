@@ -1,0 +1,94 @@
+"""What is said of a reconstruction's bending, against independent runs with noise."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
+from ingest.growth.drift import DriftOptions, center_covariances, inflation
+from tests.support.new_photos import NewPhotos, take_photos
+from tests.support.scenes import box_points, looking_at, random_descriptors
+
+COUNT = 40  # world points that the existing map has; they lie in the west
+PHOTOS = 6
+
+
+def walk(seed: int) -> tuple[NewPhotos, FloatArray, FixedPoints]:
+    """Photos that walk 60 m east; only the first two see existing points."""
+    world = np.random.default_rng(5)
+    points = np.concatenate([box_points(world, 120) + np.array([30.0 * k, 0.0, 0.0]) for k in range(4)])
+    poses = [
+        looking_at(np.array([18.0 * k, -40.0, 25.0]), np.array([18.0 * k, 0.0, 3.0])) for k in range(PHOTOS)
+    ]
+    new = take_photos(
+        np.random.default_rng(seed),
+        points,
+        random_descriptors(world, len(points)),
+        poses,
+        sfm_from_local=Sim3.identity(),
+        noise_px=0.5,
+        point_noise_m=0.02,
+        pose_noise_m=0.02,
+    )
+    point_of, photo_of, pixels = [], [], []
+    for k in (0, 1):
+        rows = np.flatnonzero(new.world_of[k] < COUNT)
+        point_of.append(new.world_of[k][rows])
+        photo_of.append(np.full(len(rows), k))
+        pixels.append(new.features[k].features.xy[rows].astype(np.float64))
+    fixed = FixedPoints(
+        xyz=points[:COUNT],
+        point_of=np.concatenate(point_of),
+        photo_of=np.concatenate(photo_of),
+        pixels=np.concatenate(pixels),
+    )
+    return new, points, fixed
+
+
+def test_centres_are_off_as_far_as_is_said() -> None:
+    """Mean squared normalised error of three coordinates is 3; the far end is several times less sure."""
+    options = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
+    lengths, sigmas = [], []
+    for seed in range(10):
+        new, _, fixed = walk(seed)
+        model = new.model
+        world = np.array(
+            [
+                new.world_of[k][f]
+                for k, f in zip(model.photo_of.tolist(), model.keypoint_of.tolist(), strict=True)
+            ]
+        )
+        free = with_observations(model, (world >= COUNT) | (model.photo_of > 1))
+        keypoints = list(new.keypoints().values())
+        done = adjust_anchored(free, keypoints, fixed, [0], AnchoredOptions())
+        spread = center_covariances(done.model, keypoints, fixed, done.fixed_kept, [0], 1.0, options)
+        off = done.model.centers() - np.array([p.center for p in new.poses])
+        lengths.append([float(e @ np.linalg.solve(c, e)) for e, c in zip(off, spread, strict=True)])
+        sigmas.append(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
+    assert 1.5 < np.mean(lengths) < 6.0, np.mean(lengths, axis=0)
+    assert np.mean(sigmas, axis=0)[-1] > 3.0 * np.mean(sigmas, axis=0)[0]
+
+
+def test_a_lens_that_may_be_off_widens_it() -> None:
+    new, _, fixed = walk(1)
+    keypoints = list(new.keypoints().values())
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    sure = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
+    narrow = center_covariances(new.model, keypoints, fixed, kept, [0], 1.0, sure)
+    wide = center_covariances(new.model, keypoints, fixed, kept, [0], 1.0, DriftOptions())
+    assert (np.trace(wide, axis1=1, axis2=2) > np.trace(narrow, axis1=1, axis2=2)).all()
+
+
+def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
+    new, _, fixed = walk(2)
+    keypoints = list(new.keypoints().values())
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
+    arguments = (new.model, keypoints, fixed, kept, [0])
+    factor = inflation(*arguments, tiny, 1.0, DriftOptions())
+    assert factor > 10.0
+    assert inflation(*arguments, tiny * factor, 1.0, DriftOptions()) < 1.0 + 1e-6
+    assert inflation(*arguments, ample, 1.0, DriftOptions()) == 1.0
+    assert inflation(*arguments, tiny, 4.0, DriftOptions()) > 2.0 * factor
