@@ -21,12 +21,18 @@ def register(subparsers: Any) -> None:
     kinds = ingest.add_subparsers(title="what to ingest", metavar="KIND", required=True)
     photos = kinds.add_parser(
         "photos",
-        help="a folder of photos with GPS",
-        description="Reconstruct a folder of photos, place it by their GPS and commit the maps. A killed "
-        "ingest goes on where it was when the same command runs again.",
+        help="a folder of photos with GPS, or a table of photos",
+        description="Reconstruct photos, place them by their GPS and commit the maps. A killed ingest goes "
+        "on where it was when the same command runs again.",
     )
     add_database_argument(photos)
-    photos.add_argument("folder", metavar="FOLDER", type=Path, help="folder of photos, searched through")
+    photos.add_argument(
+        "folder",
+        metavar="PATH",
+        type=Path,
+        help="folder of photos, searched through; or a table (.csv, .parquet, .jsonl) with the columns path "
+        "or id, lat, lon, accuracy, time, owner, licence, title",
+    )
     _add_selection(photos)
     _add_making(photos)
     _add_control(photos)
@@ -46,6 +52,12 @@ def _add_selection(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--name", default="", help="name of the map; default: the folder's name")
     group.add_argument("--owner", default="", help="of photos that do not name their own")
     group.add_argument("--licence", default="", help="of the photos, e.g. CC-BY-4.0")
+    group.add_argument(
+        "--trust-geotags",
+        action="store_true",
+        help="positions of a table place active maps, as those of a folder do; by default such maps are "
+        "quarantined",
+    )
 
 
 def _add_making(parser: argparse.ArgumentParser) -> None:
@@ -106,6 +118,20 @@ def _add_control(parser: argparse.ArgumentParser) -> None:
 def _add_running(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("how the job runs")
     group.add_argument("--workers", type=int, default=None, help="processes; default: one per core")
+    group.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        default=None,
+        help="of a Dask scheduler, e.g. tcp://10.0.0.1:8786, whose workers do the work; they need the work "
+        "folder and the photos under the same paths (extra dask)",
+    )
+    group.add_argument(
+        "--vocabulary",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="of visual words for finding similar photos; default: the one that comes with featuredb",
+    )
     group.add_argument(
         "--work",
         type=Path,
@@ -172,6 +198,7 @@ def summary(report: "IngestReport") -> str:
 def _options(args: argparse.Namespace) -> "IngestOptions":
     """The pipeline's options; what the command line leaves open keeps its default."""
     from featuredb.features.extractor import ExtractorOptions
+    from featuredb.index.vocabulary import read_vocabulary
     from ingest.map_builder import MapOptions
     from ingest.pipeline import IngestOptions
     from ingest.reconstruction import MapMakingOptions
@@ -184,7 +211,12 @@ def _options(args: argparse.Namespace) -> "IngestOptions":
         maps=MapOptions(height_datum=args.height_datum, **_given(min_track_length=args.min_track_length)),
         cameras=args.cameras,
     )
-    scan = ScanOptions(exclude=tuple(args.exclude), owner=args.owner, licence=args.licence)
+    scan = ScanOptions(
+        exclude=tuple(args.exclude),
+        owner=args.owner,
+        licence=args.licence,
+        trust_geotags=args.trust_geotags,
+    )
     return IngestOptions(
         scan=scan,
         making=making,
@@ -193,6 +225,8 @@ def _options(args: argparse.Namespace) -> "IngestOptions":
         work=args.work,
         stop_after=args.stop_after,
         survey=_survey(args),
+        dask=args.dask,
+        vocabulary=None if args.vocabulary is None else read_vocabulary(args.vocabulary),
         **_given(workers=args.workers),
     )
 

@@ -36,6 +36,11 @@ class TwoView:
     homography: FloatArray
     candidates: NDArray[np.int64]
 
+    @property
+    def is_watermark(self) -> bool:
+        """Whether the matches are a shift of what stands near the borders of both photos."""
+        return int(self.config) == int(pycolmap.TwoViewGeometryConfiguration.WATERMARK)
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """By field name, to be written to a file."""
         return {f.name: getattr(self, f.name) for f in fields(self)}

@@ -13,15 +13,20 @@ that differ of 256:
 A threshold of 24 bits lies between 18 and 44. `tests/integration/test_scan_real.py` measures it again.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from ingest.photo import Photo
+
+if TYPE_CHECKING:
+    from ingest.matching import Matched
 
 _HASH_SIDE = 16
 _SAMPLED_SIDE = 64
@@ -85,7 +90,8 @@ def near_duplicates(
 
     The copy with most pixels is kept, then one with a position, then the first by name. Photos that both
     say when, where or with what they were taken must agree in it, so that a scene that stands still and
-    is photographed twice keeps both photos.
+    is photographed twice keeps both photos; of a site's photos only the picture counts. The time grows
+    linearly with the number of photos.
 
     Args:
         photos: usable ones.
@@ -94,21 +100,65 @@ def near_duplicates(
     if not photos:
         return {}
     bits = hash_bits(hashes)
-    kept: list[int] = []
+    buckets = _Buckets(bits, options.max_bits)
     copies: dict[str, tuple[str, int]] = {}
     for i in sorted(range(len(photos)), key=lambda i: _preference(photos[i])):
-        distances = hash_distances(bits[i], bits[kept])
+        candidates = buckets.near(i)
+        distances = hash_distances(bits[i], bits[candidates])
         near = [
-            (int(distances[j]), kept[j])
-            for j in np.flatnonzero(distances <= options.max_bits)
-            if _agree(photos[i], photos[kept[j]], options)
+            (int(distances[k]), int(candidates[k]))
+            for k in np.flatnonzero(distances <= options.max_bits)
+            if _agree(photos[i], photos[int(candidates[k])], options)
         ]
         if near:
             distance, best = min(near)
             copies[photos[i].name] = (photos[best].name, distance)
         else:
-            kept.append(i)
+            buckets.keep(i)
     return copies
+
+
+class _Buckets:
+    """Finds the kept hashes near another without looking at all of them.
+
+    Hashes that differ in at most b bits agree in at least one of b + 1 bands of bits.
+    """
+
+    def __init__(self, bits: NDArray[np.uint8], max_bits: int) -> None:
+        edges = np.linspace(0, 8 * bits.shape[1], max_bits + 2).astype(int)
+        single = np.unpackbits(bits, axis=1)
+        weights = 1 << np.arange(int(np.diff(edges).max()), dtype=np.int64)
+        self._keys = np.stack(
+            [single[:, a:b] @ weights[: b - a] for a, b in itertools.pairwise(edges)], axis=1
+        )
+        self._kept: list[dict[int, list[int]]] = [{} for _ in range(max_bits + 1)]
+
+    def near(self, i: int) -> NDArray[np.int64]:
+        """Kept rows that share a band with row i, rising."""
+        found: set[int] = set()
+        for band, key in zip(self._kept, self._keys[i].tolist(), strict=True):
+            found.update(band.get(key, ()))
+        return np.array(sorted(found), dtype=np.int64)
+
+    def keep(self, i: int) -> None:
+        """Row i is one that others may be copies of."""
+        for band, key in zip(self._kept, self._keys[i].tolist(), strict=True):
+            band.setdefault(key, []).append(i)
+
+
+def copies_of(photos: Sequence[Photo], matched: "Matched") -> dict[int, int]:
+    """Rows of photos that show the picture of another owner's photo, each with the row that is kept.
+
+    The picture may have been cut, framed, marked or scaled: what matched says so (ingest.overlays). Photos
+    of one owner are left alone: who photographs twice from one place does no harm.
+    """
+    group_of: dict[int, set[int]] = {}
+    for i, j in matched.copies:
+        if photos[i].owner != photos[j].owner:
+            group = group_of.get(i, {i}) | group_of.get(j, {j})
+            group_of |= dict.fromkeys(group, group)
+    kept = {i: min(group, key=lambda k: _preference(photos[k])) for i, group in group_of.items()}
+    return {i: best for i, best in sorted(kept.items()) if i != best}
 
 
 def _preference(photo: Photo) -> tuple[int, bool, str]:
@@ -119,6 +169,8 @@ def _agree(a: Photo, b: Photo, options: DuplicateOptions) -> bool:
     """Whether nothing that both photos say of themselves speaks against their being copies."""
     if abs(a.width * b.height / (a.height * b.width) - 1.0) > options.max_aspect:
         return False
+    if a.gps_is_hint or b.gps_is_hint:
+        return True  # what photo sites say of a picture that was uploaded again is of the upload
     for mine, other in ((a.make, b.make), (a.model, b.model)):
         if mine and other and mine != other:
             return False

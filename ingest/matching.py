@@ -1,7 +1,7 @@
 """Stage: matches of each pair of photos, verified by two-view geometry, one file a pair."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from ingest.colmap_bridge import TwoView, verify_pair
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.extract import read_features
 from ingest.fingerprint import digest, options_fingerprint
+from ingest.overlays import OverlayOptions, is_copy, without_overlay
 from ingest.pairs import Pair
 from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
 
@@ -33,6 +34,7 @@ class MatchOptions:
         error_reference_side_px: keypoints are located on images of about this size.
         min_inliers: pairs with fewer verified matches do not count. Pairs of different places had none at
             all (tools/pair_inliers.py); repeated structure gives more, and two good photos hundreds.
+        overlays: what is a watermark, and what is a copy.
         seed: of RANSAC.
     """
 
@@ -41,6 +43,7 @@ class MatchOptions:
     max_error_px: float = 2.0
     error_reference_side_px: int = 1600
     min_inliers: int = 20
+    overlays: OverlayOptions = field(default_factory=OverlayOptions)
     seed: int = 0
 
 
@@ -79,6 +82,7 @@ class Matched:
 
     Attributes:
         inliers: number of verified matches of the pairs that have enough of them.
+        copies: pairs among them whose matches are those of two copies of one picture.
         files: where every pair's geometry lies.
         reused: pairs that were matched already.
         lost: why some pairs could not be matched.
@@ -86,6 +90,7 @@ class Matched:
 
     inliers: dict[Pair, int]
     files: dict[Pair, Path]
+    copies: frozenset[Pair] = frozenset()
     reused: int = 0
     lost: tuple[Lost, ...] = ()
 
@@ -94,13 +99,25 @@ class Matched:
         return Matched(
             inliers=self.inliers | other.inliers,
             files=self.files | other.files,
+            copies=self.copies | other.copies,
             reused=self.reused + other.reused,
             lost=self.lost + other.lost,
         )
 
+    def without(self, rows: Collection[int]) -> "Matched":
+        """Without the verified pairs of some photos."""
+        kept = {(i, j): n for (i, j), n in self.inliers.items() if i not in rows and j not in rows}
+        return replace(self, inliers=kept, copies=self.copies & kept.keys())
+
     def geometry(self, pair: Pair) -> TwoView:
         """The two-view geometry of a pair, read from its file."""
-        return TwoView(**read_arrays(self.files[pair]))
+        return read_two_view(self.files[pair])
+
+
+def read_two_view(path: Path) -> TwoView:
+    """The geometry in a file of this stage."""
+    arrays = read_arrays(path)
+    return TwoView(**{f.name: arrays[f.name] for f in fields(TwoView)})
 
 
 def match_pairs(
@@ -119,10 +136,10 @@ def match_pairs(
     """
     files = {pair: _match_file(views[pair[0]], views[pair[1]], workspace, options) for pair in pairs}
     todo: dict[int, list[Pair]] = {}
-    counts: dict[Pair, int] = {}
+    counts: dict[Pair, _Outcome] = {}
     for pair, file in files.items():
         if file.exists():
-            counts[pair] = len(read_array(file, "inliers"))
+            counts[pair] = _outcome(file)
         else:
             todo.setdefault(pair[0], []).append(pair)
     tasks = [
@@ -139,8 +156,10 @@ def match_pairs(
     for own, outcome in zip(todo.values(), outcomes, strict=True):
         if not isinstance(outcome, Lost):
             counts |= dict(zip(own, outcome, strict=True))
+    enough = {p: counts[p] for p in files if p in counts and counts[p][0] >= options.min_inliers}
     return Matched(
-        inliers={p: counts[p] for p in files if counts.get(p, 0) >= options.min_inliers},
+        inliers={pair: count for pair, (count, _) in enough.items()},
+        copies=frozenset(pair for pair, (_, copy) in enough.items() if copy),
         files=files,
         reused=reused,
         lost=tuple(o for o in outcomes if isinstance(o, Lost)),
@@ -173,18 +192,29 @@ def _distinct_nearest(
     return np.where(good, rows[:, 0], -1)
 
 
-def _match_one(task: MatchTask) -> list[int]:
-    """Match one photo with its others and write a file for each; the numbers of verified matches."""
+_Outcome = tuple[int, bool]
+"""Number of verified matches of a pair, and whether its photos are copies."""
+
+
+def _outcome(file: Path) -> _Outcome:
+    """Of a pair that was matched already."""
+    return len(read_array(file, "inliers")), bool(read_array(file, "copy"))
+
+
+def _match_one(task: MatchTask) -> list[_Outcome]:
+    """Match one photo with its others and write a file for each; what became of each pair."""
     use_threads(1)
     features = read_features(task.photo.features).features
     return [_match_pair(task, features, other, target) for other, target in task.others]
 
 
-def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) -> int:
+def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) -> _Outcome:
     if target.exists():  # a worker that died had come so far
-        return len(read_array(target, "inliers"))
+        return _outcome(target)
     b = read_features(other.features).features
-    matches = mutual_matches(a.descriptors, b.descriptors, task.options)
+    options, sizes = task.options, ((a.width, a.height), (b.width, b.height))
+    matches = mutual_matches(a.descriptors, b.descriptors, options)
+    matches = without_overlay(a.xy, b.xy, *sizes, matches, options.overlays)
     side = max(a.width, a.height, b.width, b.height)
     view = verify_pair(
         task.photo.camera,
@@ -193,11 +223,15 @@ def _match_pair(task: MatchTask, a: Features, other: PhotoView, target: Path) ->
         b.xy,
         matches,
         focal_known=task.photo.focal_known and other.focal_known,
-        max_error_px=task.options.max_error_px * max(1.0, side / task.options.error_reference_side_px),
-        seed=task.options.seed,
+        max_error_px=options.max_error_px * max(1.0, side / options.error_reference_side_px),
+        seed=options.seed,
     )
-    write_arrays(target, view.arrays())
-    return len(view.inliers)
+    if view.is_watermark:
+        view = replace(view, inliers=view.inliers[:0])
+    pixels = a.xy[view.inliers[:, 0]], b.xy[view.inliers[:, 1]]
+    copy = is_copy(pixels[0].astype(np.float64), pixels[1].astype(np.float64), *sizes, options.overlays)
+    write_arrays(target, view.arrays() | {"copy": np.array(copy)})
+    return len(view.inliers), copy
 
 
 def _match_file(a: PhotoView, b: PhotoView, workspace: Workspace, options: MatchOptions) -> Path:

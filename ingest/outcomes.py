@@ -82,11 +82,13 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
         code, reason = "stopped", f"the ingest stopped after {stop_after}, as asked"
     elif photo.status == "ok" and photo.name in result.lost:
         code, reason = "lost", result.lost[photo.name]
+    elif photo.status == "ok" and photo.name in result.copies:
+        code, reason = "copy", f"the picture of {result.copies[photo.name]}, cut, framed or marked"
     elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
         code, reason = "no_matches", "no other photo shows the same place"
     elif photo.status == "ok":
         code, reason = "no_pose", "its matches fit no reconstruction of at least three photos"
-    skipped = photo.status == "skipped" or code == "unreadable"
+    skipped = photo.status == "skipped" or code in ("unreadable", "copy")
     return _outcome(
         photo, result, status="skipped" if skipped else "not_registered", code=code, reason=reason
     )

@@ -13,10 +13,11 @@ PhotoStatus = Literal["ok", "skipped"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Photo:
-    """One file of the folder, usable or not.
+    """One file of the folder or table, usable or not.
 
     Attributes:
-        name: path within the ingested folder, with forward slashes; unique within the ingest.
+        name: path within the ingested folder, with forward slashes, or what the table calls it; unique
+            within the ingest.
         path: where the file lies.
         sha256: hex digest of its bytes, "" where it could not be read.
         status: ok, or skipped with a `reason` for people and a `reason_code` for programs.
@@ -28,10 +29,13 @@ class Photo:
             where the photo names no camera, so that it shares with none.
         focal_px: focal length from EXIF in pixels of the stored image, or None.
         capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.
-        gps: position prior from EXIF, or None.
+        gps: position prior from EXIF or a table, or None.
+        gps_is_hint: nobody answers for the position (a photo site's table): good enough to look for
+            neighbours there, not to place an active map by.
         altitude_reference: what gps.height_m is counted from: sea_level, ellipsoid or unknown.
         relative_altitude_m: height above take-off by a drone's barometer, or None.
-        owner, licence: attribution from EXIF (Artist, Copyright) or the ingest's options.
+        owner, licence: attribution from a table, EXIF (Artist, Copyright) or the ingest's options.
+        title: from a table.
         duplicate_of: name of the photo that was kept instead, "" where this is no duplicate.
         warnings: what was wrong in the photo's metadata without making it unusable.
     """
@@ -51,9 +55,11 @@ class Photo:
     focal_px: float | None = None
     capture_time: datetime | None = None
     gps: GeoPrior | None = None
+    gps_is_hint: bool = False
     altitude_reference: AltitudeReference = "unknown"
     relative_altitude_m: float | None = None
     owner: str = ""
     licence: str = ""
+    title: str = ""
     duplicate_of: str = ""
     warnings: tuple[str, ...] = ()

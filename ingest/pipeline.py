@@ -20,6 +20,7 @@ from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.photo import Photo
+from ingest.photo_table import is_table, read_table
 from ingest.reconstruction import (
     Component,
     MapMakingOptions,
@@ -30,7 +31,7 @@ from ingest.reconstruction import (
 )
 from ingest.register.control.model import Survey
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome
-from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder
+from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder, scan_table
 from ingest.stage_clock import StageClock
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
@@ -98,6 +99,9 @@ def ingest_photos(
 ) -> IngestReport:
     """Scan, extract, match, reconstruct, place by GPS, build and commit.
 
+    Args:
+        folder: of photos, searched through, or a table of them (see ingest.photo_table).
+
     A killed ingest goes on where it was when it is called again with the same photos and options, and
     gives the same maps under the same ids. Photos that cannot be placed are reported, and nothing of them
     is committed.
@@ -118,7 +122,7 @@ def ingest_photos(
     if options.stop_after == "scan":
         result = Reconstructed(stopped_after="scan")
     else:
-        with executor_of(options, shared=(root, folder)) as executor:
+        with executor_of(options, shared=(root, folder.parent if is_table(folder) else folder)) as executor:
             result = reconstruct_photos(
                 photos,
                 workspace,
@@ -145,7 +149,7 @@ def ingest_photos(
         stages=clock.timings,
         photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
-        warnings=_warnings(result, outcomes, options),
+        warnings=(*scanned.notes, *_warnings(result, outcomes, options)),
     )
 
 
@@ -165,7 +169,10 @@ def _scan(
 ) -> ScanResult:
     cache = root / "scan" / f"{digest(str(folder.absolute()))[:16]}.json"
     with clock.stage("scan") as counts:
-        scanned = scan_folder(folder, options.scan, progress, cache)
+        if is_table(folder):
+            scanned = scan_table(read_table(folder), options.scan, progress, cache)
+        else:
+            scanned = scan_folder(folder, options.scan, progress, cache)
         counts |= {"reused": len(scanned.photos) - scanned.read, "total": len(scanned.photos)}
     return scanned
 
@@ -203,7 +210,7 @@ def executor_of(options: IngestOptions, shared: Sequence[Path]) -> Iterator[Exec
 
 
 def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) -> MapIdentity:
-    name = options.name or folder.absolute().name
+    name = options.name or (folder.stem if is_table(folder) else folder.absolute().name)
     return MapIdentity(
         map_id=f"{job_id}-{number}",
         name=name if number == 0 else f"{name} ({number + 1})",

@@ -23,6 +23,7 @@ from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.colmap_bridge import Model
+from ingest.duplicates import copies_of
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import FeatureFiles, PhotoFeatures, extract_photos, features_key, read_keypoints
 from ingest.fingerprint import options_fingerprint
@@ -105,6 +106,7 @@ class Reconstructed:
         components: placed models, largest cluster first; empty until they are placed.
         unreadable: photos by name whose pixels could not be read, with the reason.
         lost: photos by name whose tasks ended every worker that ran them, with the reason.
+        copies: photos by name that show the picture of another owner's, with that one's name.
         features_per_photo: number of features by photo name.
         pairs: pairs tried, by row.
         inliers: verified matches of the pairs that have enough of them.
@@ -118,6 +120,7 @@ class Reconstructed:
     components: tuple[Component, ...] = ()
     unreadable: dict[str, str] = field(default_factory=dict)
     lost: dict[str, str] = field(default_factory=dict)
+    copies: dict[str, str] = field(default_factory=dict)
     features_per_photo: dict[str, int] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
     inliers: dict[Pair, int] = field(default_factory=dict)
@@ -187,8 +190,11 @@ def reconstruct_photos(
                 views, more, workspace, options.matching, executor, progress, names
             )
         counts |= {"reused": matched.reused, "total": len(matched.files)}
+    copies = copies_of(usable, matched)
+    matched = matched.without({row for row, _ in copies.items()})
     done = replace(
         done,
+        copies={usable[row].name: usable[kept].name for row, kept in copies.items()},
         features_per_photo={
             p.name: len(read_keypoints(f)) for p, f in zip(usable, features.paths, strict=True)
         },
@@ -301,7 +307,7 @@ def _reconstruct(
         chosen = [photos[row] for row in cluster.rows]
         positions, sigmas = _priors(chosen, local_frame_of(chosen))
         for row, position, sigma in zip(cluster.rows, positions.tolist(), sigmas.tolist(), strict=True):
-            if np.isfinite(sigma).all():
+            if np.isfinite(sigma).all() and not photos[row].gps_is_hint:
                 views[row] = replace(views[row], prior_position=tuple(position), prior_sigma_m=tuple(sigma))
     return reconstruct_clusters(
         clusters,
@@ -340,6 +346,9 @@ def _component(
 ) -> Component:
     """Place one model and build its map where the placement is accepted.
 
+    Positions that nobody answers for place a quarantined map: it answers nothing and places nothing until
+    something better confirms it.
+
     Args:
         photos: all usable ones.
         features: of the model's.
@@ -374,6 +383,7 @@ def _component(
         residual_rms_m=placed.residual_rms_m,
         evidence=_evidence(placed, [chosen[i] for i in with_gps]),
     )
+    hints = [chosen[i].gps_is_hint for i, inner in zip(with_gps, placed.inliers, strict=True) if inner]
     feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
     if feature_map is None:
         return replace(
@@ -381,6 +391,8 @@ def _component(
             reason_code="NO_POINTS",
             reason="no point is placed well enough: the photos' rays are parallel",
         )
+    if any(hints):
+        feature_map = replace(feature_map, status="quarantined")
     return replace(component, feature_map=feature_map, reason="")
 
 

@@ -6,7 +6,8 @@ folder, keyed by name, size and modification time, spares that the next time.
 
 import hashlib
 import os
-from collections.abc import Sequence
+import stat
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -17,16 +18,18 @@ from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, 
 from featuredb.features.exif import read_exif
 from featuredb.features.image_header import check_signature
 from featuredb.maps.exif_prior import prior_from_exif
+from featuredb.maps.feature_map import GeoPrior
 from ingest.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photo import Photo
+from ingest.photo_table import PhotoTable, TableRow, missing_reason, summary_of
 from ingest.scan_cache import Examined, read_cache, write_cache
 from ingest.walk import FoundFile, walk
 
 # Raised when the same file would be judged differently, so that old caches are not used.
 _VERSION = 1
-# The cache is written this often, so that a kill costs at most so many files.
+# The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
 
 
@@ -41,6 +44,9 @@ class ScanOptions:
         exclude: shell patterns; a file whose name, with or without its folder, fits one is left out.
         workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
         owner, licence: attribution of photos that do not name their own.
+        geotag_sigma_m: standard deviation of a table's position that does not say its own. Geotags of
+            photo sites are tens of metres off, where they are not wrong altogether.
+        trust_geotags: positions of a table place maps as those of a folder do.
     """
 
     limits: DecodeLimits = INGEST_LIMITS
@@ -50,6 +56,8 @@ class ScanOptions:
     workers: int = 0
     owner: str = ""
     licence: str = ""
+    geotag_sigma_m: float = 30.0
+    trust_geotags: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,10 +67,12 @@ class ScanResult:
     Attributes:
         photos: all files, used or not, sorted by name.
         read: files that were opened; the others were in the cache or refused by their name.
+        notes: what is wrong with the table, where there is one.
     """
 
     photos: tuple[Photo, ...]
     read: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def usable(self) -> tuple[Photo, ...]:
@@ -98,10 +108,59 @@ def scan_folder(
     """
     options = options or ScanOptions()
     files = [_excluded(file, options.exclude) for file in walk(folder, options.recursive)]
+    return _scan_files(files, options, progress, cache_file, {})
+
+
+def scan_table(
+    table: PhotoTable,
+    options: ScanOptions | None = None,
+    progress: Progress = no_progress,
+    cache_file: Path | None = None,
+) -> ScanResult:
+    """Look at every photo of a table; what the table says goes before what the file says.
+
+    Args: see `scan_folder`. Files that are not there, and rows that cannot be read, are among the photos
+        with their reason.
+    """
+    options = options or ScanOptions()
+    files = [_excluded(_table_file(row), options.exclude) for row in table.rows]
+    rows = {row.name: row for row in table.rows}
+    result = _scan_files(sorted(files, key=lambda f: f.name), options, progress, cache_file, rows)
+    bad = [
+        Photo(
+            name=f"row {row.number}",
+            path=Path(f"row {row.number}"),
+            status="skipped",
+            reason_code="bad_row",
+            reason=f"row {row.number} of the table: {row.reason}",
+        )
+        for row in table.bad
+    ]
+    return replace(result, photos=(*result.photos, *bad), notes=tuple(summary_of(table)))
+
+
+def _table_file(row: TableRow) -> FoundFile:
+    try:
+        info = row.path.stat()
+    except (OSError, ValueError):
+        return FoundFile(name=row.name, path=row.path, reason_code="missing", reason=missing_reason(row))
+    if not stat.S_ISREG(info.st_mode):
+        return FoundFile(name=row.name, path=row.path, reason_code="unreadable", reason="not a regular file")
+    return FoundFile(name=row.name, path=row.path, size=info.st_size, mtime_ns=info.st_mtime_ns)
+
+
+def _scan_files(
+    files: Sequence[FoundFile],
+    options: ScanOptions,
+    progress: Progress,
+    cache_file: Path | None,
+    rows: Mapping[str, TableRow],
+) -> ScanResult:
     key = f"{_VERSION}:{options_fingerprint(options.limits)}"
     known = read_cache(cache_file, key) if cache_file else {}
     examined, read = _examine_all(files, known, options, progress, cache_file, key)
     photos = [_as_photo(file, examined.get(file.name), options) for file in files]
+    photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
     photos = _mark_exact(photos)
     photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()}, options.duplicates)
     return ScanResult(photos=tuple(photos), read=read)
@@ -136,14 +195,16 @@ def _examine_all(
             todo.append(file)
     done = len(files) - len(todo)
     progress("scan", done, len(files))
+    next_save = _SAVE_EVERY
     workers = options.workers or min(8, os.cpu_count() or 1)
     with ThreadPoolExecutor(workers, thread_name_prefix="scan") as pool:
         futures = {pool.submit(examine, file, options.limits): file for file in todo}
         for count, future in enumerate(as_completed(futures), start=1):
             results[futures[future].name] = future.result()
             progress("scan", done + count, len(files))
-            if cache_file and count % _SAVE_EVERY == 0:
+            if cache_file and count >= next_save:
                 write_cache(cache_file, key, results)
+                next_save = count + max(_SAVE_EVERY, len(results) // 4)
     if cache_file and (todo or results.keys() != known.keys()):
         write_cache(cache_file, key, results)
     return results, len(todo)
@@ -215,6 +276,34 @@ def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) 
         owner=exif.artist or options.owner,
         licence=exif.copyright or options.licence,
         warnings=exif.warnings,
+    )
+
+
+def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
+    """The photo with what the table says of it.
+
+    The height, which tables have none of, stays EXIF's.
+    """
+    gps = photo.gps
+    if row.latitude_deg is not None and row.longitude_deg is not None:
+        gps = GeoPrior(
+            latitude_deg=row.latitude_deg,
+            longitude_deg=row.longitude_deg,
+            height_m=None if photo.gps is None else photo.gps.height_m,
+            sigma_horizontal_m=row.accuracy_m or options.geotag_sigma_m,
+            sigma_vertical_m=options.geotag_sigma_m if photo.gps is None else photo.gps.sigma_vertical_m,
+        )
+    elif gps is not None and row.accuracy_m is not None:
+        gps = replace(gps, sigma_horizontal_m=row.accuracy_m)
+    return replace(
+        photo,
+        gps=gps,
+        gps_is_hint=gps is not None and not options.trust_geotags,
+        capture_time=row.time or photo.capture_time,
+        owner=row.owner or photo.owner,
+        licence=row.licence or photo.licence,
+        title=row.title,
+        warnings=(*photo.warnings, *row.warnings),
     )
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from featuredb.geometry.camera import Camera
 from ingest.colmap_adjust import AdjustOptions, adjust_models
-from ingest.colmap_bridge import Model, SfmPhoto, TwoView, run_incremental, write_database
+from ingest.colmap_bridge import Model, SfmPhoto, run_incremental, write_database
 from ingest.extract import read_keypoints
-from ingest.workspace import atomic_folder, read_arrays
+from ingest.matching import read_two_view
+from ingest.workspace import atomic_folder
 
 PriorUse = Literal["none", "bundle"]
 
@@ -120,7 +121,7 @@ class SfmTask:
     def write_database(self, path: Path) -> tuple[SfmPhoto, ...]:
         """COLMAP's database of the photos and their pairs; the photos as they were read."""
         photos = tuple(view.photo() for view in self.views)
-        geometries = {(i, j): TwoView(**read_arrays(file)) for i, j, file in self.matches}
+        geometries = {(i, j): read_two_view(file) for i, j, file in self.matches}
         write_database(path, self.cameras, photos, geometries)
         return photos
 

@@ -1,0 +1,149 @@
+"""Bulk ingest: tables, blocks that are joined, and the same maps from every executor."""
+
+import csv
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store import Database
+from featuredb.store.encode import content_digest
+from ingest.clusters.graph import ClusterOptions
+from ingest.pipeline import IngestOptions, ingest_photos
+from ingest.reconstruction import MapMakingOptions
+from ingest.report import IngestReport
+from ingest.scan import ScanOptions
+from tests.support.hill_photos import FRAME, HillPhoto, write_hill_photos
+
+_OPTIONS = IngestOptions(
+    workers=1,
+    gps_sigma_m=(0.02, 0.02),
+    making=MapMakingOptions(
+        extractor=ExtractorOptions(max_features=800),
+        # As small as hills of twenty photos allow: several blocks, joined by their seams.
+        clusters=ClusterOptions(max_block_photos=8, least_seam_photos=4),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhoto]]:
+    folder = tmp_path_factory.mktemp("hills")
+    return folder, write_hill_photos(folder, columns=5, rows=4, spacing_m=8.0)
+
+
+@pytest.fixture(scope="module")
+def in_process(
+    hills: tuple[Path, list[HillPhoto]], tmp_path_factory: pytest.TempPathFactory
+) -> tuple[FeatureMap, IngestReport]:
+    database = Database.create(tmp_path_factory.mktemp("in-process") / "db")
+    report = ingest_photos(database, hills[0], _OPTIONS)
+    return _only_map(database), report
+
+
+def _only_map(database: Database) -> FeatureMap:
+    snapshot = database.snapshot()
+    (summary,) = snapshot.maps()
+    return snapshot.load_map(summary.map_id)
+
+
+def test_blocks_are_joined_into_one_map_that_agrees_with_the_truth(
+    hills: tuple[Path, list[HillPhoto]], in_process: tuple[FeatureMap, IngestReport]
+) -> None:
+    feature_map, report = in_process
+    blocks = {s.name: s.total for s in report.stages}["reconstruct"]
+    assert blocks >= 3
+    assert report.count("registered") == len(feature_map.images) == 20
+    frame_from_map = FRAME.enu_from(feature_map.frame)
+    poses = {photo.name: photo.cam_from_local for photo in hills[1]}
+    for image in feature_map.images:
+        cam_from_frame = image.cam_from_local @ frame_from_map.inverse()
+        assert np.linalg.norm(cam_from_frame.center - poses[image.name].center) < 0.05
+        assert cam_from_frame.angle_to_deg(poses[image.name]) < 0.1
+    # Tracks run across the seams.
+    assert feature_map.points.track_length.max() >= 9
+
+
+def test_the_pool_gives_the_same_map(
+    hills: tuple[Path, list[HillPhoto]], in_process: tuple[FeatureMap, IngestReport], tmp_path: Path
+) -> None:
+    database = Database.create(tmp_path / "db")
+    ingest_photos(database, hills[0], replace(_OPTIONS, workers=2))
+    assert content_digest(_only_map(database)) == content_digest(in_process[0])
+
+
+@pytest.fixture
+def cluster() -> Iterator[Any]:
+    distributed = pytest.importorskip("distributed", reason="needs the extra `dask`")
+    with distributed.LocalCluster(
+        n_workers=3, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+@pytest.mark.slow
+def test_dask_gives_the_same_map_although_a_worker_is_killed(
+    cluster: Any,
+    hills: tuple[Path, list[HillPhoto]],
+    in_process: tuple[FeatureMap, IngestReport],
+    tmp_path: Path,
+) -> None:
+    killed: list[int] = []
+
+    def kill_one(stage: str, done: int, total: int) -> None:
+        """One worker in the middle of each of two stages."""
+        if (stage, done) in (("extract", total // 2), ("reconstruct", 1)) and len(killed) < 2:
+            pid = cluster.workers[len(killed)].process.pid
+            os.kill(pid, signal.SIGKILL)
+            killed.append(pid)
+
+    database = Database.create(tmp_path / "db")
+    options = replace(_OPTIONS, dask=cluster.scheduler_address)
+    report = ingest_photos(database, hills[0], options, kill_one)
+    assert len(killed) == 2
+    assert report.count("registered") == 20
+    assert content_digest(_only_map(database)) == content_digest(in_process[0])
+
+
+def _write_table(folder: Path, photos: list[HillPhoto], path: Path, *, owner: str) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["path", "lat", "lon", "accuracy", "owner", "licence", "title", "camera club"])
+        for photo in photos:
+            latitude, longitude, _ = FRAME.geodetic_from_enu(photo.cam_from_local.center)
+            writer.writerow(
+                [os.path.relpath(folder / photo.name, path.parent), latitude, longitude, 0.5, owner,
+                 "CC0-1.0", "hills", "none"]
+            )  # fmt: skip
+        writer.writerow(["gone.jpg", 48.0, 8.0, 5, owner, "", "", ""])
+        writer.writerow(["", 48.0, 8.0, 5, owner, "", "", ""])
+
+
+@pytest.mark.parametrize(("trust", "status"), [(False, "quarantined"), (True, "active")])
+def test_positions_of_a_table_place_active_maps_only_when_they_are_trusted(
+    trust: bool, status: str, tmp_path: Path
+) -> None:
+    photos = write_hill_photos(tmp_path / "photos")
+    table = tmp_path / "site.csv"
+    _write_table(tmp_path / "photos", photos, table, owner="Ann")
+    database = Database.create(tmp_path / "db")
+    making = replace(_OPTIONS.making, clusters=ClusterOptions())
+    options = IngestOptions(workers=1, making=making, scan=ScanOptions(trust_geotags=trust))
+    report = ingest_photos(database, table, options)
+    assert report.count("registered") == 9
+    found = _only_map(database)
+    assert found.status == status
+    assert found.name == "site"
+    assert {(image.owner, image.licence) for image in found.images} == {("Ann", "CC0-1.0")}
+    assert {round(image.gps.sigma_horizontal_m, 3) for image in found.images if image.gps} == {0.5}
+    reasons = {p.name: p.reason_code for p in report.photos if p.status == "skipped"}
+    assert reasons == {"gone.jpg": "missing", "row 11": "bad_row"}
+    assert "ignored: camera club" in report.warnings[0]
+    assert "row 11 is left out" in report.warnings[1]

@@ -1,0 +1,107 @@
+"""Tables of photos: every form gives the same rows, and what is wrong is told by row."""
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from featuredb.errors import IngestError
+from ingest.photo_table import is_table, read_table, summary_of
+
+_ROWS = [
+    {"path": "a/one.jpg", "lat": 48.99, "lon": 8.41, "accuracy": 25.0, "time": "2026-03-01T12:00:00+00:00",
+     "owner": "Ann", "licence": "CC-BY-4.0", "title": "Église, été", "views": 7},
+    {"path": "two.jpg", "lat": None, "lon": None, "accuracy": None, "time": None, "owner": None,
+     "licence": None, "title": None, "views": None},
+]  # fmt: skip
+
+
+def _written(folder: Path, suffix: str) -> Path:
+    path = folder / f"photos{suffix}"
+    if suffix == ".parquet":
+        pq.write_table(pa.Table.from_pylist(_ROWS), path)
+    elif suffix == ".jsonl":
+        path.write_text("\n".join(json.dumps(r) for r in _ROWS) + "\n", encoding="utf-8")
+    else:
+        sign = {".csv": ",", ".tsv": "\t"}[suffix]
+        lines = [sign.join(_ROWS[0])] + [
+            sign.join("" if v is None else f'"{v}"' for v in r.values()) for r in _ROWS
+        ]
+        path.write_text("\ufeff" + "\r\n".join(lines), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".tsv", ".parquet", ".jsonl"])
+def test_every_form_gives_the_same_rows(suffix: str, tmp_path: Path) -> None:
+    path = _written(tmp_path, suffix)
+    assert is_table(path)
+    table = read_table(path)
+    one, two = table.rows
+    assert (one.name, one.path) == ("a/one.jpg", tmp_path / "a/one.jpg")
+    assert (one.latitude_deg, one.longitude_deg, one.accuracy_m) == (48.99, 8.41, 25.0)
+    assert one.time == datetime(2026, 3, 1, 12, tzinfo=UTC)
+    assert (one.owner, one.licence, one.title) == ("Ann", "CC-BY-4.0", "Église, été")
+    assert (two.latitude_deg, two.accuracy_m, two.time, two.owner) == (None, None, None, "")
+    assert table.unknown_columns == ("views",)
+    assert not table.bad
+
+
+def test_what_is_wrong_costs_its_row_or_its_value_only(tmp_path: Path) -> None:
+    path = tmp_path / "photos.csv"
+    path.write_text(
+        "Path;Latitude;lng;accuracy;time;licence\n"
+        "one.jpg;48,99;8.41;5;2026:03:01 12:00:00;x\n"
+        "two.jpg;95;8.41;-3;yesterday;x\n"
+        ";48;8;5;;x\n"
+        "three.jpg;0;0;;;x\n"
+        "one.jpg;48;8;5;;x\n"
+        "four.jpg;48;8\n"
+        "five.jpg;48.5;8.5;nan;;x\n",
+        encoding="utf-8",
+    )
+    table = read_table(path)
+    rows = {r.name: r for r in table.rows}
+    assert list(rows) == ["one.jpg", "two.jpg", "three.jpg", "five.jpg"]
+    assert rows["one.jpg"].time == datetime(2026, 3, 1, 12)
+    assert rows["one.jpg"].latitude_deg is None
+    assert "'48,99' is no number" in rows["one.jpg"].warnings[0]
+    assert [len(r.warnings) for r in rows.values()] == [2, 3, 1, 0]
+    assert (rows["five.jpg"].latitude_deg, rows["five.jpg"].accuracy_m) == (48.5, None)
+    assert [b.number for b in table.bad] == [3, 5, 6]
+    told = "\n".join(summary_of(table))
+    assert "row 3 is left out: neither a path nor an id" in told
+    assert "row 5 is left out: one.jpg is in row 1 already" in told
+    assert "row 6 is left out: expected 6 values, found 3" in told
+
+
+def test_lines_of_json_that_are_none_are_told(tmp_path: Path) -> None:
+    path = tmp_path / "photos.jsonl"
+    path.write_text('{"id": "17"}\n\nnot json\n[1]\n{"id": 18, "lat": 1, "lon": 2}\n')
+    (tmp_path / "17.jpg").write_bytes(b"x")
+    table = read_table(path)
+    assert [(r.number, r.name, r.path.name) for r in table.rows] == [(1, "17", "17.jpg"), (5, "18", "18")]
+    assert [b.number for b in table.bad] == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("a.csv", b"lat,lon\n1,2\n", "a column `path` or `id`, found lat, lon"),
+        ("a.csv", b"\xff\xfe\x00", "expected a table of photos"),
+        ("a.parquet", b"PAR1 not really", "expected a table of photos"),
+        ("a.jsonl", b"", "found no columns"),
+    ],
+)
+def test_files_that_are_no_tables_are_refused(name: str, data: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(IngestError, match=message):
+        read_table(tmp_path / name)
+
+
+def test_a_folder_is_no_table(tmp_path: Path) -> None:
+    (tmp_path / "holidays.csv").mkdir()
+    assert not is_table(tmp_path / "holidays.csv")
+    assert not is_table(tmp_path / "photo.jpg")
