@@ -17,6 +17,7 @@ from featuredb.simworld.sights import Sight, Surroundings
 from featuredb.simworld.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
 from featuredb.simworld.visits import drone_visit, ground_visit
 
+_AHEAD = 15  # photos that somebody may be ahead of his share: two visits
 _VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photographed by these people
 
 
@@ -44,14 +45,18 @@ def plan_visits(
     if not places:
         raise InvalidValueError(f"plan_visits: no sight of {scene.name} can be photographed")
     around = Surroundings(scene)
-    weights = np.array([p.weight for p in people])
+    shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
+    taken_by = np.zeros(len(people))
     taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * [s.weight**0.7 for s in places]
     photos: list[PlannedPhoto] = []
     visit = first_visit
     while len(photos) < count:
-        who = int(rng.choice(len(people), p=weights / weights.sum()))
+        # Whoever is behind his share is likely to come next, so that everybody comes.
+        behind = np.maximum(shares * (len(photos) + _AHEAD) - taken_by, 0.0)
+        who = int(rng.choice(len(people), p=behind / behind.sum()))
         where = int(rng.choice(len(places), p=taste[who] / taste[who].sum()))
         taken = _visit(people[who], places[where], around, visit, seed, town, kind, rng)
+        taken_by[who] += len(taken)
         photos += taken[: count - len(photos)]
         visit += 1
         if visit - first_visit > _VISIT_TRIES * max(count, 50):
