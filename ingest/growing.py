@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,7 +17,7 @@ from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
 from ingest.growth.grow import GrowthOptions, GrowthPhotos, extractor_for, grow, no_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
-from ingest.reconstruction import MapMakingOptions, reconstruct_photos
+from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
 _LOG = logging.getLogger(__name__)
@@ -77,6 +77,20 @@ def grow_candidates(
     return replace(report, photos=(*kept, *refused.values()), notes=notes)
 
 
+def reconstructed_photos(done: Reconstructed, candidate_ids: Mapping[int, str] | None = None) -> GrowthPhotos:
+    """Photos that `reconstruct_photos` has gone through, for `ingest.growth.grow.grow`: of any origin.
+
+    Args:
+        candidate_ids: of contributed photos, by row of the usable ones.
+    """
+    return GrowthPhotos(
+        photos=done.usable,
+        features_of=done.features.__getitem__,
+        models=done.reconstruction.models,
+        candidate_ids=candidate_ids or {},
+    )
+
+
 def _prepared(
     database: Database,
     waiting: CandidatePhotos,
@@ -94,13 +108,10 @@ def _prepared(
     job = digest("growth", making.fingerprint, *sorted(p.sha256 for p in photos))[:24]
     done = reconstruct_photos(photos, Workspace(root=work, job_id=job), making, executor, progress=progress)
     ids = dict(zip((p.name for p in photos), waiting.candidate_ids, strict=False))
-    new = GrowthPhotos(
-        photos=done.usable,
-        features_of=done.features.__getitem__,
-        models=done.reconstruction.models,
-        candidate_ids={row: ids[photo.name] for row, photo in enumerate(done.usable)},
-    )
-    return new, {ids[name]: ("UNREADABLE", reason) for name, reason in done.unreadable.items()}
+    rows = {row: ids[photo.name] for row, photo in enumerate(done.usable)}
+    return reconstructed_photos(done, rows), {
+        ids[name]: ("UNREADABLE", reason) for name, reason in done.unreadable.items()
+    }
 
 
 def _refuse(

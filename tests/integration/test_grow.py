@@ -250,7 +250,7 @@ def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest
     assert main(["canary", url, "add", str(photo), "--note", "over the survey"]) == 0
     assert main(["canary", url, "list"]) == 0
     assert "known.jpg" in capsys.readouterr().out
-    assert main(["grow", url, "--trust", "anna", "--max-features", "1500", "--report", str(report)]) == 0
+    assert main(["grow", url, "--trust", "anna", "--max-features", "1000", "--report", str(report)]) == 0
     assert "6 in active maps" in capsys.readouterr().out
     told = json.loads(report.read_text())
     assert told["maps"][0]["gates"]["canaries"]["passes"]

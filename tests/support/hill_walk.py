@@ -22,7 +22,7 @@ from ingest.reconstruction import MapMakingOptions
 from tests.support.hill_photos import CAMERA, FRAME, _exif, _render
 from tests.support.planar_map import field_texture, view
 
-EXTRACTOR = ExtractorOptions(max_features=1500)
+EXTRACTOR = ExtractorOptions(max_features=1000)
 MAKING = MapMakingOptions(extractor=EXTRACTOR)
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 WEST_M = -32.0  # middle of the survey that anchors the database
