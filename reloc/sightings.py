@@ -89,4 +89,5 @@ def expected_points(
     rim = options.rim_share * camera.width
     inside = (np.minimum(pixels, [camera.width, camera.height] - pixels) > rim).all(axis=1)
     usual = (distance > near / options.max_scale) & (distance < far * options.max_scale)
-    return rows[(np.arccos(np.clip(cosine, -1.0, 1.0)) <= cone) & usual & inside]
+    fair = (np.arccos(np.clip(cosine, -1.0, 1.0)) <= cone) & usual & inside
+    return np.asarray(rows[fair], dtype=np.int64)

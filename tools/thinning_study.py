@@ -247,7 +247,7 @@ def _studies(args: argparse.Namespace) -> list[Study]:
     if args.world is not None:
         studies.append(_simulated(args.world, args.db, args.limit))
     if args.real:
-        studies.append(_real(*(Path(a) for a in args.real[:3]), args.real[3:]))
+        studies.append(_real(Path(args.real[0]), Path(args.real[1]), Path(args.real[2]), args.real[3:]))
     if not studies:
         raise SystemExit("expected --world and --db, or --real, or both")
     return studies

@@ -7,19 +7,19 @@ that nothing but the view changes:
 
 - facade: a house front across the street, from 9 m at eye height, azimuth 0 to 70 degrees off its normal;
 - town: from 80 m, 45 degrees above the horizon, azimuth 0 to 70 degrees;
-- descent: from 60 m straight above down to 10 degrees above the horizon (80 degrees of change).
+- descent: from 60 m straight above down to 20 degrees above the horizon (70 degrees of change).
 
-Three photos within 4 degrees of the first view are the map: keypoints of the first that match one of the others,
-at their true depth. Each other photo is matched with the first one (mutual ratio test, two-view geometry as the
-ingest does) and localised against the map as the server does, with its own true lens. A match is true when the
-exact depth says that both pixels show one point, within 4 pixels of 1000.
+Three photos within 4 degrees of the first view are the map: keypoints of the first that match one of the
+others, at their true depth. Each other photo is matched with the first one (mutual ratio test, two-view
+geometry as the ingest does) and localised against the map as the server does, with its own true lens. A match
+is true when the exact depth says that both pixels show one point, within 4 pixels of 1000.
 
-Extractors: that of this program (RootSIFT of OpenCV); COLMAP's SIFT plain, with affine shape, with domain size
-pooling; and this program's, where the query alone is described under simulated tilts (ASIFT's, one-sided).
+Extractors: that of this program (RootSIFT of OpenCV); COLMAP's SIFT plain, with affine shape, with domain
+size pooling; and this program's, where the query alone is described under simulated tilts (ASIFT's, one-sided).
 Descriptors of different extractors are never compared.
 
-Photos and features are kept in FOLDER. `--part K N` makes every N-th photo only, for several processes. Writes
-view_change.csv and view_change.png and prints the table.
+Photos and features are kept in FOLDER. `--part K N` makes every N-th photo only, for several processes.
+Writes view_change.csv and view_change.png, a sheet of the photos, and prints the table.
 """
 
 import argparse
@@ -81,8 +81,8 @@ class Row:
     """One photo against the map of its sight.
 
     Attributes:
-        features: of the photo. matches, verified, true: with the first view: tentative, after two-view geometry,
-            and those of them that show one point.
+        features: of the photo. matches, verified, true: with the first view: tentative, after two-view
+            geometry, and those of them that show one point.
         inliers: of the localisation. localised: believed. error_m, error_deg: of what was believed, else NaN.
         cpu_s: of extracting the photo's features.
     """
@@ -181,7 +181,7 @@ def of_sight(args: argparse.Namespace, family: str, sight: int) -> list[Row]:
                     error_m=_distance(pose, view.cam_from_local),
                     error_deg=np.nan if pose is None else pose.angle_to_deg(view.cam_from_local),
                     cpu_s=cpu_s,
-                )  # fmt: skip
+                )
             )
     return rows
 
@@ -209,7 +209,9 @@ def small_map(views: Sequence[View], described: Sequence[Features], scene: Scene
         map_id="sight", name="sight", epsg=scene.epsg, height_datum="ellipsoidal", frame=scene.frame,
         cameras=(first.camera,),
         images=tuple(
-            MapImage(image_id=k, name=f"{k}", sha256=f"{k:064x}", camera_id=0, cam_from_local=v.cam_from_local)
+            MapImage(
+                image_id=k, name=f"{k}", sha256=f"{k:064x}", camera_id=0, cam_from_local=v.cam_from_local
+            )
             for k, v in enumerate(views)
         ),
         points=MapPoints(
@@ -219,14 +221,15 @@ def small_map(views: Sequence[View], described: Sequence[Features], scene: Scene
             covariance=np.tile(np.array([1e-4, 0, 0, 1e-4, 0, 1e-4], np.float32), (n, 1)),
         ),
         observations=MapObservations(
-            point_index=point_index, image_id=np.concatenate([np.full(len(t), k, np.int32) for k, _, t in seen]),
+            point_index=point_index,
+            image_id=np.concatenate([np.full(len(t), k, np.int32) for k, _, t in seen]),
             has_descriptor=np.ones(len(point_index), np.bool_), **take,
         ),
         placement=Placement(
             method="gcp", local_from_sfm=Sim3.identity(), covariance=np.diag([1e-10] * 4 + [1e-6] * 3),
             residual_rms_m=0.0,
         ),
-        # The study's maps and queries share an extractor each; the name is that of the localisation's options.
+        # Each map and its queries share an extractor; the name is the one that localisation asks for.
         extractor_fingerprint=LocaliseOptions().extractor.fingerprint,
     )  # fmt: skip
 
@@ -409,12 +412,9 @@ def table(rows: Sequence[Row]) -> str:
             mine = [r for r in rows if r.family == family and r.extractor == extractor]
             for angle in ANGLES:
                 these = [r for r in mine if r.angle == angle]
+                found = sum(r.localised for r in these)
                 true = np.median([r.true for r in these])
-                cells.append(
-                    f"{sum(r.localised for r in these):>6}/{sum(_wrong(r) for r in these)}/{true:<6.0f}".rjust(
-                        14
-                    )
-                )
+                cells.append(f"{found:>6}/{sum(_wrong(r) for r in these)}/{true:<6.0f}")
             lines.append(
                 f"  {extractor:<22}" + "".join(cells) + f"{np.mean([r.cpu_s for r in mine]):>9.2f}"
                 f"{np.mean([r.features for r in mine]):>10.0f}"

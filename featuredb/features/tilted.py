@@ -1,9 +1,9 @@
-"""Features of a photo as if the camera stood more to the side: simulated tilts (Morel and Yu 2009, ASIFT).
+"""Features of a photo as if seen more from the side: simulated tilts (ASIFT, Morel and Yu 2009).
 
-A surface seen obliquely is, up to scale, the surface seen from the front, turned and squeezed in one direction.
-SIFT follows turns and scales but no squeezing. Here the photo itself is turned, squeezed and described several
-times over. The descriptors are those of `extract`, so maps made without tilts take such queries: only one side
-needs the tilts, since a ratio test asks whether a *map point* is unique.
+A surface seen obliquely is, up to scale, the surface seen from the front, turned and squeezed in one
+direction. SIFT follows turns and scales but no squeezing. Here the photo itself is turned, squeezed and
+described several times over. The descriptors are those of `extract`, so maps made without tilts take such
+queries: only one side needs the tilts, since a ratio test asks whether a *map point* is unique.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ class TiltOptions:
 def extract_tilted(
     gray: NDArray[np.uint8], options: ExtractorOptions | None = None, tilts: TiltOptions | None = None
 ) -> Features:
-    """Features of the photo and of its simulated tilts, in the photo's own pixels; the photo's own come first.
+    """Features of the photo, then those of its simulated tilts, all in the photo's own pixels.
 
     Args:
         gray: (h, w) uint8, pixels as stored in the file.
@@ -77,7 +77,7 @@ def tilted(
     """The photo turned by an angle and squeezed across by a factor, smoothed for it.
 
     Returns:
-        The picture, and (2, 3) the affine map from its pixels to the photo's, centre of the first pixel at 0.5.
+        The picture, and (2, 3) the affine map from its pixels to the photo's; first pixel centre at 0.5.
     """
     h, w = gray.shape
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
@@ -85,7 +85,7 @@ def tilted(
     corners = np.array([[0, 0], [w, 0], [0, h], [w, h]], dtype=np.float64) @ turn.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     wide, high_px = (int(np.ceil(v)) for v in high - low)
-    # Without smoothing in the squeezed direction, what is finer than the new pixels turns into false features.
+    # Without smoothing across, what is finer than the new pixels turns into false features.
     forward = np.column_stack([turn, -low])
     turned = _warp(gray, forward, (wide, high_px))
     sigma = 0.8 * np.sqrt(tilt**2 - 1.0)

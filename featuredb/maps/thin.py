@@ -126,7 +126,7 @@ def k_cover(feature_map: FeatureMap, cover: int) -> NDArray[np.bool_]:
     bounds, weights = starts.tolist(), weight.tolist()
 
     def gain(row: int) -> float:
-        return weights[row] * sum(
+        return float(weights[row]) * sum(
             1.0 / (1 + in_cell.get(cells[k], 0))
             for k in range(bounds[row], bounds[row + 1])
             if taken[images[k]] < need[images[k]]

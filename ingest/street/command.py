@@ -39,7 +39,8 @@ def make_street_map(
     aerial = snapshot.load_map(found[0].map_id)
     files = find_photos(aerial, photos)
     low, high = np.percentile(aerial.points_local()[:, :2], (1, 99), axis=0)
-    box = (*(float(v) for v in low - _MARGIN_M), *(float(v) for v in high + _MARGIN_M))
+    (west, south), (east, north) = low - _MARGIN_M, high + _MARGIN_M
+    box = float(west), float(south), float(east), float(north)
     cloud = load_cloud(database, aerial.frame, box)
     if not len(cloud):
         raise RegistrationError(

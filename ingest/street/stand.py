@@ -24,7 +24,7 @@ class StandOptions:
         headings: views around each place; 75 degrees wide, six overlap by a fifth.
         eye_m: above the ground. pitch_deg: of the views; people hold a camera a little upward.
         free_m: nothing stands within so much of a place ...
-        low_m, high_m: ... between these heights above the ground: kerbs are stepped over, crowns walked under.
+        low_m, high_m: ... between these heights above the ground: kerbs are stepped over, crowns are above.
     """
 
     step_m: float = 12.0

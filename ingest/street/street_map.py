@@ -118,12 +118,22 @@ def street_map(
             f"street views: expected the extractor of the map, {aerial.extractor_fingerprint}, found "
             f"{options.extractor.fingerprint}"
         )
+    low, high = np.percentile(aerial.points_local()[:, :2], (2, 98), axis=0)
+    return street_map_at(aerial, cloud, gray_of, standing_places(cloud, low, high, options.stand), options)
+
+
+def street_map_at(
+    aerial: FeatureMap,
+    cloud: PointCloud,
+    gray_of: Callable[[MapImage], NDArray[np.uint8]],
+    places: FloatArray,
+    options: StreetOptions,
+) -> FeatureMap:
+    """`street_map` of views around given eye positions (n, 3), local frame of the map."""
     sources = [
         source_photo(cloud, gray_of(image), aerial.cameras[image.camera_id], image.cam_from_local)
         for image in aerial.images
     ]
-    low, high = np.percentile(aerial.points_local()[:, :2], (2, 98), axis=0)
-    places = standing_places(cloud, low, high, options.stand)
     described = [d for d in street_views(cloud, places, sources, options) if len(d.features)]
     return _assembled(aerial, described, options)
 

@@ -32,7 +32,8 @@ from tests.support.planar_map import CAMERA, field_texture, planar_map, render, 
 def test_distribution_of_rates_is_recovered() -> None:
     rng = np.random.default_rng(4)
     n = rng.integers(5, 60, 5000)
-    a, b = rate_distribution(n, betabinom.rvs(n, 2.0, 5.0, random_state=rng))
+    seen = np.asarray(betabinom.rvs(n, 2.0, 5.0, random_state=rng), dtype=np.int64)
+    a, b = rate_distribution(n, seen)
     assert a == pytest.approx(2.0, rel=0.12)
     assert b == pytest.approx(5.0, rel=0.12)
 
@@ -134,7 +135,8 @@ def test_localised_photos_tell_what_they_found(field: FeatureMap) -> None:
     indexed = [IndexedArea(area=area, index=build_index(area.descriptors))]
     found = []
     for k in range(4):
-        pose = view(*rng.uniform(-12, 12, 2), 45.0, rng.uniform(0, 8), rng.uniform(0, 360))
+        east, north = rng.uniform(-12, 12, 2)
+        pose = view(float(east), float(north), 45.0, rng.uniform(0, 8), rng.uniform(0, 360))
         features = extract(render(field_texture(1), pose, seed=100 + k), LocaliseOptions().extractor)
         localised = localise_features(features, LocaliseRequest(camera=CAMERA), indexed)
         found += sightings_of(localised, features, f"source {k}", {"field": "w"})

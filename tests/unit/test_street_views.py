@@ -63,7 +63,8 @@ def photo(camera: Camera, pose: Rigid3, seed: int = 0) -> NDArray[np.uint8]:
     row = ((_HIGH_M - met[:, 2]) / _TEXEL_M).astype(np.float32).reshape(y.shape)
     seen = cv2.remap(texture, column, row, cv2.INTER_LINEAR).astype(np.float64)
     noise = np.random.default_rng(seed).normal(0, 1.5, y.shape)
-    return np.clip(np.where(on_wall.reshape(y.shape), seen, 110.0) + noise, 0, 255).astype(np.uint8)
+    grey = np.where(on_wall.reshape(y.shape), seen, 110.0) + noise
+    return np.asarray(np.clip(grey, 0, 255), dtype=np.uint8)
 
 
 @pytest.fixture(scope="module")
