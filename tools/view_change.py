@@ -15,7 +15,7 @@ geometry as the ingest does) and localised against the map as the server does, w
 is true when the exact depth says that both pixels show one point, within 4 pixels of 1000.
 
 Extractors: that of this program (RootSIFT of OpenCV); COLMAP's SIFT plain, with affine shape, with domain
-size pooling; and this program's, where the query alone is described under simulated tilts (ASIFT's, one-sided).
+size pooling; and this program's, the query alone described under simulated tilts (ASIFT's, one-sided).
 Descriptors of different extractors are never compared.
 
 Photos and features are kept in FOLDER. `--part K N` makes every N-th photo only, for several processes.
