@@ -129,7 +129,7 @@ def grow(
             run.replacements.append(replaced)
         localiser = Localiser.open(database, previous=localiser)
         localised = _round(database, new, localiser, run, options)
-        if not _promote(database, new, localiser, localised, run, options):
+        if not _promote(database, new, localiser, localised, run, options, work):
             break
     return GrowthReport(
         database=database.url,
@@ -244,6 +244,7 @@ def _promote(
     localised: dict[int, LocalisedPhoto],
     run: _Run,
     options: GrowthOptions,
+    work: Path,
 ) -> bool:
     """Confirm and promote; whether anything was."""
     witnesses = NewPhotos(
@@ -253,7 +254,7 @@ def _promote(
         localised=localised,
     )
     outcomes = promote_confirmed(
-        database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m
+        database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m, work=work
     )
     for outcome in outcomes:
         run.promotions[outcome.map_id] = outcome

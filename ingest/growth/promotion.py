@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
 from ingest.growth.canaries import CanaryOptions, CanaryRun, run_canaries
 from ingest.growth.confirmation import Confirmation, ConfirmationOptions, confirm
+from ingest.growth.examined import question, recall, remember
 from ingest.growth.gates import Gate
 from ingest.growth.trusted_points import answering_with, confirmed_points
 from ingest.growth.witnesses import Heard, NewPhotos, WitnessOptions, hear_witnesses
@@ -92,6 +94,7 @@ def promote_confirmed(
     new: NewPhotos | None = None,
     *,
     budget_m: float,
+    work: Path | None = None,
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made.
 
@@ -99,12 +102,14 @@ def promote_confirmed(
         localiser: of the active maps of the newest snapshot.
         new: photos that may bear witness, beside the images of other maps.
         budget_m: maps that have drifted further stay.
+        work: work folder, where it is kept what was found out: without anything new nothing is asked again.
 
     Raises:
         StoreError
     """
     options = options or PromotionOptions()
     snapshot = database.snapshot()
+    asked = question(database, snapshot, _digests(new), options)
     waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
     ready: list[_Ready] = []
     outcomes: list[Promotion] = []
@@ -113,15 +118,29 @@ def promote_confirmed(
         if held_back is not None:
             outcomes.append(held_back)
             continue
+        known = recall(work, summary.map_id, asked)
+        if known is not None:
+            outcomes.append(_stays(summary.map_id, *known))
+            continue
         found = examine(snapshot.load_map(summary.map_id), snapshot, options, new)
         failed = next((gate for gate in found.gates if not gate.passes), None)
         if failed is not None:
             outcomes.append(_stays(summary.map_id, failed.reason, failed.message, found.gates))
+            remember(work, summary.map_id, asked, failed.reason, failed.message, found.gates)
         else:
             ready.append(_committed(database, summary, found))
     if ready:
-        outcomes += _promote(database, localiser, ready, options)
+        decided = _promote(database, localiser, ready, options)
+        after = question(database, database.snapshot(), _digests(new), options)
+        for outcome in decided:
+            if not outcome.promoted and outcome.reason_code != "CONFLICT":
+                remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
+        outcomes += decided
     return outcomes
+
+
+def _digests(new: NewPhotos | None) -> list[str]:
+    return [] if new is None else [new.photos[row].sha256 for row in new.rows]
 
 
 def promote_by_hand(

@@ -73,6 +73,21 @@ def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> N
     assert outcomes["n"].promoted
 
 
+def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    database, work = _database(tmp_path, _ANCHOR, mine), tmp_path / "work"
+
+    def ask() -> Promotion:
+        return promote_confirmed(database, Localiser.open(database), budget_m=_BUDGET_M, work=work)[0]
+
+    first = ask()
+    with monkeypatch.context() as patch:
+        patch.setattr("ingest.growth.promotion.examine", None)
+        assert ask() == first
+    database.commit_map(strip_map("n", 78.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    assert ask().promoted  # something new has come
+
+
 def test_photos_of_the_anchor_bear_witness_to_a_map_that_lies_on_it(tmp_path: Path) -> None:
     mine = strip_map("m", 22.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     assert _promoted(_database(tmp_path, _ANCHOR, mine))["m"].promoted
