@@ -76,7 +76,9 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
     mine = [r for r in active if r.fact.kind in _OWN]
     foreign = [r for r in active if r.fact.kind in _FOREIGN]
     wrong = [r for r in active if r.wrong]
-    share = len({r.fact.name for r in mine}) / max(len(own), 1)
+    # Of a picture and its re-upload one is taken; it does not matter which.
+    pictures = {r.fact.name for r in mine} | {r.fact.copy_of for r in active if r.fact.kind == "copy"}
+    share = len(pictures & {f.name for f in own}) / max(len(own), 1)
     errors = [r.error_m for r in mine]
     median = float(np.median(errors)) if errors else float("nan")
     worst = max(errors, default=float("nan"))

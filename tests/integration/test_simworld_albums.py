@@ -12,7 +12,7 @@ import pytest
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.album_files import read_facts
+from featuredb.simworld.album_files import TABLE_FILES, read_facts
 from featuredb.simworld.community import CommunityOptions, write_community
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.photograph import render_view
@@ -20,6 +20,7 @@ from featuredb.simworld.poison_world import POISONS, PoisonOptions, plan_poison,
 from featuredb.simworld.scale_world import ScaleOptions, write_scale
 from featuredb.simworld.truth import read_truth
 from featuredb.simworld.walk_world import WalkOptions, plan_walk
+from ingest.photo_table import read_table
 
 FLIGHT = FlightOptions(lines=1, per_line=2, oblique=0, width=320, gps_error="rtk")
 TINY = CommunityOptions(
@@ -56,6 +57,9 @@ def test_tables_name_every_contributed_photo_alike(album: Path) -> None:
         assert (row["id"], row["owner"]) == (line["id"], line["owner"])
         assert (float(row["lat"]) if row["lat"] else None) == line["lat"]
         assert facts[row["path"]].owner == row["owner"]
+    read = [read_table(album / name).rows for name in TABLE_FILES]
+    assert [row.name for row in read[0]] == contributed
+    assert read[0] == read[1] == read[2]
 
 
 def test_truth_has_the_photos_of_the_town_and_no_others(album: Path) -> None:
