@@ -28,16 +28,16 @@ class DriftOptions:
 
     Attributes:
         keypoint_px: standard deviation of a keypoint on an image of 1600 pixels.
-        adopted_focal_rel, adopted_distortion: what a lens taken from a map may be off: reconstructions of a
-            dozen photos differ by so much between subsets of a flight.
+        adopted_focal_rel, adopted_distortion: what a lens taken from a map may be off against that map's
+            points. They were made with that very lens: what it trades for height, they trade alike.
         own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
         max_photos: of more, the rest is taken to be no worse; the equations are dense.
         max_points: free points that take part; fewer know less, so the bound stays one.
     """
 
     keypoint_px: float = 0.5
-    adopted_focal_rel: float = 0.01
-    adopted_distortion: float = 0.005
+    adopted_focal_rel: float = 0.001
+    adopted_distortion: float = 0.0005
     own_focal_rel: float = 0.15
     own_distortion: float = 0.1
     max_photos: int = 300
