@@ -97,6 +97,8 @@ class _Run:
     promotions: dict[str, Promotion] = field(default_factory=dict)
     replacements: list[Replacement] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    lost: set[int] = field(default_factory=set)  # not localised in the last round
+    fresh: set[str] = field(default_factory=set)  # promoted in the last round
     rounds: int = 0
 
 
@@ -127,6 +129,7 @@ def grow(
         replaced = replace_descendants(database, work, options.replacing, budget_m=options.drift_budget_m)
         if replaced is not None:
             run.replacements.append(replaced)
+            run.lost.clear()  # moved maps may hold what they did not
         localiser = Localiser.open(database, previous=localiser)
         localised = _round(database, new, localiser, run, options)
         if not _promote(database, new, localiser, localised, run, options, work):
@@ -150,9 +153,11 @@ def _round(
 ) -> dict[int, LocalisedPhoto]:
     """Localise what is not in a map yet, place reconstructions and lone photos, commit what passes."""
     open_rows = [row for row in range(len(new.photos)) if row not in run.map_of]
+    worth = _worth_localising(new, open_rows, localiser, run, options)
     localised, reasons = localise_photos(
-        new.photos, open_rows, new.features_of, localiser.areas, options.localise
+        new.photos, worth, new.features_of, localiser.areas, options.localise
     )
+    run.lost = {row for row in open_rows if row not in localised}
     run.why.update({row: _split(reason) for row, reason in reasons.items()})
     run.refused.clear()
     for model in new.models():
@@ -170,6 +175,19 @@ def _round(
         _note_refusal(refused, new, run)
     run.why.update({row: _split(reason) for row, reason in grown.waiting.items()})
     return localised
+
+
+def _worth_localising(
+    new: GrowthPhotos, rows: Sequence[int], localiser: Localiser, run: _Run, options: GrowthOptions
+) -> list[int]:
+    """All rows at first; later those that were found before, or are found in what was promoted since."""
+    served = {m.map_id for indexed in localiser.areas for m in indexed.area.maps}
+    fresh = tuple(sorted(served & run.fresh))
+    if not run.lost or not fresh:
+        return list(rows)
+    asked = [row for row in rows if row in run.lost]
+    seen, _ = localise_photos(new.photos, asked, new.features_of, localiser.areas_of(fresh), options.localise)
+    return [row for row in rows if row not in run.lost or row in seen]
 
 
 def _try_model(
@@ -267,7 +285,8 @@ def _promote(
                 reason=outcome.reason,
                 gates={**entry.gates, **{g.name: g.as_json() for g in outcome.gates}},
             )
-    return any(outcome.promoted for outcome in outcomes)
+    run.fresh = {outcome.map_id for outcome in outcomes if outcome.promoted}
+    return bool(run.fresh)
 
 
 def _note_refusal(refused: Refused, new: GrowthPhotos, run: _Run) -> None:
