@@ -31,13 +31,14 @@ class ThinOptions:
     """How far a map is thinned.
 
     Attributes:
-        cover: K, described points that each image keeps seeing.
+        cover: K, described points that each image keeps seeing. From 400 on the simulated town gains hardly
+            any answer within its limits (docs/growth.md).
         max_views: described observations that a chosen point keeps, those that differ most in direction and
             distance. More only repeat what the mean descriptor says already.
         keep_points: points that are not chosen stay without descriptors.
     """
 
-    cover: int = 200
+    cover: int = 400
     max_views: int = 8
     keep_points: bool = True
 
