@@ -8,6 +8,7 @@ and, asked of the new map alone, a new map that shows their place somewhere else
 """
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -67,7 +68,7 @@ class CanaryCheck:
     Attributes:
         name: for people.
         before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
-        error_m: of the answer after; NaN where there is none.
+        error_before_m, error_m: of the answers; NaN where there is none.
         regression: why it is one, "" where it is none.
     """
 
@@ -75,6 +76,7 @@ class CanaryCheck:
     before: Verdict
     after: Verdict
     alone: Verdict | Literal[""] = ""
+    error_before_m: float = float("nan")
     error_m: float = float("nan")
     regression: str = ""
 
@@ -154,7 +156,8 @@ def check_known(
     """Ask one known query of both."""
     data = load_canary_image(database, canary)
     gray = decode_gray(data, options.limits)
-    request = localise_request(LocaliseWireRequest.model_validate(dict(canary.request)), data, gray)
+    asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
+    request = localise_request(asked, data, gray)
     results = [localiser.localise(gray, request) for localiser in (before, after)]
     verdicts = [known_verdict(result, canary.pose) for result in results]
     miss = _miss_of_known(results[1].pose, canary.pose)
@@ -162,7 +165,8 @@ def check_known(
         name=canary.name,
         before=verdicts[0],
         after=verdicts[1],
-        error_m=float("nan") if miss is None else miss.metres,
+        error_before_m=_metres(_miss_of_known(results[0].pose, canary.pose)),
+        error_m=_metres(miss),
         regression=_regression(verdicts[0], verdicts[1], miss, results[1]),
     )
 
@@ -280,7 +284,8 @@ def _check_own(
         before=verdicts[0],
         after=verdicts[1],
         alone=alone,
-        error_m=float("nan") if misses[1] is None else misses[1].metres,
+        error_before_m=_metres(misses[0]),
+        error_m=_metres(misses[1]),
         regression=regression,
     )
 
@@ -325,6 +330,10 @@ def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: M
         return None
     expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
     return _miss(pose, expected.center, expected.rotation)
+
+
+def _metres(miss: _Miss | None) -> float:
+    return float("nan") if miss is None else miss.metres
 
 
 def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:

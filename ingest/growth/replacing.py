@@ -15,7 +15,7 @@ from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame, in_frame, move_map
 from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
-from ingest.growth.canaries import CanaryOptions, CanaryRun, check_known
+from ingest.growth.canaries import CanaryCheck, CanaryOptions, CanaryRun, check_known
 from ingest.growth.map_graph import (
     OWN,
     PlacedMap,
@@ -37,6 +37,7 @@ from reloc.localiser import Localiser
 
 # Said of maps whose parent was placed anew, see featuredb.store.changes.
 _FLAG = "was placed anew"
+_SAME_M = 1e-6  # an answer that moves by less was not touched
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,7 +205,7 @@ def _commit(
         before = growth_of(maps[map_id].evidence).get("drift_m")
         reports.append(MovedMap(map_id=map_id, move_m=ways[map_id], drift_before_m=before, drift_m=drift))
     new = _with_generations(new, maps)
-    canaries = known_canaries_of(database, {m.map_id: m for m in new}, options.canaries)
+    canaries = ask_persons_canaries(database, {m.map_id: m for m in new}, options.canaries)
     if canaries.regressions:
         return Replacement(
             reason="CANARY",
@@ -226,15 +227,30 @@ def _commit(
     )
 
 
-def known_canaries_of(database: Database, new: Mapping[str, FeatureMap], options: CanaryOptions) -> CanaryRun:
-    """The database's known queries, before and after maps move. Images of the maps would move along."""
-    known = list_canaries(database)
+def ask_persons_canaries(
+    database: Database, new: Mapping[str, FeatureMap], options: CanaryOptions
+) -> CanaryRun:
+    """The known queries that a person vouches for, before and after maps move.
+
+    Images of the maps move along, and so do remembered answers. Where someone knows the truth, an answer that
+    is wrong afterwards must at least have come much nearer: before, the new anchor answered already, and may
+    have been as wrong.
+    """
+    known = [canary for canary in list_canaries(database) if canary.origin == "person"]
     if not known:
         return CanaryRun(checks=(), note="no known queries")
     before = Localiser.open(database)
     after = Localiser.open(database, previous=before, instead=new)
-    checks = tuple(check_known(database, canary, before, after, options) for canary in known)
-    return CanaryRun(checks=checks, note=f"{len(known)} known queries")
+    checks = [check_known(database, canary, before, after, options) for canary in known]
+    return CanaryRun(checks=tuple(_judged(check) for check in checks), note=f"{len(known)} known queries")
+
+
+def _judged(check: CanaryCheck) -> CanaryCheck:
+    untouched = abs(check.error_m - check.error_before_m) < _SAME_M
+    nearer = check.before == "moved" and check.error_m <= 0.5 * check.error_before_m
+    if check.regression or check.after not in ("moved", "found") or untouched or nearer:
+        return check
+    return replace(check, regression=f"{check.error_m:.2f} m off, once the maps have moved")
 
 
 def _way(move: Sim3, corners: FloatArray) -> float:
