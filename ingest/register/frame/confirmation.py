@@ -67,7 +67,7 @@ class ConfirmOptions:
     min_piece_px: int = 40
     max_piece_px: int = 40
     min_agreeing: float = 0.18
-    min_low_agreeing: float = 0.0
+    min_low_agreeing: float = 0.2
     max_layer_ratio: float = 1.5
     min_layer_m: float = 2.0
     min_log_nfa: float = 5.0

@@ -50,12 +50,13 @@ def dense_fitted(
 ) -> FrameHypothesis | None:
     """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few."""
     found: FrameHypothesis | None = start
-    for spacing_px, piece_px in zip(options.spacing_px, options.piece_px, strict=True):
-        found = found and _fit_round(views, prior, found, options, spacing_px, piece_px)
+    rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
+    for sizes in rounds:
+        found = found and _fit_round(views, prior, found, options, *sizes)
     # A pose that is still on its way may look right already: the pieces that lie near have made it.
     for _ in range(options.more_rounds):
         before = found
-        found = found and _fit_round(views, prior, found, options, spacing_px, piece_px)
+        found = found and _fit_round(views, prior, found, options, *rounds[-1])
         if before is None or found is None or _moved_px(views, before, found) < options.settled_px:
             break
     return found
@@ -68,11 +69,12 @@ def _fit_round(
     options: DenseFitOptions,
     spacing_px: float,
     piece_px: int,
+    near_px: int,
 ) -> FrameHypothesis | None:
     renderings = views.renders([start.pose.cam_from_local], dense_side_px(views, spacing_px))
     if not renderings:
         return None
-    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, options)
+    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px, options)
     if len(matches) < _MIN_PLACES:
         return None
     settings = dense_pose_options(views, options, spacing_px)

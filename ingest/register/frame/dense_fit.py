@@ -31,7 +31,8 @@ class DenseFitOptions:
             since edges between splats are known better than their spacing.
         piece_px: side of a piece, round by round.
         more_rounds: at most, like the last one, until the pose moves less than settled_px.
-        near_px: a piece's place is looked for this near.
+        near_px: a piece's place is looked for this near, round by round: the first takes up what the search
+            left.
         window_px: radius of the score map against whose spread a place is judged.
         min_score: height of a place in standard deviations of its map. Low: the robust loss weighs them, and
             a piece that has structure along one direction only still says where it is across.
@@ -43,7 +44,7 @@ class DenseFitOptions:
     piece_px: tuple[int, ...] = (28, 40, 40)
     more_rounds: int = 8
     settled_px: float = 0.2
-    near_px: int = 6
+    near_px: tuple[int, ...] = (10, 6, 6)
     window_px: int = 12
     min_score: float = 1.5
     tolerance_px: float = 4.0
@@ -57,6 +58,7 @@ def near_places(
     rendering: Rendering,
     source: RenderSource,
     piece_px: int,
+    near_px: int,
     options: DenseFitOptions,
 ) -> FrameMatches:
     """Pieces of a render, and where in the photo they fit best near where the render's pose puts them.
@@ -73,13 +75,11 @@ def near_places(
     maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, options.window_px)
     if len(maps) == 0:
         return FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-    cut = options.window_px - options.near_px
+    cut = options.window_px - near_px
     inner = np.ascontiguousarray(maps.maps[:, cut : maps.maps.shape[1] - cut, cut : maps.maps.shape[2] - cut])
     places, scores, _ = peaks(inner, rival_px=3)
     # A place on the rim has its top outside: the piece saw nothing here.
-    good = (scores >= options.min_score) & (
-        np.abs(places - options.near_px).max(axis=1) < options.near_px - 0.6
-    )
+    good = (scores >= options.min_score) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
     scale = np.array([camera.width / size[0], camera.height / size[1]])
     return FrameMatches(
         pixels=(maps.origin + cut + places)[good] * scale, points=np.asarray(maps.points_local)[good]
