@@ -44,7 +44,7 @@ class DriftOptions:
     max_points: int = 20_000
 
 
-def inflation(
+def bending_variance_m2(
     model: Model,
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
@@ -54,23 +54,26 @@ def inflation(
     dilution: float,
     options: DriftOptions,
 ) -> float:
-    """By how much a similarity's covariance (7, 7) must grow to hold the positions of all photos; at least 1.
+    """What must be added to a similarity's covariance to hold the positions of all photos, square metres.
+
+    Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
+    position is good to centimetres; a factor that covers this would make metres of it at the far end.
 
     Args:
         model: refined, in metres. keypoints: of its photos.
         fixed: existing points, those observations of `kept` (m,).
         adopted: cameras whose lens was a map's.
+        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
         dilution: how many times larger the variance of residuals is than independent keypoints would have
             it, neighbours included.
     """
     if len(model.rows) > options.max_photos or not kept.any():
-        return 1.0
+        return 0.0
     spread = center_covariances(model, keypoints, fixed, kept, adopted, dilution, options)
     jacobian = point_jacobian(model.centers())
     claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
     seen = np.union1d(model.photo_of, fixed.photo_of[kept])  # a photo that was left out says nothing
-    ratio = np.linalg.eigvalsh(spread[seen])[:, -1] / np.linalg.eigvalsh(claimed[seen])[:, -1]
-    return float(max(1.0, ratio.max()))
+    return float(max(0.0, np.linalg.eigvalsh(spread[seen] - claimed[seen])[:, -1].max()))
 
 
 def center_covariances(

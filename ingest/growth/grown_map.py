@@ -18,7 +18,7 @@ from ingest.colmap_anchored import Anchored, FixedPoints, with_observations
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors, find_anchors
-from ingest.growth.drift import DriftOptions, inflation
+from ingest.growth.drift import DriftOptions, bending_variance_m2
 from ingest.growth.localised import in_frame
 from ingest.growth.placement import (
     Held,
@@ -109,7 +109,7 @@ def grow_component(
     if not gate.passes:
         return Refused(reason=gate.reason, message=gate.message, rows=rows, gates=placement.gates)
     assert held.fit is not None
-    grown_by = inflation(
+    bending_m2 = bending_variance_m2(
         adjusted.model,
         keypoints,
         fixed,
@@ -119,10 +119,10 @@ def grow_component(
         max(held.fit.spread, 1.0) ** 2 * held.fit.neighbours_factor,
         options.drift,
     )
-    placement = widened(placement, grown_by)
+    placement = widened(placement, bending_m2)
     complete = with_existing(adjusted, fixed, good.take(sharp), placement.parents)
     complete = only_photos(complete, [k for k in range(len(rows)) if k not in outside])
-    more = {"bending": grown_by}
+    more = {"bending_m": float(np.sqrt(bending_m2))}
     return assemble(complete, placement, held, photos, features_of, near, identity, options, more)
 
 
@@ -139,11 +139,11 @@ def _meeting_place(
     return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
 
 
-def widened(placement: MapsPlacement, factor: float) -> MapsPlacement:
-    """The placement with its covariance relative to the existing maps multiplied."""
+def widened(placement: MapsPlacement, bending_m2: float) -> MapsPlacement:
+    """The placement with its covariance relative to the existing maps widened by what bending adds."""
     assert placement.covariance is not None
     assert placement.covariance_relative is not None
-    wider = placement.covariance_relative * factor
+    wider = placement.covariance_relative + np.diag([0.0] * 4 + [bending_m2] * 3)
     on_earth = placement.covariance - placement.covariance_relative
     return replace(placement, covariance_relative=wider, covariance=wider + on_earth)
 

@@ -237,18 +237,22 @@ def solve_with_new(
 def no_surer_than(edges: Sequence[StoredEdge], together: FloatArray | None) -> list[StoredEdge]:
     """Edges of one map to several, all made of the same photos, so that they do not count these twice.
 
-    Taken as independent, they would place the map more surely than one fit to all of them did; their
-    covariances grow by the largest ratio.
+    Taken as independent, they would place the map more surely than one fit to all of them, its bending
+    included, did. What is missing is common to all of them; shared out over n of them, each gets n times as
+    much, so that they have it together.
 
     Args:
         together: (7, 7) covariance of the map's placement by all of them at once.
     """
-    if together is None or len(edges) < 2:
+    if together is None or not edges:
         return list(edges)
-    information = sum(np.linalg.inv(edge.covariance) for edge in edges)
-    half = np.linalg.cholesky(together)
-    factor = max(1.0, float(np.linalg.eigvalsh(half.T @ information @ half)[-1]))
-    return [replace(edge, covariance=factor * edge.covariance) for edge in edges]
+    apart = np.linalg.inv(sum(np.linalg.inv(edge.covariance) for edge in edges))
+    half = np.linalg.cholesky(apart)  # axes in which what they say together is a unit ball: units mix
+    white = np.linalg.solve(half, np.linalg.solve(half, together - apart).T)
+    values, vectors = np.linalg.eigh(0.5 * (white + white.T))
+    missing = half @ (vectors * np.maximum(values, 0.0)) @ vectors.T @ half.T
+    more = len(edges) * 0.5 * (missing + missing.T)
+    return [replace(edge, covariance=edge.covariance + more) for edge in edges]
 
 
 def drift_m(covariance_relative: FloatArray, corners: FloatArray) -> float:

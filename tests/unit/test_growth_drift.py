@@ -3,11 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
-from ingest.growth.drift import DriftOptions, center_covariances, inflation
+from ingest.growth.drift import DriftOptions, bending_variance_m2, center_covariances
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import box_points, looking_at, random_descriptors
 
@@ -87,8 +88,12 @@ def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
     arguments = (new.model, keypoints, fixed, kept, [0])
-    factor = inflation(*arguments, tiny, 1.0, DriftOptions())
-    assert factor > 10.0
-    assert inflation(*arguments, tiny * factor, 1.0, DriftOptions()) < 1.0 + 1e-6
-    assert inflation(*arguments, ample, 1.0, DriftOptions()) == 1.0
-    assert inflation(*arguments, tiny, 4.0, DriftOptions()) > 2.0 * factor
+    more = bending_variance_m2(*arguments, tiny, 1.0, DriftOptions())
+    assert more > 1e-4
+    wider = tiny + np.diag([0.0] * 4 + [more] * 3)
+    assert bending_variance_m2(*arguments, wider, 1.0, DriftOptions()) < 1e-9
+    assert bending_variance_m2(*arguments, ample, 1.0, DriftOptions()) == 0.0
+    assert bending_variance_m2(*arguments, tiny, 4.0, DriftOptions()) > 2.0 * more
+    # A similarity that covers the far end is widened by what the near photos lack, not at the far end.
+    spread = center_covariances(*arguments, 1.0, DriftOptions())
+    assert more == pytest.approx(np.linalg.eigvalsh(spread)[:, -1].max(), rel=0.01)

@@ -101,10 +101,12 @@ def test_two_edges_of_the_same_photos_count_once() -> None:
     found = no_surer_than([edge, replace(edge, map_id="B")], EDGE)
     together = np.linalg.inv(sum(np.linalg.inv(e.covariance) for e in found))
     np.testing.assert_allclose(together, EDGE, rtol=1e-9)
-    # One that is no surer than the fit stays as it is.
-    assert no_surer_than([edge], EDGE / 2)[0].covariance is edge.covariance
+    # Those that are no surer than the fit stay as they are; a single one gets what it lacks.
+    np.testing.assert_allclose(no_surer_than([edge], EDGE / 2)[0].covariance, EDGE, rtol=1e-9)
     loose = no_surer_than([edge, replace(edge, map_id="B")], EDGE / 10)
-    np.testing.assert_array_equal(loose[0].covariance, EDGE)
+    np.testing.assert_allclose(loose[0].covariance, EDGE, rtol=1e-9)
+    bent = EDGE + np.diag([0.0] * 4 + [0.01] * 3)
+    np.testing.assert_allclose(no_surer_than([edge], bent)[0].covariance, bent, rtol=1e-6)
 
 
 def test_the_drift_gate() -> None:
