@@ -9,7 +9,7 @@
    localised by the maps that exist, reconstructed among themselves, placed and refined by growth. What
    cannot be placed waits, is tried with the next portion, and once more at the end.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
-   metre is a fiftieth of the median viewing distance: what it would be for photos taken at 50 m.
+   metre is a hundredth of the extent of the camera centres (diagonal of their box).
 
 Prints one line a photo with -v, and one line a set. Exit code 0 if all photos of the reference are
 registered and the median difference is at most 0.3 m, else 1. Grown maps are committed as active here: who
@@ -50,6 +50,7 @@ _PORTIONS = 3
 _LIMIT_M = 0.3
 _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
 _MADE_UP_DISTANCE_M = 50.0
+_EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
 
 
 @dataclass(slots=True, kw_only=True)
@@ -169,6 +170,11 @@ def _viewing_distance(component: Component) -> float:
     return float(np.median(np.linalg.norm(offsets, axis=1)))
 
 
+def _extent(centers: FloatArray) -> float:
+    """Diagonal of the box of camera centres (n, 3)."""
+    return float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
+
+
 def _grow(state: State) -> Grown:
     """One round over all waiting photos."""
     areas = Localiser.open(state.database).areas
@@ -224,7 +230,7 @@ def _summary(new: GrownMap) -> str:
 def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: float, grown_s: float) -> int:
     metric = joint.placement.local_from_sfm is not None and joint.placement.reason is None
     sim = joint.placement.local_from_sfm if metric else None
-    scale = _MADE_UP_DISTANCE_M / _viewing_distance(joint)
+    scale = _EXTENT_M / _extent(joint.model.centers())
     sim = sim or Sim3(scale=scale, rotation=np.eye(3), translation=np.zeros(3))
     reference = {p.name: sim.act(c) for p, c in zip(joint.photos, joint.model.centers(), strict=True)}
     both = sorted(reference.keys() & state.centers.keys())
@@ -237,13 +243,14 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
             print(f"    {name:<28} {distance:.3f} m")
     missing = sorted(reference.keys() - state.centers.keys())
     median = float(np.median(apart)) if len(both) else float("nan")
+    place = np.array(list(reference.values()))
     print(
         f"{args.photos.parent.name + '/' + args.photos.name:<22} {args.cut:<12} photos {len(state.photos)}, "
-        f"joint {len(reference)}, grown {len(state.centers)}, of the joint ones {len(both)}; "
-        f"difference median {median:.3f} m, largest {apart.max(initial=0):.3f} m "
-        f"({'GPS' if metric else 'own scale'}), viewing distance "
-        f" {sim.scale * _viewing_distance(joint):.0f} m; CPU {joint_s:.0f} s joint, {grown_s:.0f} s "
-        f"grown{'; missing ' + ', '.join(missing) if missing else ''}"
+        f"joint {len(reference)}, grown {len(state.centers)}, of the joint ones {len(both)}; difference "
+        f"median {median:.3f} m, largest {apart.max(initial=0):.3f} m; "
+        f"{'metres by GPS' if metric else 'own scale'}, extent {_extent(place):.0f} m, viewing distance "
+        f"{sim.scale * _viewing_distance(joint):.0f} m; CPU {joint_s:.0f} s joint, {grown_s:.0f} s grown"
+        f"{'; missing ' + ', '.join(missing) if missing else ''}"
     )
     return 0 if not missing and median <= _LIMIT_M else 1
 

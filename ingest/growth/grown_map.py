@@ -19,7 +19,7 @@ from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors, find_anchors
 from ingest.growth.drift import DriftOptions, bending_variance_m2
-from ingest.growth.localised import in_frame
+from ingest.growth.localised import LocaliseEachOptions, in_frame, with_lens
 from ingest.growth.placement import (
     Held,
     PlacementOptions,
@@ -42,12 +42,14 @@ class GrowOptions:
         min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
             lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
             reconstruction cannot be bent to what the existing maps say.
+        localise: how poses are found again with the lenses of the reconstruction.
         drift: how far the refined reconstruction may bend beyond what holds it.
         maps: what goes into the map; the height datum is that of the parents.
     """
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     refine: RefineOptions = field(default_factory=RefineOptions)
+    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     min_held_share: float = 0.5
     drift: DriftOptions = field(default_factory=DriftOptions)
     maps: MapOptions = field(default_factory=MapOptions)
@@ -85,6 +87,8 @@ def grow_component(
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
     model, constant = adopt_lenses(model, mine, keypoints, options.refine)
+    lenses = dict(zip(rows, model.camera_of.tolist(), strict=True))
+    mine = {r: with_lens(p, model.cameras[lenses[r]], options.localise) for r, p in mine.items()}
     anchors = find_anchors(model, mine, dict(zip(rows, keypoints, strict=True)))
     held = place_by_maps(model, mine, anchors, photos, near, frame, options.placement)
     placement = held.placement

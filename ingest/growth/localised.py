@@ -10,6 +10,7 @@ from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
@@ -17,7 +18,7 @@ from reloc.candidates import IndexedArea
 from reloc.localise import Localised, localise_features
 from reloc.matching import Matches, guided_matches, visible_points
 from reloc.options import LocaliseOptions
-from reloc.pose import PoseHypothesis, pose_uncertainty, refine_pose
+from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
 from reloc.result import LocaliseRequest
 from reloc.search import pairs
 
@@ -182,6 +183,45 @@ def match_each_map(
         point=np.concatenate([p.point for p in parts] or [np.zeros(0, np.int64)]),
         distance=np.concatenate([p.distance for p in parts] or [np.zeros(0, np.float32)]),
     )
+
+
+def with_lens(photo: LocalisedPhoto, camera: Camera, options: LocaliseEachOptions) -> LocalisedPhoto:
+    """The photo's pose by its own matches with a lens that is given; as it was where they do not fit it.
+
+    Where the lens was estimated along, focal length and distance hardly differ: two poses of one photo can be
+    compared with the same lens only.
+    """
+    if camera == photo.camera or (camera.width, camera.height) != (photo.camera.width, photo.camera.height):
+        return photo
+    settings = options.localise.pose
+    start = PoseHypothesis(
+        cam_from_local=photo.cam_from_local,
+        camera=camera,
+        camera_source="request",
+        inliers=np.ones(len(photo.pixels), dtype=np.bool_),
+        prior_focal_px=camera.focal_px,
+    )
+    # The camera goes back along its axis as the focal length grows, so that the scene keeps its size.
+    center = photo.cam_from_local.center
+    away = center - np.median(photo.points, axis=0)
+    shift = away * (camera.focal_px / photo.camera.focal_px - 1.0)
+    start = replace(start, cam_from_local=_moved(photo.cam_from_local, shift))
+    best = estimate_pose(photo.pixels, photo.points, camera, "request", settings)
+    again = max(
+        (refine_pose(photo.pixels, photo.points, s, settings) for s in (start, best) if s is not None),
+        key=lambda pose: pose.count,
+    )
+    if again.count < 0.5 * len(photo.pixels) or again.count < 4:
+        return photo
+    rows = np.flatnonzero(again.inliers)
+    spread = pose_uncertainty(
+        photo.pixels[rows], photo.points[rows], photo.point_covariance[rows], again, settings
+    )
+    return replace(photo, cam_from_local=again.cam_from_local, camera=camera, covariance=spread.covariance)
+
+
+def _moved(pose: Rigid3, offset: FloatArray) -> Rigid3:
+    return Rigid3(rotation=pose.rotation, translation=pose.translation - pose.rotation @ offset)
 
 
 def in_frame(photo: LocalisedPhoto, frame: LocalFrame) -> LocalisedPhoto:
