@@ -134,7 +134,7 @@ def ingest_photos(
                 vocabulary=options.vocabulary,
             )
     with clock.stage("build"):
-        outcomes, registered = _place_and_commit(
+        outcomes, registered, quarantined = _place_and_commit(
             database, result, options, lambda number: _identity(folder, options, job_id, number), progress
         )
     return IngestReport(
@@ -149,7 +149,7 @@ def ingest_photos(
         stages=clock.timings,
         photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
-        warnings=(*scanned.notes, *_warnings(result, outcomes, options)),
+        warnings=(*scanned.notes, *_warnings(result, outcomes, options), *_quarantine_note(quarantined)),
     )
 
 
@@ -241,19 +241,25 @@ def _place_and_commit(
     options: IngestOptions,
     identity: Callable[[int], MapIdentity],
     progress: Progress,
-) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome]]:
-    """Place the models and make the maps visible; what became of each component and of its photos.
+) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome], list[str]]:
+    """Place the models and make the maps visible.
+
+    Returns:
+        What became of each component and of its photos, and the ids of maps in quarantine.
 
     Maps are committed together until they are large: then the next ones go into another commit, so that
     memory does not grow with the photos.
     """
     outcomes: list[MapOutcome] = []
     registered: dict[str, PhotoOutcome] = {}
+    quarantined: list[str] = []
     if options.stop_after not in (None, "build", "commit"):
-        return (), {}
+        return (), {}, []
     batch: list[Component] = []
     for component in place_models(result, options.making, identity=identity, survey=options.survey):
         batch.append(component)
+        if component.feature_map is not None and component.feature_map.status == "quarantined":
+            quarantined.append(component.feature_map.map_id)
         if sum(len(c.model.point_of) for c in batch) > _OBSERVATIONS_PER_COMMIT:
             outcomes += _commit(database, batch, options)
             registered |= _registered_all(batch, result)
@@ -261,7 +267,7 @@ def _place_and_commit(
     outcomes += _commit(database, batch, options)
     registered |= _registered_all(batch, result)
     progress("build", len(outcomes), len(outcomes))
-    return tuple(outcomes), registered
+    return tuple(outcomes), registered, quarantined
 
 
 def _registered_all(batch: Sequence[Component], result: Reconstructed) -> dict[str, PhotoOutcome]:
@@ -277,6 +283,16 @@ def _commit(database: Database, batch: Sequence[Component], options: IngestOptio
     if maps:
         created = {r.map_id: r.created for r in database.commit_maps(maps)}
     return [map_outcome(c, created, options.making) for c in batch]
+
+
+def _quarantine_note(map_ids: Sequence[str]) -> tuple[str, ...]:
+    if not map_ids:
+        return ()
+    return (
+        f"{len(map_ids)} maps are placed by geotags that nobody answers for and stay in quarantine "
+        f"({', '.join(map_ids[:3])}{', ...' if len(map_ids) > 3 else ''}): they answer no queries until "
+        "something better confirms them; --trust-geotags believes the geotags.",
+    )
 
 
 def _warnings(
