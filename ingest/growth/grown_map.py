@@ -44,7 +44,9 @@ class GrowOptions:
             reconstruction cannot be bent to what the existing maps say.
         localise: how poses are found again with the lenses of the reconstruction.
         drift: how far the refined reconstruction may bend beyond what holds it.
-        maps: what goes into the map; the height datum is that of the parents.
+        maps: what goes into the map; the height datum is that of the parents. Points of two photos carry
+            descriptors: a handful of photos has hardly longer tracks, and the next photo needs them to be
+            localised.
     """
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
@@ -52,7 +54,7 @@ class GrowOptions:
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     min_held_share: float = 0.5
     drift: DriftOptions = field(default_factory=DriftOptions)
-    maps: MapOptions = field(default_factory=MapOptions)
+    maps: MapOptions = field(default_factory=lambda: MapOptions(min_track_length=2))
 
 
 def grow_component(
