@@ -15,12 +15,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.index.area import Area
-from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.move import covariance_in_frame
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.gates import Gate
+from ingest.growth.parents import ParentOptions, edges_of, largest_sigma_m, parents_covariance
 from ingest.growth.similarity_fit import (
     Fit,
     FitOptions,
@@ -30,7 +29,7 @@ from ingest.growth.similarity_fit import (
     rank_proposals,
     tolerances_px,
 )
-from ingest.growth.values import Edge, LocalisedPhoto, MapAgreement, MapsPlacement
+from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
 from ingest.photo import Photo
 from reloc.acceptance import agreement
 from reloc.matching import visible_points
@@ -61,8 +60,7 @@ class PlacementOptions:
             some: as for a query (reloc.acceptance).
         min_visible_points: a photo that should see fewer existing points says nothing about visibility.
         max_blind: share of photos below `min_visible`.
-        min_map_points, min_map_photos: an existing map with fewer shared points, seen by fewer photos, is
-            not a parent: alone it would not hold the new one.
+        parents: when an existing map is one of them.
     """
 
     fit: FitOptions = field(default_factory=FitOptions)
@@ -78,8 +76,7 @@ class PlacementOptions:
     min_visible: float = 0.2
     min_visible_points: int = 30
     max_blind: float = 0.34
-    min_map_points: int = 30
-    min_map_photos: int = 2
+    parents: ParentOptions = field(default_factory=ParentOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -136,7 +133,7 @@ def place_by_maps(
     used = np.isin(anchors.photo_of, list(agree)) | anchors.carried
     used &= fit.errors_px < tolerances_px(model, anchors, options.fit.tolerance_rel)
     maps = {m.map_id: m for area in areas for m in area.maps}
-    edges = _edges(model, fit, anchors, used, options)
+    edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     asked = _ask(
         model, fit, agree, own, anchors, used, edges, photos, areas, frame, on_earth, ranked, options
@@ -323,87 +320,6 @@ def visible_parts(
             seen = held.pixels[held.photo_of == k]
             found.append(agreement(seen, expected, camera.width, camera.height))
     return np.array(found)
-
-
-def _edges(
-    model: Model, fit: Fit, anchors: Anchors, used: NDArray[np.bool_], options: PlacementOptions
-) -> tuple[Edge, ...]:
-    """How each existing map holds the model, by its own points alone where they suffice."""
-    found: list[Edge] = []
-    for m, map_id in enumerate(anchors.map_ids):
-        mine = used & (anchors.map_of == m)
-        points = len(np.unique(anchors.point_of[mine]))
-        photos = len(np.unique(anchors.photo_of[mine]))
-        if points < options.min_map_points or photos < options.min_map_photos:
-            continue
-        alone = fit_similarity(model, fit.local_from_sfm, anchors, mine, options.fit)
-        found.append(
-            Edge(
-                map_id=map_id,
-                parent_from_new=alone.local_from_sfm @ fit.local_from_sfm.inverse(),
-                covariance=alone.covariance,
-                shared_points=points,
-                photos=photos,
-            )
-        )
-    return tuple(sorted(found, key=lambda e: (-e.shared_points, e.map_id)))
-
-
-def parents_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFrame) -> FloatArray:
-    """(7, 7) of the parents' placements on Earth in `frame`, weighted by shared points.
-
-    The mean of covariances bounds that of a mean from above however the parents' errors are correlated:
-    parents that came of one anchor err alike.
-    """
-    total = sum(weight for _, weight in parents)
-    covariance = np.zeros((7, 7))
-    for feature_map, weight in parents:
-        moved = covariance_in_frame(feature_map.placement.covariance, feature_map.frame, frame)
-        covariance += weight / total * moved
-    return covariance
-
-
-def map_agreements(placement: MapsPlacement, held: Anchors) -> tuple[MapAgreement, ...]:
-    """How well each pair of parents agrees, as the new map that overlaps both sees it.
-
-    Args:
-        held: anchors that agree with the placement.
-    """
-    found: list[MapAgreement] = []
-    edges = placement.edges
-    for i, a in enumerate(edges):
-        for b in edges[i + 1 :]:
-            a_from_b = a.parent_from_new @ b.parent_from_new.inverse()
-            adjoint = a_from_b.adjoint()
-            covariance = a.covariance + adjoint @ b.covariance @ adjoint.T
-            both = np.isin(held.map_of, [held.map_ids.index(a.map_id), held.map_ids.index(b.map_id)])
-            middle = held.points[both].mean(axis=0)
-            offset = a_from_b.act(middle) - middle
-            distance = float(np.linalg.norm(offset))
-            jacobian = point_jacobian(middle)
-            spread = jacobian @ covariance @ jacobian.T
-            axis = offset / distance if distance > 0 else np.array([1.0, 0.0, 0.0])
-            sigma = float(np.sqrt(axis @ spread @ axis))
-            found.append(
-                MapAgreement(
-                    map_a=a.map_id,
-                    map_b=b.map_id,
-                    a_from_b=a_from_b,
-                    covariance=np.asarray((covariance + covariance.T) / 2),
-                    distance_m=distance,
-                    sigma_m=sigma,
-                    sigmas=float(np.sqrt(offset @ np.linalg.solve(spread, offset))),
-                    photos=(a.photos, b.photos),
-                )
-            )
-    return tuple(found)
-
-
-def largest_sigma_m(covariance: FloatArray, points: FloatArray) -> float:
-    """Largest standard deviation, over points (n, 3), of where a similarity of that covariance puts them."""
-    jacobian = point_jacobian(points)
-    spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    return float(np.sqrt(np.linalg.eigvalsh(spread)[:, -1].max()))
 
 
 def _corners(points: FloatArray) -> FloatArray:
