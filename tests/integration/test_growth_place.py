@@ -15,7 +15,7 @@ from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
-from ingest.growth.localised import localise_photos
+from ingest.growth.localised import LocaliseEachOptions, localise_photos, with_lens
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from reloc.candidates import IndexedArea
 from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
@@ -330,3 +330,42 @@ def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, a
     grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
     assert not grown.maps
     assert set(grown.waiting) == {0, 1} or [r.reason for r in grown.refused] == ["TOO_FEW_AGREE"]
+
+
+@pytest.mark.parametrize(("bystanders", "enough"), [(1, False), (2, True)])
+def test_photos_of_existing_maps_vouch_for_a_lone_one(
+    area: IndexedArea, bystanders: int, enough: bool
+) -> None:
+    """The last photo of a walk has no new neighbour; photos of the old map see what it sees."""
+    old = [ring(10)[7], ring(10)[8]]
+    both = take_photos(np.random.default_rng(21), POINTS, DESCRIPTORS, [*walk(1), *old], camera_key=KEY)
+    found, _ = localise_photos(both.photos, range(3), both.features_of, [area])
+    assert len(found) == 3
+    known = {r: found[r] for r in range(1, 1 + bystanders)}
+    grown = grow_photos(
+        [], both.photos, both.features_of, {0: found[0]}, [area], lambda rows: identity(), known=known
+    )
+    if not enough:
+        assert not grown.maps
+        assert "2 are needed" in grown.waiting[0]
+        return
+    assert not grown.waiting
+    (made,) = grown.maps
+    assert sorted(made.model.rows.tolist()) == [0, 1, 2]
+    assert centers_error(made, both).max() < 0.1
+
+
+def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:
+    """A longer lens stands further back; with the true lens the photo is where it was."""
+    longer = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(960.0, 500.0, 400.0, 0.01))
+    options = LocaliseEachOptions()
+    back = with_lens(localised[2], longer, options)
+    assert back.camera == longer
+    moved = back.cam_from_local.center - new.poses[2].center
+    outward = new.poses[2].center - np.median(localised[2].points, axis=0)
+    assert np.linalg.norm(moved) > 1.5
+    assert moved @ outward / np.linalg.norm(moved) / np.linalg.norm(outward) > 0.9
+    again = with_lens(back, CAMERA, options)
+    assert np.linalg.norm(again.cam_from_local.center - new.poses[2].center) < 0.1
+    other_size = Camera(model="SIMPLE_RADIAL", width=500, height=400, params=(450.0, 250.0, 200.0, 0.0))
+    assert with_lens(localised[2], other_size, options) is localised[2]
