@@ -8,7 +8,13 @@ from dataclasses import dataclass, replace
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame.clock import StageClock
 from ingest.register.frame.confirmation import Confirmation
-from ingest.register.frame.dense import confirmed, dense_fitted, dense_hypotheses, intensity_refined
+from ingest.register.frame.dense import (
+    confirmed,
+    dense_fitted,
+    dense_hypotheses,
+    intensity_refined,
+    searched_again,
+)
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened
 from ingest.register.frame.search import (
@@ -52,7 +58,23 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
             return judged[-1]
         if confirmation.confirmed and confirmation.log_nfa >= options.sure_confirmation_log_nfa:
             return judged[-1]
-    return max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
+    best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
+    return best and _looked_again(views, prior, best, clock)
+
+
+def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> Judged:
+    """A pose that is nearly confirmed, searched and fitted in turns: each leaves the other's dead ends."""
+    options, best, start = views.options, judged, judged.found
+    for _ in range(options.more_looks):
+        if best.confirmation.confirmed or best.confirmation.log_nfa < options.promising_log_nfa:
+            break
+        with clock.stage("look again"):
+            near = searched_again(views, prior, start)
+        if near is None:
+            break
+        again = _polished(views, loosened(prior, options.prior_slack), near, clock)
+        best, start = max(best, again, key=lambda j: j.confirmation.log_nfa), again.found
+    return best
 
 
 def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from ingest.register.frame.confirmation import Confirmation, confirm_pose
 from ingest.register.frame.dense_fit import DenseFitOptions, near_places
-from ingest.register.frame.dense_search import register_dense
+from ingest.register.frame.dense_search import register_dense, searched_near
 from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame.matching import joined
 from ingest.register.frame.prior_fit import fitted_under_prior
@@ -60,6 +60,15 @@ def dense_fitted(
         if before is None or found is None or _moved_px(views, before, found) < options.settled_px:
             break
     return found
+
+
+def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
+    """The dense search's own maximum next to a pose that was fitted; None where there is none."""
+    pose = found.pose.cam_from_local
+    near = searched_near(views.gray, found.pose.camera, pose, prior, views.cloud, found.source)
+    if near is None:
+        return None
+    return replace(found, pose=replace(found.pose, cam_from_local=near.cam_from_local))
 
 
 def _fit_round(

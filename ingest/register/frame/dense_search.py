@@ -126,6 +126,20 @@ def register_dense(
     return []
 
 
+def searched_near(
+    photo_gray: NDArray[np.uint8],
+    camera: Camera,
+    pose: Rigid3,
+    prior: FramePrior,
+    cloud: PointCloud,
+    source: RenderSource,
+    options: DenseOptions = DenseOptions(),
+) -> DensePose | None:
+    """The highest sum of score maps near a pose, at the finest octave; None where it shows too little."""
+    view = pinhole_view(photo_gray, camera, _sides(camera, prior, cloud, options)[-1])
+    return _refined(view, pose, prior, cloud, source, options)
+
+
 def score_maps_of(
     view: PinholeView,
     cam_from_local: Rigid3,

@@ -36,6 +36,8 @@ class FrameOptions:
         decisive_log_nfa: one with so much, if the pictures confirm it, ends the search.
         promising_log_nfa: a pose of the dense search with less evidence of the pictures is not fitted. Before
             the fit right ones had 0.6 and more, of those at wrong places one in ten.
+        more_looks: so many times at most the best pose is searched and fitted again, where it is not
+            confirmed, but has that much evidence.
         sure_confirmation_log_nfa: and so does one that the pictures confirm so strongly. Three of
             four right poses do; wrong ones reached 8.
         tolerance_rel: inlier tolerance as a share of the longer side (4 pixels at 1600), where points are
@@ -65,6 +67,7 @@ class FrameOptions:
     min_log_nfa: float = 2.0
     decisive_log_nfa: float = 60.0
     promising_log_nfa: float = 0.5
+    more_looks: int = 2
     sure_confirmation_log_nfa: float = 20.0
     tolerance_rel: float = 0.0025
     max_tolerance_rel: float = 0.006
