@@ -127,15 +127,16 @@ def ingested(
     link(album.folder, photos, (f.name for f in facts))
     shutil.rmtree(database, ignore_errors=True)
     command = [
-        *(sys.executable, "-m", "featuredb.cli.main", "ingest", "photos", str(database), str(photos)),
+        *(sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)),
         *("--workers", str(args.workers), "--quiet", *extra, *args.ingest_option),
     ]
     start, before = time.monotonic(), os.times()
-    with subprocess.Popen(command) as process:
+    said = out / f"{name}.txt"  # a line for each photo that is in no map
+    with said.open("wb") as file, subprocess.Popen(command, stdout=file) as process:
         peak = _peak_of(process)
     wall, after = time.monotonic() - start, os.times()
     if process.returncode != 0:
-        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
+        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}; see {said}")
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
     maps = Database.open(database).snapshot().maps()
     run = Ingest(
