@@ -44,7 +44,7 @@ def test_good_evidence_is_believed() -> None:
     [
         ({"inliers": 12}, "TOO_FEW_MATCHES"),
         ({"confirmed": False, "confirmation_message": "no"}, "NOT_CONFIRMED"),
-        ({"confirmation_log_nfa": 8.4}, "NOT_CONFIRMED"),
+        ({"confirmation_log_nfa": 8.4, "log_nfa": 5.0}, "NOT_CONFIRMED"),
         ({"cells": 4}, "NO_CONSISTENT_POSE"),
         ({"agreement": 0.1}, "NO_CONSISTENT_POSE"),
         ({"rival_share": 0.6}, "AMBIGUOUS"),
@@ -73,6 +73,11 @@ def test_middling_evidence_is_believed_where_other_places_show_much_less() -> No
     # What is found elsewhere counts as 1 at least.
     faint = replace(MIDDLING, confirmation_log_nfa=4.0, places_elsewhere=2)
     assert verdict(faint, options) is not None
+
+
+def test_features_and_pictures_add_up() -> None:
+    assert verdict(replace(MIDDLING, log_nfa=22.0), VerdictOptions()) is None
+    assert verdict(replace(MIDDLING, log_nfa=20.0), VerdictOptions()) is not None
 
 
 def test_elsewhere_is_asked_only_where_it_decides() -> None:

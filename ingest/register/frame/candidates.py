@@ -56,7 +56,9 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
         silent = confirmation.pieces < options.verdict.min_confirmation_pieces
         if start.log_nfa >= options.decisive_log_nfa and (confirmation.confirmed or silent):
             return judged[-1]
-        if confirmation.confirmed and confirmation.log_nfa >= options.sure_confirmation_log_nfa:
+        joint = start.log_nfa + confirmation.log_nfa
+        sure = confirmation.log_nfa >= options.sure_confirmation_log_nfa
+        if confirmation.confirmed and (sure or joint >= options.verdict.min_joint_log_nfa):
             return judged[-1]
     best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
     return best and _looked_again(views, prior, best, clock)

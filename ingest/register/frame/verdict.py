@@ -25,6 +25,8 @@ class VerdictOptions:
         min_confirmation_log_nfa: evidence of the pictures with which a pose needs no features. It is the best
             of very many that were tried, and towns resemble each other: of 20 photos of another town the
             strongest reached 14.3.
+        min_joint_log_nfa: or evidence of features and pictures together; nothing wrong had more than 4 from
+            features.
         min_confirmation_ratio: with less, it must be so many times what the photo reaches at places of the
             scan where it cannot be (`elsewhere`), of which max_places_elsewhere are tried and
             min_places_elsewhere must be there. What is found there counts as 1 at least.
@@ -43,6 +45,7 @@ class VerdictOptions:
     min_log_nfa_alone: float = 60.0
     min_confirmation_pieces: int = 25
     min_confirmation_log_nfa: float = 20.0
+    min_joint_log_nfa: float = 30.0
     min_confirmation_ratio: float = 5.0
     max_places_elsewhere: int = 3
     min_places_elsewhere: int = 1
@@ -107,10 +110,9 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
     silent = e.confirmation_pieces < o.min_confirmation_pieces and e.log_nfa >= o.min_log_nfa_alone
     if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
-    if e.log_nfa < o.min_log_nfa_alone and e.confirmation_log_nfa < o.min_confirmation_log_nfa:
-        refusal = _against_elsewhere(e, o)
-        if refusal is not None:
-            return refusal
+    refusal = None if _suffices(e, o) else _against_elsewhere(e, o)
+    if refusal is not None:
+        return refusal
     if e.cells < o.min_cells or e.agreement < o.min_agreement:
         return (
             "NO_CONSISTENT_POSE",
@@ -133,6 +135,15 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
             "allowed; if the prior's deviations are too small, give larger ones",
         )
     return None
+
+
+def _suffices(e: FrameEvidence, o: VerdictOptions) -> bool:
+    """Whether the evidence needs no comparison with other places."""
+    return (
+        e.log_nfa >= o.min_log_nfa_alone
+        or e.confirmation_log_nfa >= o.min_confirmation_log_nfa
+        or e.log_nfa + e.confirmation_log_nfa >= o.min_joint_log_nfa
+    )
 
 
 def _against_elsewhere(e: FrameEvidence, o: VerdictOptions) -> tuple[FrameReason, str] | None:
