@@ -64,7 +64,7 @@ class Vocabulary:
         return content.hexdigest()[:16]
 
     def aggregate(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """One vector (size,) of unit length for a photo's descriptors (n, 128); zeros where there are none."""
+        """Unit vector (size,) of a photo's descriptors (n, 128); zeros where there are none."""
         total = np.zeros_like(self.words)
         if len(descriptors):
             projected = (descriptors.astype(np.float32) - self.mean) @ self.projection

@@ -205,7 +205,7 @@ def test_anchors_give_way_within_their_own_covariance() -> None:
 
 
 def test_an_anchor_that_was_moved_remembers_its_own_placement() -> None:
-    """Moved 2 m by an earlier graph; with the same overlap again nothing moves, and nothing is counted twice."""
+    """Moved 2 m by an earlier graph; with the same overlap again nothing moves or is counted twice."""
     loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
     firm = np.diag(np.repeat([1e-5, 0.03], [4, 3]) ** 2)
     first = solve_pose_graph(

@@ -94,9 +94,7 @@ def test_keys_follow_the_content() -> None:
         replace(task, options=SfmOptions(seed=1)),
         replace(task, views=(replace(view, features=Path("work/features/sift/bb.npz")),)),
         replace(task, views=(replace(view, features=Path("work/features/other/aa.npz")),)),
-        replace(
-            task, views=(replace(view, prior_position=(0.0, 0.0, 0.0), prior_sigma_m=(1.0, 1.0, 1.0)),)
-        ),
+        replace(task, views=(replace(view, prior_position=(0.0, 0.0, 0.0), prior_sigma_m=(1.0, 1.0, 1.0)),)),
         replace(task, matches=((0, 1, Path("work/matches/ratio/aa/aa_bb.npz")),)),
     ]
     assert len({task.key(), *(other.key() for other in others)}) == 6
