@@ -2,6 +2,7 @@
 
 import argparse
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
     from ingest.register.control.model import Survey
     from ingest.report import IngestReport
 
+_LISTED = 40  # photos that are named on the terminal
 _STAGES = ("scan", "extract", "match", "reconstruct", "build")
 
 
@@ -187,9 +189,12 @@ def summary(report: "IngestReport") -> str:
         if outcome.control is not None and outcome.control.control.marks:
             lines.extend(f"note: {text}" for text in outcome.control.file.notes)
             lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
-    for photo in report.photos:
-        if photo.status != "registered":
-            lines.append(f"  {photo.name}: {photo.reason_code}: {photo.reason}")
+    left_out = [photo for photo in report.photos if photo.status != "registered"]
+    lines.extend(f"  {p.name}: {p.reason_code}: {p.reason}" for p in left_out[:_LISTED])
+    if len(left_out) > _LISTED:
+        counts = Counter(p.reason_code for p in left_out[_LISTED:])
+        more = ", ".join(f"{count} {code}" for code, count in counts.most_common())
+        lines.append(f"  and {len(left_out) - _LISTED} more: {more}; --report DIR has them all")
     lines.extend(f"warning: {warning}" for outcome in report.maps for warning in outcome.warnings)
     lines.extend(f"warning: {warning}" for warning in report.warnings)
     return "\n".join(lines) + "\n"

@@ -149,7 +149,12 @@ def ingest_photos(
         stages=clock.timings,
         photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
-        warnings=(*scanned.notes, *_warnings(result, outcomes, options), *_quarantine_note(quarantined)),
+        warnings=(
+            *scanned.notes,
+            *_warnings(result, outcomes, options),
+            *_quarantine_note(quarantined),
+            *_lost(result),
+        ),
     )
 
 
@@ -293,6 +298,10 @@ def _quarantine_note(map_ids: Sequence[str]) -> tuple[str, ...]:
         f"({', '.join(map_ids[:3])}{', ...' if len(map_ids) > 3 else ''}): they answer no queries until "
         "something better confirms them; --trust-geotags believes the geotags.",
     )
+
+
+def _lost(result: Reconstructed) -> tuple[str, ...]:
+    return tuple(f"Matching of {task.task} is lost: {task.reason}" for task in result.lost_matches[:20])
 
 
 def _warnings(

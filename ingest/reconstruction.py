@@ -24,7 +24,7 @@ from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.colmap_bridge import Model
 from ingest.duplicates import copies_of
-from ingest.executor import Executor, Progress, no_progress
+from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.extract import FeatureFiles, PhotoFeatures, extract_photos, features_key, read_keypoints
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapIdentity, MapOptions, build_map
@@ -106,6 +106,7 @@ class Reconstructed:
         components: placed models, largest cluster first; empty until they are placed.
         unreadable: photos by name whose pixels could not be read, with the reason.
         lost: photos by name whose tasks ended every worker that ran them, with the reason.
+        lost_matches: tasks of matching that did so; their pairs count as not overlapping.
         copies: photos by name that show the picture of another owner's, with that one's name.
         features_per_photo: number of features by photo name.
         pairs: pairs tried, by row.
@@ -120,6 +121,7 @@ class Reconstructed:
     components: tuple[Component, ...] = ()
     unreadable: dict[str, str] = field(default_factory=dict)
     lost: dict[str, str] = field(default_factory=dict)
+    lost_matches: tuple[Lost, ...] = ()
     copies: dict[str, str] = field(default_factory=dict)
     features_per_photo: dict[str, int] = field(default_factory=dict)
     pairs: tuple[Pair, ...] = ()
@@ -199,6 +201,7 @@ def reconstruct_photos(
             p.name: len(read_keypoints(f)) for p, f in zip(usable, features.paths, strict=True)
         },
         pairs=tuple(matched.files),
+        lost_matches=matched.lost,
         inliers=matched.inliers,
         matches_per_photo=_matches_per_photo(usable, matched.inliers),
     )
