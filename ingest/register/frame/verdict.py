@@ -25,8 +25,8 @@ class VerdictOptions:
         min_confirmation_log_nfa: evidence of the pictures with which a pose needs no features. It is the best
             of very many that were tried, and towns resemble each other: of 20 photos of another town the
             strongest reached 14.3.
-        min_joint_log_nfa: or evidence of features and pictures together; nothing wrong had more than 4 from
-            features.
+        min_joint_log_nfa: or evidence of features and pictures together; features spoke for none of the wrong
+            poses that were measured.
         min_confirmation_ratio: with less, it must be so many times what the photo reaches at places of the
             scan where it cannot be (`elsewhere`), of which max_places_elsewhere are tried and
             min_places_elsewhere must be there. What is found there counts as 1 at least.
