@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from featuredb.features.decode import decode_gray, decode_rgb
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.lidar.load import load_cloud
@@ -64,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     street = _street_map(args, world, drone, cloud)
     say = sys.stdout.write
     say(f"street views: {len(street.images)} views, {len(street.points)} points\n")
-    for name, feature_map in (("drone map", drone), ("street views", street)):
+    maps = {"street views": street} if args.street_only else {"drone map": drone, "street views": street}
+    for name, feature_map in maps.items():
         indexed = [_indexed(feature_map)]
         for lens in (False, True) if name == "street views" else (False,):
             errors = [_asked(world, image, indexed, lens) for image in world.truth.group("street")]
@@ -88,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for image in world.truth.group("street")[
         :: max(1, len(world.truth.group("street")) // max(args.frames, 1))
     ][: args.frames]:
-        say(_registered(world, image, cloud, args.seed) + "\n")
+        say(_registered(world, image, drone, cloud, args.seed) + "\n")
         sys.stdout.flush()
     return 0
 
@@ -100,7 +102,7 @@ def _street_map(args: argparse.Namespace, world: World, drone: FeatureMap, cloud
         options = StreetOptions()
         low, high = np.percentile(drone.points_local()[:, :2], (2, 98), axis=0)
         places = standing_places(cloud, low, high, options.stand)
-        photos = np.array([i.cam_from_local.center for i in world.truth.group("street")])
+        photos = np.array([_pose(world, i, drone).center for i in world.truth.group("street")])
         gap = np.linalg.norm(places[:, None, :2] - photos[None, :, :2], axis=2).min(axis=1)
         near = places[gap < args.near]
         start = time.process_time()
@@ -111,6 +113,11 @@ def _street_map(args: argparse.Namespace, world: World, drone: FeatureMap, cloud
         )
         Database.create(kept).commit_map(replace(made, status="active"))
     return _largest(kept)
+
+
+def _pose(world: World, image: TrueImage, drone: FeatureMap) -> Rigid3:
+    """True pose in the frame of the drone map, which need not be that of the truth."""
+    return image.cam_from_local @ world.truth.frame.enu_from(drone.frame)
 
 
 def _gray_of(world: World) -> Callable[[MapImage], NDArray[np.uint8]]:
@@ -138,10 +145,10 @@ def _query(path: Path) -> tuple[NDArray[np.uint8], LocaliseRequest]:
     return gray, localise_request(LocaliseWireRequest(), data, gray)
 
 
-def _registered(world: World, image: TrueImage, cloud: PointCloud, seed: int) -> str:
+def _registered(world: World, image: TrueImage, drone: FeatureMap, cloud: PointCloud, seed: int) -> str:
     """One photo to the scan itself, from a geotag with 30 m of error."""
     rng = np.random.default_rng((seed, 91, len(image.name), int(image.name[-8:-4])))
-    true = image.cam_from_local.center
+    true = _pose(world, image, drone).center
     center: FloatArray = true + np.append(rng.normal(0, 30.0, 2), rng.normal(0, 1.0))
     prior = FramePrior(
         cam_from_local=look_pose(center, float(rng.uniform(0, 360)), 6.0), sigma_horizontal_m=30.0,
@@ -167,7 +174,7 @@ def _sheet(path: Path, world: World, drone: FeatureMap, cloud: PointCloud) -> No
     lines = []
     for image in street[:: max(1, len(street) // 4)][:4]:
         camera: Camera = image.camera.scaled_to(480, round(480 * image.camera.height / image.camera.width))
-        view = synthesise(surfaces, camera, image.cam_from_local, sources)
+        view = synthesise(surfaces, camera, _pose(world, image, drone), sources)
         photo = cv2.resize(
             decode_gray(world.folder / image.name),
             (camera.width, camera.height),
@@ -199,6 +206,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--near", type=float, default=25.0, metavar="M")
     parser.add_argument("--frames", type=int, default=5)
     parser.add_argument("--negatives", type=int, default=40)
+    parser.add_argument("--street-only", action="store_true", help="do not ask the drone map")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     return parser.parse_args(argv)
