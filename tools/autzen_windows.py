@@ -49,6 +49,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
+from ingest.register.frame.confirmation import ConfirmOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import VerdictOptions
 from ingest.register.frame_registration import FramePrior
@@ -247,7 +248,7 @@ def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
         if len(some):
             axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
     line = VerdictOptions()
-    for limit in (line.min_confirmation_log_nfa, line.min_confirmation_ratio):
+    for limit in (line.min_confirmation_log_nfa, ConfirmOptions().min_log_nfa):
         axes.axhline(limit, color="#1b2733", lw=0.8, ls="--")
     axes.set(xscale="log", xlabel="error on the ground, m", ylabel="evidence, -log10(NFA)", ylim=(0, None))
     axes.legend(fontsize=8)

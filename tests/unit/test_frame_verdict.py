@@ -70,9 +70,6 @@ def test_middling_evidence_is_believed_where_other_places_show_much_less() -> No
     refusal = verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=3.0), options)
     assert refusal is not None
     assert refusal[0] == "AMBIGUOUS"
-    # What is found elsewhere counts as 1 at least.
-    faint = replace(MIDDLING, confirmation_log_nfa=4.0, places_elsewhere=2)
-    assert verdict(faint, options) is not None
 
 
 def test_features_and_pictures_add_up() -> None:
@@ -85,7 +82,6 @@ def test_elsewhere_is_asked_only_where_it_decides() -> None:
     assert not asks_elsewhere(GOOD, options)
     assert not asks_elsewhere(replace(MIDDLING, inliers=12), options)
     assert not asks_elsewhere(replace(MIDDLING, confirmed=False), options)
-    assert not asks_elsewhere(replace(MIDDLING, confirmation_log_nfa=3.0), options)
 
 
 def test_decisive_features_bear_silent_pictures_but_no_contradiction() -> None:
