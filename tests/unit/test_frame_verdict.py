@@ -72,6 +72,15 @@ def test_middling_evidence_is_believed_where_other_places_show_much_less() -> No
     assert refusal[0] == "AMBIGUOUS"
 
 
+def test_relief_needs_evidence_of_its_own() -> None:
+    relief = replace(MIDDLING, places_elsewhere=5, relief_only=True)
+    assert verdict(replace(relief, relief_only=False), VerdictOptions()) is None
+    refusal = verdict(relief, VerdictOptions())
+    assert refusal is not None
+    assert refusal[0] == "NOT_CONFIRMED"
+    assert verdict(replace(relief, confirmation_log_nfa=25.0), VerdictOptions()) is None
+
+
 def test_features_and_pictures_add_up() -> None:
     assert verdict(replace(MIDDLING, log_nfa=22.0), VerdictOptions()) is None
     assert verdict(replace(MIDDLING, log_nfa=20.0), VerdictOptions()) is not None

@@ -129,7 +129,10 @@ def _by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
         return own
     others = [replace(found, source=source) for source in _sources(views) if source != found.source]
     judged = [own, *(Judged(found=other, confirmation=confirmed(views, other)) for other in others)]
-    return max(judged, key=lambda j: j.confirmation.log_nfa)
+    # Relief shows what stands and nothing of the ground: it is asked instead of others only beyond doubt.
+    sure = views.options.sure_confirmation_log_nfa
+    heard = [j for j in judged if j is own or j.found.source != "shaded" or j.confirmation.log_nfa >= sure]
+    return max(heard, key=lambda j: j.confirmation.log_nfa)
 
 
 def _polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:

@@ -151,6 +151,7 @@ def _evidence(
         rival_share=found.rival_share,
         prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
         position_sigma_share=share,
+        relief_only=found.source == "shaded",
         focal_sigma_rel=focal_sigma_rel(
             found.inliers.pixels, found.inliers.points, found.pose, views.options.correlated_inliers
         ),
