@@ -16,6 +16,7 @@ from ingest.register.frame.verdict import (
     asks_elsewhere,
     cells_with_inliers,
     verdict,
+    weighed_log_nfa,
 )
 from ingest.register.frame_registration import FramePrior
 
@@ -84,6 +85,18 @@ def test_relief_needs_evidence_of_its_own() -> None:
 def test_features_and_pictures_add_up() -> None:
     assert verdict(replace(MIDDLING, log_nfa=22.0), VerdictOptions()) is None
     assert verdict(replace(MIDDLING, log_nfa=20.0), VerdictOptions()) is not None
+
+
+def test_middling_evidence_far_from_the_prior_is_refused() -> None:
+    options = VerdictOptions()
+    asked = replace(MIDDLING, places_elsewhere=5, confirmation_log_nfa=7.7)
+    assert verdict(replace(asked, prior_sigmas=2.4), options) is None
+    assert weighed_log_nfa(replace(asked, prior_sigmas=2.4)) == 7.7
+    refusal = verdict(replace(asked, prior_sigmas=4.7), options)
+    assert refusal is not None
+    assert refusal[0] == "NOT_CONFIRMED"
+    assert "4.7 deviations" in refusal[1]
+    assert verdict(replace(GOOD, prior_sigmas=4.7), options) is None  # features speak for it
 
 
 def test_elsewhere_is_asked_only_where_it_decides() -> None:
