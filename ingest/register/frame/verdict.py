@@ -32,8 +32,8 @@ class VerdictOptions:
             min_places_elsewhere must be there. Right poses had 10 times as much and more, those of photos of
             another town up to 3 times as much with all places tried, but up to 5 with three.
         min_weighed_log_nfa: and so much evidence with the prior counted in (`weighed_log_nfa`): what the
-            pictures must say anyway. Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at 4.7
-            deviations from the prior, which leaves 4.3; right poses had 5.3 and more.
+            pictures must say anyway. Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at
+            4.7 deviations from the prior, which leaves 4.3; right poses had 5.3 and more.
         rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
         max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
             axes together. Generous: people and devices understate their errors.
