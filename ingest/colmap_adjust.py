@@ -11,7 +11,8 @@ reconstructions.
 import copy
 import logging
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,13 @@ import pycolmap
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import SfmPhoto, quiet
+from ingest.focal_prior import (
+    FocalPriorOptions,
+    add_focal_priors,
+    fix_gauge,
+    shared_variance_px2,
+    take_adjusted,
+)
 
 _LOG = logging.getLogger(__name__)
 _MORE_OF_RADIAL = 1  # the second radial coefficient
@@ -49,6 +57,7 @@ class AdjustOptions:
             consumer cameras lie within 1 %. Two flight lines of `brighton` moved it by 12 %, at a gain of
             43 times the penalty, and bent the map.
         use_positions: GPS positions take part, robustly, each with its own sigma.
+        focal_prior: how much the focal lengths of EXIF count.
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.
     """
@@ -60,28 +69,43 @@ class AdjustOptions:
     opencv_evidence: float = 20.0
     max_center_shift_rel: float = 0.03
     use_positions: bool = True
+    focal_prior: FocalPriorOptions = field(default_factory=FocalPriorOptions)
     max_iterations: int = 60
     threads: int = 1
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Known:
+    """What is known of the photos beforehand.
+
+    Attributes:
+        photos: with their positions, as they are in COLMAP's database.
+        focal_px: focal lengths of EXIF by camera id.
+    """
+
+    photos: tuple[SfmPhoto, ...]
+    focal_px: Mapping[int, float] = field(default_factory=dict)
+
+
 def adjust_models(
-    output: Path, database: Path, photos: tuple[SfmPhoto, ...], loss_scale_px: float, options: AdjustOptions
+    output: Path, database: Path, known: Known, loss_scale_px: float, options: AdjustOptions
 ) -> None:
     """Adjust every model folder under `output` in place.
 
     Args:
         database: COLMAP's, from which points are triangulated anew with the better lens.
+        known: the focal lengths are used where the adjustment is free to change them.
         loss_scale_px: of the Cauchy loss.
     """
     for folder in sorted(p for p in output.iterdir() if p.is_dir()):
         with quiet():
             reconstruction = pycolmap.Reconstruction(str(folder))
-            adjusted = _adjusted(reconstruction, folder, database, photos, loss_scale_px, options)
+            adjusted = _adjusted(reconstruction, folder, database, known, loss_scale_px, options)
             adjusted.write(str(folder))
 
 
 def adjust_posed(
-    folder: Path, database: Path, photos: tuple[SfmPhoto, ...], loss_scale_px: float, options: AdjustOptions
+    folder: Path, database: Path, known: Known, loss_scale_px: float, options: AdjustOptions
 ) -> list[int]:
     """Points for a model folder of poses alone, triangulated from all matches, and everything adjusted.
 
@@ -97,7 +121,7 @@ def adjust_posed(
         rough = replace(options, fuller_lens=False)
         for step in (rough, options):
             reconstruction = _triangulated_anew(reconstruction, database, folder)
-            reconstruction = _adjusted(reconstruction, folder, database, photos, loss_scale_px, step)
+            reconstruction = _adjusted(reconstruction, folder, database, known, loss_scale_px, step)
             _filter(reconstruction, loss_scale_px)
         reconstruction.write(str(folder))
     return sorted(image_id - 1 for image_id in reconstruction.reg_image_ids())
@@ -117,7 +141,7 @@ def _adjusted(
     reconstruction: Any,
     folder: Path,
     database: Path,
-    photos: tuple[SfmPhoto, ...],
+    known: Known,
     loss_scale_px: float,
     options: AdjustOptions,
 ) -> Any:
@@ -127,12 +151,12 @@ def _adjusted(
         radial = copy.deepcopy(reconstruction)
         for camera_id in fuller:
             _as_radial(radial.camera(camera_id))
-        _bundle(radial, photos, loss_scale_px, [], options)
+        _bundle(radial, known, loss_scale_px, [], options)
         gain = information_gain(_residuals(reconstruction), _residuals(radial), _MORE_OF_RADIAL * len(fuller))
         _LOG.info("%s: RADIAL gains %.1f times the penalty", folder.name, gain)
         if gain >= options.radial_evidence:
-            return _with_opencv(radial, fuller, folder, database, photos, loss_scale_px, options)
-    _bundle(reconstruction, photos, loss_scale_px, [], options)
+            return _with_opencv(radial, fuller, folder, database, known, loss_scale_px, options)
+    _bundle(reconstruction, known, loss_scale_px, [], options)
     return reconstruction
 
 
@@ -141,7 +165,7 @@ def _with_opencv(
     fuller: list[int],
     folder: Path,
     database: Path,
-    photos: tuple[SfmPhoto, ...],
+    known: Known,
     loss_scale_px: float,
     options: AdjustOptions,
 ) -> Any:
@@ -149,14 +173,14 @@ def _with_opencv(
     opencv = copy.deepcopy(radial)
     for camera_id in fuller:
         _as_opencv(opencv.camera(camera_id))
-    _bundle(opencv, photos, loss_scale_px, fuller, options)
+    _bundle(opencv, known, loss_scale_px, fuller, options)
     gain = information_gain(_residuals(radial), _residuals(opencv), _MORE_OF_OPENCV * len(fuller))
     _LOG.info("%s: OPENCV gains %.1f times the penalty", folder.name, gain)
     shift = max(_center_shift_rel(opencv.camera(camera_id)) for camera_id in fuller)
     measured = gain >= options.opencv_evidence and shift <= options.max_center_shift_rel
     chosen, free_center = (opencv, fuller) if measured else (radial, [])
     chosen = _triangulated_anew(chosen, database, folder)
-    _bundle(chosen, photos, loss_scale_px, free_center, options)
+    _bundle(chosen, known, loss_scale_px, free_center, options)
     return chosen
 
 
@@ -211,7 +235,7 @@ def _center_shift_rel(camera: Any) -> float:
 
 def _bundle(
     reconstruction: Any,
-    photos: tuple[SfmPhoto, ...],
+    known: Known,
     loss_scale_px: float,
     free_center: list[int],
     options: AdjustOptions,
@@ -233,7 +257,15 @@ def _bundle(
         # The principal point is free for all or none; cameras with few photos stay as they are.
         for camera_id in {reconstruction.image(i).camera_id for i in image_ids} - set(free_center):
             config.set_constant_cam_intrinsics(camera_id)
-    priors = _position_priors(reconstruction, image_ids, photos) if options.use_positions else []
+    priors = _position_priors(reconstruction, image_ids, known.photos) if options.use_positions else []
+    free = {reconstruction.image(i).camera_id for i in image_ids} if options.refine_focal else set()
+    focals = options.focal_prior.of(known.focal_px, free)
+    if len(priors) < 3:
+        fix_gauge(reconstruction, config, image_ids[0], focals)
+    work = copy.deepcopy(reconstruction)
+    if focals:
+        variance = _shared_variance_px2(reconstruction)
+        add_focal_priors(work, config, focals, variance, loss_scale_px, options.focal_prior)
     if len(priors) >= 3:
         prior_settings = pycolmap.PosePriorBundleAdjustmentOptions()
         prior_settings.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -241,13 +273,11 @@ def _bundle(
             float(np.sqrt(np.trace(np.asarray(p.position_covariance)))) for p in priors
         )
         prior_settings.alignment_ransac.random_seed = 0
-        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            settings, prior_settings, config, priors, reconstruction
-        )
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(settings, prior_settings, config, priors, work)
     else:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        adjuster = pycolmap.create_default_bundle_adjuster(settings, config, reconstruction)
+        adjuster = pycolmap.create_default_bundle_adjuster(settings, config, work)
     adjuster.solve()
+    take_adjusted(work, reconstruction)
     reconstruction.update_point_3d_errors()
 
 
@@ -284,9 +314,25 @@ def _triangulated_anew(reconstruction: Any, database: Path, folder: Path) -> Any
     )
 
 
+def _shared_variance_px2(reconstruction: Any) -> float:
+    """Of its residuals, see `shared_variance_px2`."""
+    side = max(max(camera.width, camera.height) for camera in reconstruction.cameras.values())
+    seen = list(_residuals_by_image(reconstruction))
+    if not seen:
+        return 0.0
+    photos = np.repeat([image_id for image_id, _, _ in seen], [len(pixels) for _, pixels, _ in seen])
+    residuals = np.concatenate([r for _, _, r in seen])
+    return shared_variance_px2(residuals, np.concatenate([p for _, p, _ in seen]), photos, side)
+
+
 def _residuals(reconstruction: Any) -> FloatArray:
     """(m, 2) reprojection residuals in pixels, in an order that the structure alone determines."""
-    parts = []
+    parts = [residuals for _, _, residuals in _residuals_by_image(reconstruction)]
+    return np.concatenate(parts) if parts else np.zeros((0, 2))
+
+
+def _residuals_by_image(reconstruction: Any) -> Iterator[tuple[int, FloatArray, FloatArray]]:
+    """Image id, pixels (k, 2) and residuals (k, 2) of every registered image that sees points."""
     for image_id in sorted(reconstruction.reg_image_ids()):
         image = reconstruction.image(image_id)
         seen = [p for p in image.points2D if p.has_point3D()]
@@ -297,5 +343,4 @@ def _residuals(reconstruction: Any) -> FloatArray:
         matrix = np.asarray(image.cam_from_world().matrix())
         camera = reconstruction.camera(image.camera_id)
         in_camera = np.ascontiguousarray(points @ matrix[:, :3].T + matrix[:, 3])
-        parts.append(np.asarray(camera.img_from_cam(in_camera)) - pixels)
-    return np.concatenate(parts) if parts else np.zeros((0, 2))
+        yield image_id, pixels, np.asarray(camera.img_from_cam(in_camera)) - pixels

@@ -5,7 +5,7 @@ Like ingest.colmap_bridge and ingest.colmap_adjust this module knows pycolmap's 
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
+from ingest.focal_prior import FocalPriorOptions, add_focal_priors, fix_gauge, shared_variance_px2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,6 +31,7 @@ class AnchoredOptions:
             reconstruction itself allows.
         error_reference_side_px: keypoints are located on images of about this size.
         rounds: of adjusting and dropping.
+        focal_prior: how much the focal lengths of EXIF count.
         max_iterations: of Ceres, each round.
         threads: one gives the same numbers in every run.
     """
@@ -38,6 +40,7 @@ class AnchoredOptions:
     max_error_px: float = 4.0
     error_reference_side_px: int = 1600
     rounds: int = 2
+    focal_prior: FocalPriorOptions = field(default_factory=FocalPriorOptions)
     max_iterations: int = 60
     threads: int = 1
 
@@ -85,6 +88,7 @@ def adjust_anchored(
     fixed: FixedPoints,
     constant_cameras: Sequence[int],
     options: AnchoredOptions,
+    focal_px: Mapping[int, float] | None = None,
 ) -> Anchored:
     """Adjust poses, free points and lenses (focal lengths and distortion) but those of `constant_cameras`.
 
@@ -92,13 +96,16 @@ def adjust_anchored(
 
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
+        focal_px: focal lengths of EXIF by camera, where there is one.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     state = model
     for _ in range(options.rounds):
         with quiet():
-            state = _adjusted(state, observation, keypoints, fixed, kept, constant_cameras, options)
+            state = _adjusted(
+                state, observation, keypoints, fixed, kept, constant_cameras, focal_px or {}, options
+            )
         observation, kept = _fitting(state, keypoints, fixed, options)
         observation &= _in_tracks(state, observation)
     return Anchored(
@@ -115,6 +122,7 @@ def _adjusted(
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
     constant_cameras: Sequence[int],
+    focal_px: Mapping[int, float],
     options: AnchoredOptions,
 ) -> Model:
     """One round: the model with new poses, lenses and points."""
@@ -124,9 +132,8 @@ def _adjusted(
     settings.print_summary = False
     settings.refine_principal_point = False
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    settings.ceres.loss_function_scale = options.loss_scale_px * max(
-        1.0, side / options.error_reference_side_px
-    )
+    loss_scale_px = options.loss_scale_px * max(1.0, side / options.error_reference_side_px)
+    settings.ceres.loss_function_scale = loss_scale_px
     settings.ceres.solver_options.max_num_iterations = options.max_iterations
     settings.ceres.solver_options.function_tolerance = 1e-6
     settings.ceres.solver_options.num_threads = options.threads
@@ -137,8 +144,13 @@ def _adjusted(
         config.set_constant_cam_intrinsics(camera + 1)
     for point_id in fixed_ids:
         config.add_constant_point(point_id)
+    free = set(np.unique(model.camera_of).tolist()) - set(constant_cameras)
+    focals = {c + 1: focal for c, focal in options.focal_prior.of(focal_px, free).items()}
     if not fixed_ids:
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        fix_gauge(reconstruction, config, 1, focals)
+    if focals:
+        variance = _shared_variance_px2(model, observation, keypoints)
+        add_focal_priors(reconstruction, config, focals, variance, loss_scale_px, options.focal_prior)
     pycolmap.create_default_bundle_adjuster(settings, config, reconstruction).solve()
     xyz = model.xyz.copy()
     for point, point_id in free_ids.items():
@@ -150,6 +162,22 @@ def _adjusted(
         cam_from_sfm=tuple(Rigid3.from_matrix(np.asarray(pose)) for pose in poses),
         xyz=xyz,
     )
+
+
+def _shared_variance_px2(
+    model: Model, observation: NDArray[np.bool_], keypoints: Sequence[FloatArray]
+) -> float:
+    """Of the residuals of the free points, see `shared_variance_px2`."""
+    rows = np.flatnonzero(observation)
+    residuals, pixels = np.zeros((len(rows), 2)), np.zeros((len(rows), 2))
+    for k, pose in enumerate(model.cam_from_sfm):
+        mine = model.photo_of[rows] == k
+        pixels[mine] = keypoints[k][model.keypoint_of[rows[mine]]]
+        seen = pose.act(model.xyz[model.point_of[rows[mine]]])
+        residuals[mine] = model.cameras[int(model.camera_of[k])].project(seen) - pixels[mine]
+    good = np.isfinite(residuals).all(axis=1)
+    side = max(max(c.width, c.height) for c in model.cameras)
+    return shared_variance_px2(residuals[good], pixels[good], model.photo_of[rows[good]], side)
 
 
 def _reconstruction(

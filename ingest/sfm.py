@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import AdjustOptions, adjust_models
+from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap_bridge import Model, SfmPhoto, run_incremental, write_database
 from ingest.extract import read_keypoints
 from ingest.matching import read_two_view
@@ -125,6 +125,11 @@ class SfmTask:
         write_database(path, self.cameras, photos, geometries)
         return photos
 
+    def known(self, photos: tuple[SfmPhoto, ...]) -> Known:
+        """What the final adjustment may rest on besides the matches."""
+        focals = {row + 1: camera.focal_px for row, (camera, known) in enumerate(self.cameras) if known}
+        return Known(photos=photos, focal_px=focals)
+
 
 def reconstruct(task: SfmTask, folder: Path) -> None:
     """Reconstruct into `folder`, one numbered COLMAP model each connected part; nothing if it is there."""
@@ -139,7 +144,7 @@ def reconstruct(task: SfmTask, folder: Path) -> None:
         run_incremental(
             database, Path(scratch), output, mapping_settings(options, task.side_px), lambda: None
         )
-        adjust_models(output, database, photos, loss_scale_px(task), adjust_options(options))
+        adjust_models(output, database, task.known(photos), loss_scale_px(task), adjust_options(options))
 
 
 def loss_scale_px(task: SfmTask) -> float:

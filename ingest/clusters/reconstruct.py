@@ -268,7 +268,11 @@ def _join_blocks(task: _JoinTask) -> None:
             folder.mkdir()
             write_posed(folder, _cameras(group, models, task.sfm), photos, poses)
             kept = adjust_posed(
-                folder, database, photos, loss_scale_px(task.sfm), adjust_options(task.sfm.options)
+                folder,
+                database,
+                task.sfm.known(photos),
+                loss_scale_px(task.sfm),
+                adjust_options(task.sfm.options),
             )
             taken |= {int(row) for row in kept}
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from ingest.growth.confirmation import ConfirmationOptions, confirm, sources_json
@@ -81,14 +82,29 @@ def with_drift(
 def rows_within(
     feature_map: FeatureMap, rows: Sequence[int], relative: FloatArray, budget_m: float
 ) -> list[int]:
-    """Rows of the photos whose points are within the budget; images come in the order of the rows."""
+    """Rows of the photos that are within the budget, each with its own bending in place of the largest.
+
+    Args:
+        rows: of the map's images, in their order.
+        relative: (7, 7) covariance of the map relative to the anchors, with its bending.
+    """
+    bending_m2 = float(growth_of(feature_map.placement.evidence).get("bending_m", 0.0)) ** 2
+    as_a_whole = relative - np.diag([0.0] * 4 + [bending_m2] * 3)
     points = feature_map.points_local()
     seen = feature_map.observations
     within = []
     for row, image in zip(rows, feature_map.images, strict=True):
         own = points[seen.point_index[seen.image_id == image.image_id]]
-        places = np.vstack([own, image.cam_from_local.center[None]])
+        pose = image.cam_from_local
+        places = np.vstack([own, pose.center[None]])
+        excess = bending_m2
+        if image.covariance is not None:
+            jacobian = point_jacobian(pose.center[None])[0]
+            spread = pose.rotation.T @ image.covariance[3:, 3:] @ pose.rotation
+            most = np.linalg.eigvalsh(spread - jacobian @ as_a_whole @ jacobian.T)[-1]
+            excess = float(np.clip(most, 0.0, bending_m2))
+        mine = as_a_whole + np.diag([0.0] * 4 + [excess] * 3)
         # A tenth off the budget: the part that is left is held by less, and its own bound is larger.
-        if drift_m(relative, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
+        if drift_m(mine, np.percentile(places, (10, 90), axis=0)) <= 0.9 * budget_m:
             within.append(row)
     return within

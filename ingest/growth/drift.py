@@ -5,7 +5,7 @@ not. That is in the normal equations of the adjustment: poses and lenses with th
 existing points known to what they are. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 6 and 9.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,9 +17,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap_anchored import FixedPoints, with_observations
 from ingest.colmap_bridge import Model
+from ingest.focal_prior import design_effect
 from ingest.precision import Linearised, linearise
 
-_REFERENCE_SIDE_PX = 1600.0
+_LEAST_FREEDOM = 0.1
+_LEAST_OBSERVATIONS = 100  # of a camera; fewer show no pattern
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,65 +29,87 @@ class DriftOptions:
     """How the bending is judged.
 
     Attributes:
-        keypoint_px: standard deviation of a keypoint on an image of 1600 pixels.
+        least_px: of the standard deviation of an observation with what its neighbours share; it is measured
+            on the residuals, which a handful of observations keeps too small.
         adopted_focal_rel, adopted_distortion: what a lens taken from a map may be off against that map's
             points. They were made with that very lens: what it trades for height, they trade alike.
         own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
+        exif_focal_rel: and where EXIF held its focal length.
         max_photos: of more, the rest is taken to be no worse; the equations are dense.
         max_points: free points that take part; fewer know less, so the bound stays one.
     """
 
-    keypoint_px: float = 0.5
+    least_px: float = 0.1
     adopted_focal_rel: float = 0.001
     adopted_distortion: float = 0.0005
     own_focal_rel: float = 0.15
     own_distortion: float = 0.1
+    exif_focal_rel: float = 0.02
     max_photos: int = 300
     max_points: int = 20_000
 
 
-def bending_variance_m2(
-    model: Model,
-    keypoints: Sequence[FloatArray],
-    fixed: FixedPoints,
-    kept: NDArray[np.bool_],
-    adopted: Sequence[int],
-    covariance: FloatArray,
-    dilution: float,
-    options: DriftOptions,
-) -> float:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensKnowledge:
+    """What is known of a model's lenses without its photos.
+
+    Attributes:
+        adopted: cameras whose lens was a map's.
+        by_exif: cameras whose focal length EXIF tells.
+    """
+
+    adopted: Collection[int] = ()
+    by_exif: Collection[int] = ()
+
+
+def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
     """What must be added to a similarity's covariance to hold the positions of all photos, square metres.
 
     Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
     position is good to centimetres; a factor that covers this would make metres of it at the far end.
 
     Args:
-        model: refined, in metres. keypoints: of its photos.
-        fixed: existing points, those observations of `kept` (m,).
-        adopted: cameras whose lens was a map's.
+        model: refined, in metres.
         covariance: (7, 7) of the similarity's left perturbation, in the local frame.
-        dilution: how many times larger the variance of residuals is than independent keypoints would have
-            it, neighbours included.
+        spread: (k, 6, 6) of `photo_covariances`; NaN for photos that see nothing any more and say nothing.
     """
-    if len(model.rows) > options.max_photos or not kept.any():
+    seen = np.isfinite(spread[:, 0, 0])
+    if not seen.any():
         return 0.0
-    spread = center_covariances(model, keypoints, fixed, kept, adopted, dilution, options)
-    jacobian = point_jacobian(model.centers())
+    jacobian = point_jacobian(model.centers()[seen])
     claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    seen = np.union1d(model.photo_of, fixed.photo_of[kept])  # a photo that was left out says nothing
-    return float(max(0.0, np.linalg.eigvalsh(spread[seen] - claimed[seen])[:, -1].max()))
+    excess = center_covariances(model, spread)[seen] - claimed
+    return float(max(0.0, np.linalg.eigvalsh(excess)[:, -1].max()))
 
 
-def center_covariances(
+def center_covariances(model: Model, spread: FloatArray) -> FloatArray:
+    """(k, 3, 3) square metres, of the photos' centres in the local frame, from `photo_covariances`."""
+    turns = np.array([pose.rotation for pose in model.cam_from_sfm])
+    centers = np.swapaxes(turns, 1, 2) @ spread[:, 3:, 3:] @ turns
+    return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)
+
+
+def photo_covariances(
     model: Model,
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
-    adopted: Sequence[int],
-    dilution: float,
+    lenses: LensKnowledge,
     options: DriftOptions,
 ) -> FloatArray:
-    """(k, 3, 3) square metres, of the photos' centres in the local frame, relative to the existing points."""
+    """(k, 6, 6) of the left perturbation of each cam_from_local, relative to the existing points.
+
+    NaN for photos that see nothing, and for all where there are more than `max_photos`.
+
+    Args:
+        model: refined, in metres. keypoints: of its photos.
+        fixed: existing points, those observations of `kept` (m,).
+        lenses: what is known of the model's cameras without the photos.
+    """
+    spread = np.full((len(model.rows), 6, 6), np.nan)
+    if len(model.rows) > options.max_photos or not kept.any():
+        return spread
+    seen = np.union1d(model.photo_of, fixed.photo_of[kept])
     model = _thinned(model, options)
     free_xy = np.zeros((len(model.point_of), 2))
     for k in range(len(model.rows)):
@@ -95,25 +119,46 @@ def center_covariances(
     held, held_lens = _derivatives(
         model, fixed.xyz, fixed.point_of[kept], fixed.photo_of[kept], fixed.pixels[kept]
     )
-    sides = np.array([max(c.width, c.height) for c in model.cameras])
-    sigma = options.keypoint_px * np.maximum(1.0, sides / _REFERENCE_SIDE_PX)[model.camera_of]
-    size, lenses = 6 * len(model.rows), _lens_columns(model)
-    columns = size + lenses[-1]
+    # What points and poses take up of the residuals; tracks of two photos leave a quarter.
+    freedom = 1.0 - (3 * len(model.xyz) + 6 * len(model.rows)) / (2.0 * max(len(free_xy), 1))
+    sigma = _sigmas_px(model, free, free_xy, options) / np.sqrt(max(freedom, _LEAST_FREEDOM))
+    sigma_held = _sigmas_px(model, held, fixed.pixels[kept], options)
+    size, first = 6 * len(model.rows), _lens_columns(model)
+    columns = size + first[-1]
     normal = np.zeros((columns, columns))
-    poses_free = _rows(free, free_lens, model, lenses, size, columns, sigma)
-    poses_held = _rows(held, held_lens, model, lenses, size, columns, sigma)
+    poses_free = _rows(free, free_lens, model, first, size, columns, sigma)
+    poses_held = _rows(held, held_lens, model, first, size, columns, sigma_held)
     normal += (poses_held.T @ poses_held).toarray() + (poses_free.T @ poses_free).toarray()
     by_point = _blocks(free.by_point / sigma[free.photo_of][:, None, None], free.point_of, len(model.xyz))
     normal -= _eliminated(poses_free, by_point, free, sigma)
-    normal /= dilution
-    normal[size:, size:] += np.diag(_lens_knowledge(model, adopted, options))
+    normal[size:, size:] += np.diag(_lens_information(model, lenses, options))
     # Photos without observations leave their rows empty; the damping is far below what any photo knows.
     covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)) + 1e-9 * np.eye(columns))
-    centers = np.empty((len(model.rows), 3, 3))
-    for k, pose in enumerate(model.cam_from_sfm):
-        block = covariance[6 * k + 3 : 6 * k + 6, 6 * k + 3 : 6 * k + 6]
-        centers[k] = pose.rotation.T @ block @ pose.rotation
-    return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)
+    for k in seen.tolist():
+        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+        spread[k] = (block + block.T) / 2
+    return spread
+
+
+def _sigmas_px(model: Model, linear: Linearised, pixels: FloatArray, options: DriftOptions) -> FloatArray:
+    """(k,) standard deviation of the observations of each photo, as the residuals of its camera show it.
+
+    With what neighbours share: a lens that its model does not describe leaves a pattern that many
+    observations repeat.
+    """
+    good = np.isfinite(linear.residual).all(axis=1)
+    of_camera = model.camera_of[linear.photo_of]
+    sigmas = np.empty(len(model.cameras))
+    for c, camera in enumerate(model.cameras):
+        own = good & (of_camera == c)
+        rows = np.flatnonzero(own if own.sum() >= _LEAST_OBSERVATIONS else good)
+        side = max(camera.width, camera.height)
+        if len(rows) == 0:
+            sigmas[c] = options.least_px
+            continue
+        shared = design_effect(linear.residual[rows], pixels[rows], linear.photo_of[rows], side)
+        sigmas[c] = max(np.sqrt((linear.residual[rows] ** 2).mean() * shared), options.least_px)
+    return np.asarray(sigmas[model.camera_of])
 
 
 def _thinned(model: Model, options: DriftOptions) -> Model:
@@ -163,12 +208,13 @@ def _lens_columns(model: Model) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-def _lens_knowledge(model: Model, adopted: Sequence[int], options: DriftOptions) -> FloatArray:
+def _lens_information(model: Model, lenses: LensKnowledge, options: DriftOptions) -> FloatArray:
     """Inverse variances of all lens parameters."""
     known: list[float] = []
     for c, camera in enumerate(model.cameras):
-        own = c not in adopted
-        focal = options.own_focal_rel if own else options.adopted_focal_rel
+        own = c not in lenses.adopted
+        focal = options.exif_focal_rel if c in lenses.by_exif else options.own_focal_rel
+        focal = focal if own else options.adopted_focal_rel
         distortion = options.own_distortion if own else options.adopted_distortion
         for index in camera.lens_parameters():
             is_focal = camera.params[index] > 10.0  # pixels; distortion coefficients are below one

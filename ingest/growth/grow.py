@@ -59,6 +59,11 @@ class GrowthOptions:
     promotion: PromotionOptions = field(default_factory=PromotionOptions)
     replacing: ReplaceOptions = field(default_factory=ReplaceOptions)
 
+    def with_budget(self) -> "GrowthOptions":
+        """The same where no photo of a map may be further off than the budget either."""
+        growing = replace(self.grow.grow, max_photo_bound_m=self.drift_budget_m)
+        return replace(self, grow=replace(self.grow, grow=growing))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrowthPhotos:
@@ -121,7 +126,7 @@ def grow(
         ConflictError: others changed the same maps too often; what is committed stands.
         StoreError
     """
-    options = options or GrowthOptions()
+    options = (options or GrowthOptions()).with_budget()
     started, clock = datetime.now(UTC), time.perf_counter()
     run, localiser = _Run(), None
     for _ in range(options.max_rounds):
@@ -250,6 +255,7 @@ def _take(
     run.map_of.update(dict.fromkeys(rows, feature_map.map_id))
     for row in rows:
         run.why.pop(row, None)
+    run.why.update({row: why for row, why in grown.left_out.items() if row not in run.map_of})
     run.entries[feature_map.map_id] = _entry(feature_map, grown, names, "quarantined", "", "")
     _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
     return None

@@ -19,6 +19,7 @@ from ingest.colmap_anchored import (
 from ingest.colmap_bridge import Model
 from ingest.growth.anchors import Anchors
 from ingest.growth.values import LocalisedPhoto
+from ingest.photo import Photo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,12 +45,14 @@ def adopt_lenses(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
+    focal_px: Mapping[int, float],
     options: RefineOptions,
 ) -> tuple[Model, tuple[int, ...]]:
     """The model adjusted, in its own frame, to the lenses that existing maps have for its cameras.
 
     Args:
         keypoints: pixels of all features of the model's photos, in the order of its rows.
+        focal_px: focal lengths of EXIF by camera.
 
     Returns:
         The model, and its cameras whose lens is a map's and stays.
@@ -67,7 +70,7 @@ def adopt_lenses(
     if not adopted:
         return model, ()
     with_lenses = replace(model, cameras=tuple(cameras))
-    adjusted = adjust_anchored(with_lenses, keypoints, FixedPoints.none(), adopted, options.adjust)
+    adjusted = adjust_anchored(with_lenses, keypoints, FixedPoints.none(), adopted, options.adjust, focal_px)
     return adjusted.model, tuple(adopted)
 
 
@@ -86,12 +89,14 @@ def refine_with_maps(
     anchors: Anchors,
     constant_cameras: Sequence[int],
     keypoints: Sequence[FloatArray],
+    focal_px: Mapping[int, float],
     options: RefineOptions,
 ) -> tuple[Anchored, FixedPoints, NDArray[np.int64]]:
     """The model in the local frame, metres, adjusted with the existing points of its anchors held fixed.
 
     Args:
         anchors: those that agree with the placement.
+        focal_px: focal lengths of EXIF by camera.
 
     Returns:
         The adjusted model, the fixed points with their observations, and for each of these (m,) its anchor.
@@ -102,7 +107,25 @@ def refine_with_maps(
     first, number = held.existing()
     fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
     free = without_anchored(placed, held)
-    return adjust_anchored(free, keypoints, fixed, constant_cameras, options.adjust), fixed, sharp
+    adjusted = adjust_anchored(free, keypoints, fixed, constant_cameras, options.adjust, focal_px)
+    return adjusted, fixed, sharp
+
+
+def exif_focals(model: Model, photos: Sequence[Photo]) -> dict[int, float]:
+    """Focal lengths of EXIF, pixels, by camera of the model; none where a camera's photos tell several.
+
+    Args:
+        photos: all, rows as in the model.
+    """
+    told: dict[int, set[float | None]] = {}
+    for row, camera in zip(model.rows.tolist(), model.camera_of.tolist(), strict=True):
+        told.setdefault(camera, set()).add(photos[row].focal_px)
+    found: dict[int, float] = {}
+    for camera, focals in told.items():
+        only = next(iter(focals))
+        if len(focals) == 1 and only is not None:
+            found[camera] = only
+    return found
 
 
 def in_metres(model: Model, local_from_sfm: Sim3) -> Model:

@@ -1,6 +1,6 @@
 """The values that pass between the steps of growth: localised photos, placements, grown maps, refusals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -181,12 +181,14 @@ class GrownMap:
         placement: how it was placed.
         model: the reconstruction after refinement; metric, in the frame of the map.
         agreements: between the existing maps that it overlaps.
+        left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
     """
 
     feature_map: FeatureMap
     placement: MapsPlacement
     model: Model
     agreements: tuple[MapAgreement, ...] = ()
+    left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

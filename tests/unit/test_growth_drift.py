@@ -8,10 +8,17 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
-from ingest.growth.drift import DriftOptions, bending_variance_m2, center_covariances
+from ingest.growth.drift import (
+    DriftOptions,
+    LensKnowledge,
+    bending_variance_m2,
+    center_covariances,
+    photo_covariances,
+)
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import box_points, looking_at, random_descriptors
 
+GIVEN = LensKnowledge(adopted=[0])
 COUNT = 40  # world points that the existing map has; they lie in the west
 PHOTOS = 6
 
@@ -64,7 +71,8 @@ def test_centres_are_off_as_far_as_is_said() -> None:
         free = with_observations(model, (world >= COUNT) | (model.photo_of > 1))
         keypoints = list(new.keypoints().values())
         done = adjust_anchored(free, keypoints, fixed, [0], AnchoredOptions())
-        spread = center_covariances(done.model, keypoints, fixed, done.fixed_kept, [0], 1.0, options)
+        poses = photo_covariances(done.model, keypoints, fixed, done.fixed_kept, GIVEN, options)
+        spread = center_covariances(done.model, poses)
         off = done.model.centers() - np.array([p.center for p in new.poses])
         lengths.append([float(e @ np.linalg.solve(c, e)) for e, c in zip(off, spread, strict=True)])
         sigmas.append(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
@@ -77,8 +85,8 @@ def test_a_lens_that_may_be_off_widens_it() -> None:
     keypoints = list(new.keypoints().values())
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     sure = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
-    narrow = center_covariances(new.model, keypoints, fixed, kept, [0], 1.0, sure)
-    wide = center_covariances(new.model, keypoints, fixed, kept, [0], 1.0, DriftOptions())
+    narrow = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, sure)
+    wide = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, DriftOptions())
     assert (np.trace(wide, axis1=1, axis2=2) > np.trace(narrow, axis1=1, axis2=2)).all()
 
 
@@ -87,13 +95,33 @@ def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
     keypoints = list(new.keypoints().values())
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
-    arguments = (new.model, keypoints, fixed, kept, [0])
-    more = bending_variance_m2(*arguments, tiny, 1.0, DriftOptions())
+    arguments = (new.model, keypoints, fixed, kept, GIVEN)
+    spread = photo_covariances(*arguments, DriftOptions())
+    more = bending_variance_m2(new.model, tiny, spread)
     assert more > 1e-4
     wider = tiny + np.diag([0.0] * 4 + [more] * 3)
-    assert bending_variance_m2(*arguments, wider, 1.0, DriftOptions()) < 1e-9
-    assert bending_variance_m2(*arguments, ample, 1.0, DriftOptions()) == 0.0
-    assert bending_variance_m2(*arguments, tiny, 4.0, DriftOptions()) > 2.0 * more
+    assert bending_variance_m2(new.model, wider, spread) < 1e-9
+    assert bending_variance_m2(new.model, ample, spread) == 0.0
+    coarse = photo_covariances(*arguments, replace(DriftOptions(), least_px=5.0))
+    assert bending_variance_m2(new.model, tiny, coarse) > 2.0 * more
     # A similarity that covers the far end is widened by what the near photos lack, not at the far end.
-    spread = center_covariances(*arguments, 1.0, DriftOptions())
-    assert more == pytest.approx(np.linalg.eigvalsh(spread)[:, -1].max(), rel=0.01)
+    centers = center_covariances(new.model, spread)
+    assert more == pytest.approx(np.linalg.eigvalsh(centers)[:, -1].max(), rel=0.01)
+
+
+def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
+    new, _, fixed = walk(3)
+    keypoints = list(new.keypoints().values())
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    arguments = (new.model, keypoints, fixed, kept)
+    sigmas = [
+        np.sqrt(np.linalg.eigvalsh(center_covariances(new.model, spread))[-1, -1])
+        for spread in (
+            photo_covariances(*arguments, lenses, DriftOptions())
+            for lenses in (GIVEN, LensKnowledge(by_exif=[0]), LensKnowledge())
+        )
+    ]
+    assert sigmas[0] < sigmas[1] < sigmas[2]
+    none = photo_covariances(*arguments[:-1], np.zeros_like(kept), GIVEN, DriftOptions())
+    assert np.isnan(none).all()  # nothing holds it
+    assert bending_variance_m2(new.model, np.eye(7), none) == 0.0

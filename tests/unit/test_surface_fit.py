@@ -11,6 +11,7 @@ from ingest.register.structure.surface_fit import (
     SurfaceOptions,
     guarded_gicp,
     plane_distances,
+    reach_of,
     surface_near,
 )
 from tests.support.scanned_map import ground_points, height, plain_cloud, scan
@@ -35,6 +36,10 @@ def _ground(shift: FloatArray) -> FloatArray:
     return ground_points(np.random.default_rng(2), 800, 35.0) + shift
 
 
+def _distances(surface: Surface, placed: FloatArray) -> FloatArray:
+    return plane_distances(surface, placed, reach_of(surface, _OPTIONS))
+
+
 def test_distances_are_those_from_the_ground(surface: Surface) -> None:
     points = _ground(np.array([0.0, 0.0, 0.3]))
     distance = np.abs(plane_distances(surface, points, 2.0))
@@ -51,7 +56,7 @@ def test_points_far_from_the_scan_have_no_distance(surface: Surface) -> None:
 def test_gicp_brings_a_shifted_map_back(surface: Surface) -> None:
     shift = np.array([0.10, -0.08, 0.15])
     placed = _ground(shift)
-    outcome = guarded_gicp(surface, placed, placed[:200], _LOOSE, _OPTIONS)
+    outcome = guarded_gicp(surface, placed, _distances(surface, placed), placed[:200], _LOOSE, _OPTIONS)
     assert outcome.accepted, outcome.message
     moved = outcome.move.act(placed)
     assert np.linalg.norm(moved - (placed - shift), axis=1).mean() < 0.03
@@ -60,7 +65,7 @@ def test_gicp_brings_a_shifted_map_back(surface: Surface) -> None:
 
 def test_the_guard_fires_when_gicp_leaves_the_evidence(surface: Surface) -> None:
     placed = _ground(np.array([0.10, -0.08, 0.15]))
-    outcome = guarded_gicp(surface, placed, placed[:200], _TIGHT, _OPTIONS)
+    outcome = guarded_gicp(surface, placed, _distances(surface, placed), placed[:200], _TIGHT, _OPTIONS)
     assert not outcome.accepted
     assert "sigmas" in outcome.message
     assert outcome.figures["move_of_evidence_sigmas"] > _OPTIONS.max_move_sigmas
@@ -68,14 +73,16 @@ def test_the_guard_fires_when_gicp_leaves_the_evidence(surface: Surface) -> None
 
 def test_gicp_that_gains_nothing_is_refused(surface: Surface) -> None:
     placed = _ground(np.zeros(3))
-    outcome = guarded_gicp(surface, placed, placed[:200], _LOOSE, replace(_OPTIONS, min_gain=0.5))
+    outcome = guarded_gicp(
+        surface, placed, _distances(surface, placed), placed[:200], _LOOSE, replace(_OPTIONS, min_gain=0.5)
+    )
     assert not outcome.accepted
     assert "closer" in outcome.message
 
 
 def test_too_few_points_near_the_scan_are_refused(surface: Surface) -> None:
     placed = np.vstack([_ground(np.zeros(3))[:20], _ground(np.array([0.0, 0.0, 50.0]))])
-    outcome = guarded_gicp(surface, placed, placed[:20], _LOOSE, _OPTIONS)
+    outcome = guarded_gicp(surface, placed, _distances(surface, placed), placed[:20], _LOOSE, _OPTIONS)
     assert not outcome.accepted
     assert outcome.figures["points"] == 20
 

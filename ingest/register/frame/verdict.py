@@ -1,5 +1,6 @@
 """Whether a registered frame is believed."""
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -109,7 +110,8 @@ def weighed_log_nfa(evidence: FrameEvidence) -> float:
     Right poses scatter about the prior, normally; poses that repeat the right one lie anywhere within reach.
     -log10 of the density, from that at the mean squared distance of six axes on: nearer ones gain nothing.
     """
-    return evidence.confirmation_log_nfa - max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * np.log(10.0))
+    against = max(0.0, evidence.prior_sigmas**2 - 6.0) / (2.0 * math.log(10.0))
+    return evidence.confirmation_log_nfa - against
 
 
 def highest_elsewhere(log_nfa: float, options: VerdictOptions) -> float:

@@ -26,6 +26,7 @@ class SurfaceOptions:
         min_reach_m: but never less: a map that is off by so much is still compared.
         gicp: whether GICP is tried at all.
         gicp_rounds: of nearest neighbours.
+        max_gicp_points: of the map, evenly chosen; six parameters need no more.
         min_gain: share by which GICP must lower the median distance; less is chance.
         max_move_sigmas: how far it may move the evidence, in standard deviations of the placement there.
         min_move_m: a move below the scan's own noise is always allowed.
@@ -39,6 +40,7 @@ class SurfaceOptions:
     min_reach_m: float = 2.0
     gicp: bool = True
     gicp_rounds: int = 20
+    max_gicp_points: int = 4000
     min_gain: float = 0.02
     max_move_sigmas: float = 3.0
     min_move_m: float = 0.02
@@ -149,6 +151,7 @@ def reach_of(surface: Surface, options: SurfaceOptions) -> float:
 def guarded_gicp(
     surface: Surface,
     placed: FloatArray,
+    distances: FloatArray,
     evidence: FloatArray,
     covariance: FloatArray,
     options: SurfaceOptions,
@@ -160,12 +163,13 @@ def guarded_gicp(
     covariance (7, 7) allows. GICP is rigid: the scale stays.
 
     Args:
+        distances: (n,) of the placed points, of `plane_distances`; those beyond reach, NaN, take no part.
         evidence: (m, 3) placed map points that have a pair.
     """
-    distances = plane_distances(surface, placed, reach_of(surface, options))
-    near = np.isfinite(distances)
-    if near.sum() < 50:  # fewer surface patches turn with the noise
-        return _refused("too few of the map's points lie near the scan", {"points": int(near.sum())})
+    near = np.flatnonzero(np.isfinite(distances))
+    if len(near) < 50:  # fewer surface patches turn with the noise
+        return _refused("too few of the map's points lie near the scan", {"points": len(near)})
+    near = near[:: -(-len(near) // options.max_gicp_points)]
     before = float(np.median(np.abs(distances[near])))
     move = _align(surface, placed[near], max(3.0 * before, 2.0 * surface.spacing_m), options)
     after_distances = plane_distances(surface, move.act(placed[near]), np.inf)
@@ -175,7 +179,7 @@ def guarded_gicp(
     allowed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2) + np.eye(3) * options.min_move_m**2
     sigmas = np.sqrt(np.einsum("ni,nij,nj->n", shift, np.linalg.inv(allowed), shift))
     figures = {
-        "points": int(near.sum()),
+        "points": len(near),
         "median_distance_before_m": before,
         "median_distance_after_m": after,
         "move_of_evidence_m": float(np.sqrt((shift**2).sum(axis=1).mean())),

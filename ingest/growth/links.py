@@ -1,0 +1,54 @@
+"""How firmly the photos of a reconstruction hang together.
+
+Look-alike buildings join reconstructions at the wrong place: a few dozen points of one facade tie photos that
+share thousands among themselves. Nothing in the residuals shows it, and covariances take the tie for true.
+"""
+
+import heapq
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from featuredb.geometry.arrays import FloatArray
+from ingest.colmap_bridge import Model
+
+
+def firmness(model: Model, held: Sequence[int]) -> FloatArray:
+    """(k,) of every photo: the weakest link of its firmest chain of photos to one that is held.
+
+    The link of two photos is the share of the points of the one that sees fewer which both see.
+
+    Args:
+        held: photos of the model, by place among its rows, that need no link; they have infinity.
+
+    Returns:
+        0 for photos without a chain.
+    """
+    shares = _links(model)
+    firm = np.zeros(len(model.rows))
+    firm[list(held)] = np.inf
+    queue = [(-np.inf, k) for k in held]
+    while queue:
+        width, photo = heapq.heappop(queue)
+        if -width < firm[photo]:
+            continue
+        reach = np.minimum(-width, shares[photo])
+        for other in np.flatnonzero(reach > firm).tolist():
+            firm[other] = reach[other]
+            heapq.heappush(queue, (-float(reach[other]), other))
+    return firm
+
+
+def _links(model: Model) -> FloatArray:
+    """(k, k) share of common points, 0 on the diagonal."""
+    seen: NDArray[np.float64] = np.ones(len(model.point_of))
+    sees = sparse.csr_array(
+        (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
+    )
+    common = (sees @ sees.T).toarray()
+    counts = np.maximum(np.diag(common), 1.0)
+    shares = common / np.minimum.outer(counts, counts)
+    np.fill_diagonal(shares, 0.0)
+    return np.asarray(shares)
