@@ -14,10 +14,10 @@ from ingest.growth.gates import Gate
 from ingest.growth.map_graph import (
     PlacedMap,
     StoredEdge,
-    corners_of,
     drift_m,
     growth_of,
     no_surer_than,
+    places_of,
     solve_with_new,
 )
 from ingest.growth.values import GrownMap
@@ -60,7 +60,7 @@ def with_drift(
     if solution.reason is None and feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
-    drift = drift_m(relative, corners_of(feature_map))
+    drift = drift_m(relative, places_of(feature_map))
     confirmed = confirm(feature_map, confirmation)
     gates = {g.name: g.as_json() for g in (*confirmed.gates, drift_gate(drift, budget_m))}
     growth |= {

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -13,9 +12,10 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
+from ingest.colmap_anchored import Anchored
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
-from ingest.growth.anchors import find_anchors
+from ingest.growth.anchors import Anchors, find_anchors
 from ingest.growth.drift import (
     DriftOptions,
     LensKnowledge,
@@ -25,17 +25,19 @@ from ingest.growth.drift import (
 )
 from ingest.growth.links import firmness
 from ingest.growth.localised import LocaliseEachOptions, in_frame, with_lens
+from ingest.growth.map_graph import drift_m, places_of
 from ingest.growth.model_parts import only_photos, with_existing, without_photos
-from ingest.growth.parents import drift_covariance, largest_sigma_m, map_agreements
+from ingest.growth.parents import drift_covariance, edges_of, map_agreements
 from ingest.growth.placement import Held, PlacementOptions, place_by_maps
 from ingest.growth.refine import RefineOptions, adopt_lenses, exif_focals, refine_with_maps
+from ingest.growth.similarity_fit import Fit, fit_similarity
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
 
 # Reasons of photos that nothing holds well enough, and of those that hang on others by little.
-LOOSE, WEAK_LINK = "LOOSE_PHOTO", "WEAK_LINK"
+LOOSE, WEAK_LINK = "DRIFT_BUDGET", "WEAK_LINK"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,9 +171,11 @@ def grow_component(
             rows=rows,
             gates=placement.gates,
         )
-    bending_m2 = bending_variance_m2(adjusted.model, held.fit.covariance, spread)
+    kept = good.take(sharp)
+    placement, fit = _settled(placement, adjusted, kept, options.placement)
+    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance, spread)
     placement = widened(placement, bending_m2)
-    complete = with_existing(adjusted, fixed, good.take(sharp), placement.parents)
+    complete = with_existing(adjusted, fixed, kept, placement.parents)
     inside = [k for k in range(len(rows)) if k not in outside]
     complete = only_photos(complete, inside)
     more = {"bending_m": float(np.sqrt(bending_m2))}
@@ -179,6 +183,30 @@ def grow_component(
     if isinstance(grown, Refused):
         return grown
     return replace(grown, feature_map=_with_covariances(grown.feature_map, spread[inside]), left_out=left_out)
+
+
+def _settled(
+    placement: MapsPlacement, adjusted: Anchored, anchors: Anchors, options: PlacementOptions
+) -> tuple[MapsPlacement, Fit]:
+    """The placement with the covariances of the refined model, and their fit.
+
+    Until then the reconstruction was bent as it came, and its residuals said more of that than of where it
+    lies. What photos lack beyond the similarity is added to it afterwards.
+    """
+    model, used = adjusted.model, adjusted.fixed_kept
+    fit = fit_similarity(model, Sim3.identity(), anchors, used, options.fit)
+    edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
+    if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
+        edges = placement.edges
+    assert placement.covariance is not None
+    assert placement.covariance_relative is not None
+    on_earth = placement.covariance - placement.covariance_relative
+    return replace(
+        placement,
+        edges=edges,
+        covariance_relative=fit.covariance,
+        covariance=fit.covariance + on_earth,
+    ), fit
 
 
 def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
@@ -280,7 +308,7 @@ def assemble(
         )
     agreements = map_agreements(placement, held.anchors.take(np.flatnonzero(held.used)))
     growth = {
-        "drift_m": 1.96 * largest_sigma_m(to_anchors, _box_corners(feature_map)),
+        "drift_m": drift_m(to_anchors, places_of(feature_map)),
         "steps": 1 + max(_steps(m) for m, _ in parents),
         "anchors": sorted({a for m, _ in parents for a in _anchors_of(m)}),
         "covariance_relative": to_anchors.ravel().tolist(),
@@ -326,12 +354,3 @@ def _steps(feature_map: FeatureMap) -> int:
 def _anchors_of(feature_map: FeatureMap) -> list[str]:
     named = feature_map.placement.evidence.get(GROWTH, {}).get("anchors")
     return list(named) if named else [feature_map.map_id]
-
-
-def _box_corners(feature_map: FeatureMap) -> FloatArray:
-    """(8, 3) corners, in the map's frame, of the box that holds 98 % of its points along each axis."""
-    low, high = np.quantile(feature_map.points_local(), (0.01, 0.99), axis=0)
-    corners: NDArray[np.float64] = np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    )
-    return corners

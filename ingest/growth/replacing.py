@@ -20,7 +20,6 @@ from ingest.growth.map_graph import (
     OWN,
     PlacedMap,
     StoredEdge,
-    corners_of,
     drift_m,
     family,
     graph_edges,
@@ -29,6 +28,7 @@ from ingest.growth.map_graph import (
     in_graph,
     place_of,
     placed_maps,
+    places_of,
 )
 from ingest.growth.new_overlaps import NewOverlaps, measure_new, overlaps_to_measure
 from ingest.growth.overlaps import OverlapOptions
@@ -287,7 +287,7 @@ def _with_evidence(
     """The moved map with its new covariance, drift and overlaps; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
-    drift = drift_m(relative, corners_of(feature_map))
+    drift = drift_m(relative, places_of(feature_map))
     growth = growth_of(feature_map.placement.evidence)
     if before.is_anchor:
         total = in_frame(solution.corrections[map_id], frame, own) @ before.present_from_own

@@ -25,7 +25,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.lineage import GROWTH
 from featuredb.render.cloud import PointCloud
-from ingest.growth.map_graph import StoredEdge, corners_of, drift_m, growth_of, place_of
+from ingest.growth.map_graph import StoredEdge, drift_m, growth_of, place_of, places_of
 from ingest.street.stand import StandOptions, standing_places, views_around
 from ingest.street.synthesis import (
     SourcePhoto,
@@ -270,7 +270,7 @@ def _placement(aerial: FeatureMap, views: int, options: StreetOptions) -> Placem
             GROWTH: {
                 "edges": [edge.as_json()],
                 "covariance_relative": relative.ravel().tolist(),
-                "drift_m": drift_m(relative, corners_of(aerial)),
+                "drift_m": drift_m(relative, places_of(aerial)),
             },
         },
     )
