@@ -61,8 +61,9 @@ class GrowthOptions:
 
     def with_budget(self) -> "GrowthOptions":
         """The same where no photo of a map may be further off than the budget either."""
-        growing = replace(self.grow.grow, max_photo_bound_m=self.drift_budget_m)
-        return replace(self, grow=replace(self.grow, grow=growing))
+        growing = self.grow.grow
+        settle = replace(growing.settle, max_photo_bound_m=self.drift_budget_m)
+        return replace(self, grow=replace(self.grow, grow=replace(growing, settle=settle)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,32 +12,18 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
-from ingest.colmap_anchored import Anchored
 from ingest.colmap_bridge import Model
-from ingest.growth import gates
-from ingest.growth.anchors import Anchors, find_anchors
-from ingest.growth.drift import (
-    DriftOptions,
-    LensKnowledge,
-    bending_variance_m2,
-    center_covariances,
-    photo_covariances,
-)
-from ingest.growth.links import firmness
+from ingest.growth.anchors import find_anchors
 from ingest.growth.localised import LocaliseEachOptions, in_frame, with_lens
 from ingest.growth.map_graph import drift_m, places_of
-from ingest.growth.model_parts import only_photos, with_existing, without_photos
-from ingest.growth.parents import drift_covariance, edges_of, map_agreements
+from ingest.growth.parents import drift_covariance, map_agreements
 from ingest.growth.placement import Held, PlacementOptions, place_by_maps
-from ingest.growth.refine import RefineOptions, adopt_lenses, exif_focals, refine_with_maps
-from ingest.growth.similarity_fit import Fit, fit_similarity
+from ingest.growth.refine import adopt_lenses
+from ingest.growth.settle import SettleOptions, settle
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
-
-# Reasons of photos that nothing holds well enough, and of those that hang on others by little.
-LOOSE, WEAK_LINK = "DRIFT_BUDGET", "WEAK_LINK"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,30 +31,16 @@ class GrowOptions:
     """From a reconstruction to a map.
 
     Attributes:
-        min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
-            lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
-            reconstruction cannot be bent to what the existing maps say.
-        min_link: `firmness` that photos need which are not localised themselves. In the simulated community a
-            block of seven photos, tied to a look-alike hall 78 m from theirs, had 0.04; right photos 0.14 and
-            more.
-        max_photo_bound_m: photos that may be further off (95 %), against the existing points and with what
-            their lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
-        max_rounds: of leaving such photos out; the others are adjusted without them.
+        placement, settle: the steps.
         localise: how poses are found again with the lenses of the reconstruction.
-        drift: how far the refined reconstruction may bend beyond what holds it.
         maps: what goes into the map; the height datum is that of the parents. Points of two photos carry
             descriptors: a handful of photos has hardly longer tracks, and the next photo needs them to be
             localised.
     """
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
-    refine: RefineOptions = field(default_factory=RefineOptions)
+    settle: SettleOptions = field(default_factory=SettleOptions)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
-    min_held_share: float = 0.5
-    min_link: float = 0.08
-    max_photo_bound_m: float = 0.5
-    max_rounds: int = 4
-    drift: DriftOptions = field(default_factory=DriftOptions)
     maps: MapOptions = field(default_factory=lambda: MapOptions(min_track_length=2))
 
 
@@ -103,10 +75,9 @@ def grow_component(
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    focals = exif_focals(model, photos)
-    model, constant = adopt_lenses(model, mine, keypoints, focals, options.refine)
-    lenses = dict(zip(rows, model.camera_of.tolist(), strict=True))
-    mine = {r: with_lens(p, model.cameras[lenses[r]], options.localise) for r, p in mine.items()}
+    model, lenses = adopt_lenses(model, mine, photos, keypoints, options.settle.refine)
+    camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
+    mine = {r: with_lens(p, model.cameras[camera_of[r]], options.localise) for r, p in mine.items()}
     anchors = find_anchors(model, mine, dict(zip(rows, keypoints, strict=True)))
     held = place_by_maps(model, mine, anchors, photos, near, frame, options.placement)
     placement = held.placement
@@ -121,113 +92,18 @@ def grow_component(
             rows=rows,
             gates=placement.gates,
         )
-    assert held.fit is not None
-    known = LensKnowledge(adopted=constant, by_exif=focals)
-    outside = [rows.index(r) for r in placement.disagreeing]
-    firm = firmness(without_photos(model, outside), [rows.index(r) for r in placement.agreeing])
-    weak = [int(k) for k in np.flatnonzero(firm < options.min_link) if k not in outside]
-    left_out = {
-        rows[k]: (
-            WEAK_LINK,
-            f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
-            f"{100 * options.min_link:.0f} % needed: look-alike places tie photos so",
-        )
-        for k in weak
-    }
-    outside += weak
-    for _ in range(options.max_rounds):
-        good = anchors.take(np.flatnonzero(held.used & ~np.isin(anchors.photo_of, outside)))
-        adjusted, fixed, sharp = refine_with_maps(
-            without_photos(model, outside),
-            placement.local_from_sfm,
-            good,
-            constant,
-            keypoints,
-            focals,
-            options.refine,
-        )
-        gate = gates.held_share(adjusted.fixed_kept, options.min_held_share)
-        if not gate.passes:
-            break
-        spread = photo_covariances(
-            adjusted.model, keypoints, fixed, adjusted.fixed_kept, known, options.drift
-        )
-        loose = {
-            k: message
-            for k, message in loose_photos(adjusted.model, spread, options.max_photo_bound_m).items()
-            if k not in outside
-        }
-        left_out |= {rows[k]: (LOOSE, message) for k, message in loose.items()}
-        outside += sorted(loose)
-        if not loose or len(outside) > len(rows) - 2:
-            break
-    placement = replace(placement, gates=(*placement.gates, gate))
-    if not gate.passes:
-        return Refused(reason=gate.reason, message=gate.message, rows=rows, gates=placement.gates)
-    if loose:
-        return Refused(
-            reason=LOOSE,
-            message=f"hardly a photo is held well enough: {next(iter(loose.values()))}",
-            rows=rows,
-            gates=placement.gates,
-        )
-    kept = good.take(sharp)
-    placement, fit = _settled(placement, adjusted, kept, options.placement)
-    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance, spread)
-    placement = widened(placement, bending_m2)
-    complete = with_existing(adjusted, fixed, kept, placement.parents)
-    inside = [k for k in range(len(rows)) if k not in outside]
-    complete = only_photos(complete, inside)
-    more = {"bending_m": float(np.sqrt(bending_m2))}
-    grown = assemble(complete, placement, held, photos, features_of, near, identity, options, more)
+    settled = settle(model, held, anchors, keypoints, lenses, options.placement, options.settle)
+    if isinstance(settled, Refused):
+        return settled
+    final, more = settled.placement, settled.evidence()
+    grown = assemble(settled.model, final, held, photos, features_of, near, identity, options, more)
     if isinstance(grown, Refused):
         return grown
-    return replace(grown, feature_map=_with_covariances(grown.feature_map, spread[inside]), left_out=left_out)
-
-
-def _settled(
-    placement: MapsPlacement, adjusted: Anchored, anchors: Anchors, options: PlacementOptions
-) -> tuple[MapsPlacement, Fit]:
-    """The placement with the covariances of the refined model, and their fit.
-
-    Until then the reconstruction was bent as it came, and its residuals said more of that than of where it
-    lies. What photos lack beyond the similarity is added to it afterwards.
-    """
-    model, used = adjusted.model, adjusted.fixed_kept
-    fit = fit_similarity(model, Sim3.identity(), anchors, used, options.fit)
-    edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
-    if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
-        edges = placement.edges
-    assert placement.covariance is not None
-    assert placement.covariance_relative is not None
-    on_earth = placement.covariance - placement.covariance_relative
     return replace(
-        placement,
-        edges=edges,
-        covariance_relative=fit.covariance,
-        covariance=fit.covariance + on_earth,
-    ), fit
-
-
-def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
-    """Photos that may be further off than the bound (95 %) against the existing points, and why.
-
-    Args:
-        spread: of `photo_covariances`; photos that see nothing any more are loose, unless none was asked.
-    """
-    if not np.isfinite(spread).any():
-        return {}
-    bounds = np.full(len(spread), np.inf)
-    seen = np.isfinite(spread[:, 0, 0])
-    centers = center_covariances(model, spread)[seen]
-    bounds[seen] = 1.96 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
-    return {
-        int(
-            k
-        ): f"the photo may be {bounds[k]:.2f} m off where it hangs on the others, {max_bound_m:.2f} m are "
-        "allowed"
-        for k in np.flatnonzero(bounds > max_bound_m)
-    }
+        grown,
+        feature_map=_with_covariances(grown.feature_map, settled.spread),
+        left_out=settled.left_out,
+    )
 
 
 def _with_covariances(feature_map: FeatureMap, spread: FloatArray) -> FeatureMap:
@@ -250,15 +126,6 @@ def _meeting_place(
     main = next(a.area for a in areas if a.area.frame == frame)
     datum = main.maps[0].height_datum
     return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
-
-
-def widened(placement: MapsPlacement, bending_m2: float) -> MapsPlacement:
-    """The placement with its covariance relative to the existing maps widened by what bending adds."""
-    assert placement.covariance is not None
-    assert placement.covariance_relative is not None
-    wider = placement.covariance_relative + np.diag([0.0] * 4 + [bending_m2] * 3)
-    on_earth = placement.covariance - placement.covariance_relative
-    return replace(placement, covariance_relative=wider, covariance=wider + on_earth)
 
 
 def assemble(

@@ -41,37 +41,48 @@ class RefineOptions:
     adjust: AnchoredOptions = field(default_factory=AnchoredOptions)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lenses:
+    """What is known of a model's lenses.
+
+    Attributes:
+        constant: cameras whose lens is a map's and stays.
+        focal_px: focal lengths of EXIF by camera.
+    """
+
+    constant: tuple[int, ...]
+    focal_px: Mapping[int, float]
+
+
 def adopt_lenses(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
+    photos: Sequence[Photo],
     keypoints: Sequence[FloatArray],
-    focal_px: Mapping[int, float],
     options: RefineOptions,
-) -> tuple[Model, tuple[int, ...]]:
+) -> tuple[Model, Lenses]:
     """The model adjusted, in its own frame, to the lenses that existing maps have for its cameras.
 
     Args:
+        photos: all, rows as in the model.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
-        focal_px: focal lengths of EXIF by camera.
-
-    Returns:
-        The model, and its cameras whose lens is a map's and stays.
     """
+    focal_px = exif_focals(model, photos)
     cameras = list(model.cameras)
     adopted: list[int] = []
     for c in range(len(cameras)):
-        photos = np.flatnonzero(model.camera_of == c)
-        lens = _lens_of_maps([localised[r] for r in model.rows[photos].tolist() if r in localised])
-        if lens is None or len(photos) >= options.own_lens_photos:
+        mine = np.flatnonzero(model.camera_of == c)
+        lens = _lens_of_maps([localised[r] for r in model.rows[mine].tolist() if r in localised])
+        if lens is None or len(mine) >= options.own_lens_photos:
             continue
         if (lens.width, lens.height) == (cameras[c].width, cameras[c].height):
             cameras[c] = lens
             adopted.append(c)
     if not adopted:
-        return model, ()
+        return model, Lenses(constant=(), focal_px=focal_px)
     with_lenses = replace(model, cameras=tuple(cameras))
     adjusted = adjust_anchored(with_lenses, keypoints, FixedPoints.none(), adopted, options.adjust, focal_px)
-    return adjusted.model, tuple(adopted)
+    return adjusted.model, Lenses(constant=tuple(adopted), focal_px=focal_px)
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
@@ -87,16 +98,14 @@ def refine_with_maps(
     model: Model,
     local_from_sfm: Sim3,
     anchors: Anchors,
-    constant_cameras: Sequence[int],
+    lenses: Lenses,
     keypoints: Sequence[FloatArray],
-    focal_px: Mapping[int, float],
     options: RefineOptions,
 ) -> tuple[Anchored, FixedPoints, NDArray[np.int64]]:
     """The model in the local frame, metres, adjusted with the existing points of its anchors held fixed.
 
     Args:
         anchors: those that agree with the placement.
-        focal_px: focal lengths of EXIF by camera.
 
     Returns:
         The adjusted model, the fixed points with their observations, and for each of these (m,) its anchor.
@@ -107,7 +116,7 @@ def refine_with_maps(
     first, number = held.existing()
     fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
     free = without_anchored(placed, held)
-    adjusted = adjust_anchored(free, keypoints, fixed, constant_cameras, options.adjust, focal_px)
+    adjusted = adjust_anchored(free, keypoints, fixed, lenses.constant, options.adjust, lenses.focal_px)
     return adjusted, fixed, sharp
 
 

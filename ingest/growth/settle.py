@@ -1,0 +1,233 @@
+"""Step: a placed reconstruction is refined, and photos that do not hold firmly enough are left out.
+
+Photos are left out that contradict the placement, that hang on the others by little, and that may be further
+off than allowed; the others are adjusted without them, and say anew how sure they are.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from ingest.colmap_anchored import Anchored, FixedPoints
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.anchors import Anchors
+from ingest.growth.drift import (
+    DriftOptions,
+    LensKnowledge,
+    bending_variance_m2,
+    center_covariances,
+    photo_covariances,
+)
+from ingest.growth.links import firmness
+from ingest.growth.model_parts import only_photos, with_existing, without_photos
+from ingest.growth.parents import edges_of
+from ingest.growth.placement import Held, PlacementOptions
+from ingest.growth.refine import Lenses, RefineOptions, refine_with_maps
+from ingest.growth.similarity_fit import Fit, fit_similarity
+from ingest.growth.values import MapsPlacement, Refused
+
+# Reasons of photos that nothing holds well enough, and of those that hang on others by little.
+LOOSE, WEAK_LINK = "DRIFT_BUDGET", "WEAK_LINK"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SettleOptions:
+    """Which photos of a placed reconstruction are kept.
+
+    Attributes:
+        refine: the adjustment.
+        min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
+            lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
+            reconstruction cannot be bent to what the existing maps say.
+        min_link: `firmness` that photos need which are not localised themselves. In the simulated community a
+            block of seven photos, tied to a look-alike hall 78 m from theirs, had 0.04; right photos 0.14 and
+            more.
+        max_photo_bound_m: photos that may be further off (95 %), against the existing points and with what
+            their lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
+        max_rounds: of leaving such photos out; the others are adjusted without them.
+        drift: how far the refined reconstruction may bend beyond what holds it.
+    """
+
+    refine: RefineOptions = field(default_factory=RefineOptions)
+    min_held_share: float = 0.5
+    min_link: float = 0.08
+    max_photo_bound_m: float = 0.5
+    max_rounds: int = 4
+    drift: DriftOptions = field(default_factory=DriftOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Settled:
+    """A refined reconstruction.
+
+    Attributes:
+        model: of the photos that are kept, in metres, in the placement's frame; existing points that at least
+            two of them see are its own.
+        placement: with the gates asked here and the covariances of the refined model.
+        spread: (k, 6, 6) of `photo_covariances`, of the photos that are kept.
+        bending_m: what the photos lack beyond the similarity.
+        left_out: photos that are not kept although they agree, by row, with reason and message.
+    """
+
+    model: Model
+    placement: MapsPlacement
+    spread: FloatArray
+    bending_m: float
+    left_out: Mapping[int, tuple[str, str]]
+
+    def evidence(self) -> dict[str, Any]:
+        """What a map's evidence of growth says of it."""
+        return {"bending_m": self.bending_m}
+
+
+def settle(
+    model: Model,
+    held: Held,
+    anchors: Anchors,
+    keypoints: Sequence[FloatArray],
+    lenses: Lenses,
+    placing: PlacementOptions,
+    options: SettleOptions,
+) -> Settled | Refused:
+    """Refine an accepted placement with the existing points held fixed.
+
+    Args:
+        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        placing: how the similarity was fitted.
+    """
+    placement = held.placement
+    assert placement.local_from_sfm is not None
+    rows = tuple(int(r) for r in model.rows)
+    known = LensKnowledge(adopted=lenses.constant, by_exif=lenses.focal_px)
+    outside = [rows.index(r) for r in placement.disagreeing]
+    weak = weak_photos(model, outside, [rows.index(r) for r in placement.agreeing], options.min_link)
+    left_out = {rows[k]: (WEAK_LINK, message) for k, message in weak.items()}
+    outside += sorted(weak)
+    for _ in range(options.max_rounds):
+        good = anchors.take(np.flatnonzero(held.used & ~np.isin(anchors.photo_of, outside)))
+        adjusted, fixed, sharp = refine_with_maps(
+            without_photos(model, outside),
+            placement.local_from_sfm,
+            good,
+            lenses,
+            keypoints,
+            options.refine,
+        )
+        gate = gates.held_share(adjusted.fixed_kept, options.min_held_share)
+        asked = replace(placement, gates=(*placement.gates, gate))
+        if not gate.passes:
+            return _refused(gate.reason, gate.message, rows, asked)
+        spread = photo_covariances(
+            adjusted.model, keypoints, fixed, adjusted.fixed_kept, known, options.drift
+        )
+        loose = {
+            k: message
+            for k, message in loose_photos(adjusted.model, spread, options.max_photo_bound_m).items()
+            if k not in outside
+        }
+        left_out |= {rows[k]: (LOOSE, message) for k, message in loose.items()}
+        outside += sorted(loose)
+        if not loose or len(outside) > len(rows) - 2:
+            break
+    if loose:
+        message = f"hardly a photo is held well enough: {next(iter(loose.values()))}"
+        return _refused(LOOSE, message, rows, asked)
+    return _settled(adjusted, fixed, good.take(sharp), spread, outside, left_out, asked, placing)
+
+
+def _settled(
+    adjusted: Anchored,
+    fixed: FixedPoints,
+    anchors: Anchors,
+    spread: FloatArray,
+    outside: Sequence[int],
+    left_out: Mapping[int, tuple[str, str]],
+    placement: MapsPlacement,
+    placing: PlacementOptions,
+) -> Settled:
+    placement, fit = _with_fit(placement, adjusted, anchors, placing)
+    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance, spread)
+    inside = [k for k in range(len(adjusted.model.rows)) if k not in outside]
+    return Settled(
+        model=only_photos(with_existing(adjusted, fixed, anchors, placement.parents), inside),
+        placement=_widened(placement, bending_m2),
+        spread=spread[inside],
+        bending_m=float(np.sqrt(bending_m2)),
+        left_out=left_out,
+    )
+
+
+def _refused(reason: str, message: str, rows: tuple[int, ...], placement: MapsPlacement) -> Refused:
+    return Refused(reason=reason, message=message, rows=rows, gates=placement.gates)
+
+
+def _with_fit(
+    placement: MapsPlacement, adjusted: Anchored, anchors: Anchors, options: PlacementOptions
+) -> tuple[MapsPlacement, Fit]:
+    """The placement with the covariances of the refined model, and their fit.
+
+    Until then the reconstruction was bent as it came, and its residuals said more of that than of where it
+    lies. What photos lack beyond the similarity is added to it afterwards.
+    """
+    model, used = adjusted.model, adjusted.fixed_kept
+    fit = fit_similarity(model, Sim3.identity(), anchors, used, options.fit)
+    edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
+    if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
+        edges = placement.edges
+    assert placement.covariance is not None
+    assert placement.covariance_relative is not None
+    on_earth = placement.covariance - placement.covariance_relative
+    settled = replace(
+        placement,
+        edges=edges,
+        covariance_relative=fit.covariance,
+        covariance=fit.covariance + on_earth,
+    )
+    return settled, fit
+
+
+def _widened(placement: MapsPlacement, bending_m2: float) -> MapsPlacement:
+    """The placement with its covariance relative to the existing maps widened by what bending adds."""
+    assert placement.covariance is not None
+    assert placement.covariance_relative is not None
+    wider = placement.covariance_relative + np.diag([0.0] * 4 + [bending_m2] * 3)
+    on_earth = placement.covariance - placement.covariance_relative
+    return replace(placement, covariance_relative=wider, covariance=wider + on_earth)
+
+
+def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int], min_link: float) -> dict[int, str]:
+    """Photos that hang on those that are held by too little, and how little.
+
+    Args:
+        outside: photos that do not count. held: photos that are localised and agree.
+    """
+    firm = firmness(without_photos(model, outside), held)
+    return {
+        k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
+        f"{100 * min_link:.0f} % needed: look-alike places tie photos so"
+        for k in np.flatnonzero(firm < min_link).tolist()
+        if k not in outside
+    }
+
+
+def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
+    """Photos that may be further off than the bound (95 %) against the existing points, and how far.
+
+    Args:
+        spread: of `photo_covariances`; photos that see nothing any more are loose, unless none was asked.
+    """
+    if not np.isfinite(spread).any():
+        return {}
+    bounds = np.full(len(spread), np.inf)
+    seen = np.isfinite(spread[:, 0, 0])
+    centers = center_covariances(model, spread)[seen]
+    bounds[seen] = 1.96 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
+    return {
+        k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
+        for k in np.flatnonzero(bounds > max_bound_m).tolist()
+    }
