@@ -15,18 +15,20 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import Model
 
 
-def firmness(model: Model, held: Sequence[int]) -> FloatArray:
+def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> FloatArray:
     """(k,) of every photo: the weakest link of its firmest chain of photos to one that is held.
 
     The link of two photos is the share of the points of the one that sees fewer which both see.
 
     Args:
         held: photos of the model, by place among its rows, that need no link; they have infinity.
+        without: photos that no chain goes through.
 
     Returns:
         0 for photos without a chain.
     """
     shares = _links(model)
+    shares[:, list(without)] = 0.0
     firm = np.zeros(len(model.rows))
     firm[list(held)] = np.inf
     queue = [(-np.inf, k) for k in held]

@@ -206,7 +206,7 @@ def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int], min_l
     Args:
         outside: photos that do not count. held: photos that are localised and agree.
     """
-    firm = firmness(without_photos(model, outside), held)
+    firm = firmness(model, held, outside)
     return {
         k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
         f"{100 * min_link:.0f} % needed: look-alike places tie photos so"
