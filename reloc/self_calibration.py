@@ -21,8 +21,9 @@ class LensPriors:
     """Standard deviations of what is known of a lens before the photo is looked at.
 
     Attributes:
-        exif_focal_rel: EXIF focal lengths miss the true one by cropped video-like modes and by rounding of
-            the 35 mm equivalent: on `brighton` by 26 %, on well-behaved cameras by 1 to 3 %.
+        exif_focal_rel: EXIF focal lengths of well-behaved cameras are within 1 to 3 %, by rounding of the
+            35 mm equivalent mostly; wide, because cropped pictures and video-like modes miss by tens of
+            percent, and one photo alone has to get away from that.
         unknown_focal_rel: without EXIF: a factor of two either way.
         radial: k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1.
         center_rel: principal points of consumer cameras lie within 1 % of the longer side of the middle.

@@ -27,7 +27,9 @@ class SurfaceOptions:
         gicp: whether GICP is tried at all.
         gicp_rounds: of nearest neighbours.
         max_gicp_points: of the map, evenly chosen; six parameters need no more.
-        min_gain: share by which GICP must lower the median distance; less is chance.
+        min_gain: share by which GICP must lower the median distance; less is chance: on maps of the
+            simulated town that GICP moved for a gain of a few percent, points were 0.056 m off instead of
+            0.052 (`tools/structure_study.py`).
         max_move_sigmas: how far it may move the evidence, in standard deviations of the placement there.
         min_move_m: a move below the scan's own noise is always allowed.
         threads: of small_gicp. Its threads are OpenMP's, after which a process should not fork.
@@ -41,7 +43,7 @@ class SurfaceOptions:
     gicp: bool = True
     gicp_rounds: int = 20
     max_gicp_points: int = 4000
-    min_gain: float = 0.02
+    min_gain: float = 0.1
     max_move_sigmas: float = 3.0
     min_move_m: float = 0.02
     threads: int = 1
