@@ -72,11 +72,20 @@ def agreement(
     Args:
         inliers: (k, 2) pixels. expected: (v, 2) pixels of all map points that the pose makes visible.
     """
-    expected_cells, counts = np.unique(_cells(expected, width, height), return_counts=True)
-    expected_cells = expected_cells[counts >= 3]
-    if len(expected_cells) == 0:
+    cells = _expected_cells(expected, width, height)
+    if len(cells) == 0:
         return 0.0
-    return float(np.isin(expected_cells, _cells(inliers, width, height)).mean())
+    return float(np.isin(cells, _cells(inliers, width, height)).mean())
+
+
+def expected_cells(expected: NDArray[np.floating], width: int, height: int) -> int:
+    """How many cells `agreement` asks."""
+    return len(_expected_cells(expected, width, height))
+
+
+def _expected_cells(expected: NDArray[np.floating], width: int, height: int) -> NDArray[np.int64]:
+    cells, counts = np.unique(_cells(expected, width, height), return_counts=True)
+    return np.asarray(cells[counts >= 3], dtype=np.int64)
 
 
 def _cells(pixels: NDArray[np.floating], width: int, height: int) -> NDArray[np.int64]:

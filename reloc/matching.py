@@ -14,6 +14,11 @@ from featuredb.index.nearest import nearest
 from reloc.candidates import Cluster
 from reloc.options import MatchOptions
 
+# Beyond the map's own views SIFT finds most of what there is to 30 degrees, some of it to 60, on flat walls
+# and from descents (tools/view_change.py): up to the first a point is missed where it is not found, up to the
+# second a match may be one. More is a scene seen from behind, or from under the ground.
+EXPECTED_DEG, POSSIBLE_DEG = 30.0, 60.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Matches:
@@ -73,7 +78,7 @@ def guided_matches(
     Args:
         points: rows of the area's points to project.
     """
-    rows = visible_points(area, points.astype(np.int64), camera, cam_from_local)
+    rows = visible_points(area, points.astype(np.int64), camera, cam_from_local, POSSIBLE_DEG)
     if len(rows) == 0 or len(features) == 0:
         return _concatenate([])
     pixels = camera.project(cam_from_local.act(area.points[rows]))
@@ -88,12 +93,16 @@ def guided_matches(
 
 
 def visible_points(
-    area: Area, points: NDArray[np.int64], camera: Camera, cam_from_local: Rigid3
+    area: Area,
+    points: NDArray[np.int64],
+    camera: Camera,
+    cam_from_local: Rigid3,
+    beyond_views_deg: float = EXPECTED_DEG,
 ) -> NDArray[np.int64]:
     """Those of the points that project into the image and are seen from a side that the map knows.
 
     A point counts as seen from a known side when the ray to the new camera lies within the cone of the
-    map's own views, widened by 30 degrees: SIFT does not follow much further.
+    map's own views, widened by `beyond_views_deg`.
     """
     pixels = camera.project(cam_from_local.act(area.points[points]))
     with np.errstate(invalid="ignore"):
@@ -107,7 +116,7 @@ def visible_points(
     toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
     cosine = np.einsum("ij,ij->i", toward, area.view_direction[points])
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    cone = np.arccos(np.clip(area.view_spread_cos[points], -1.0, 1.0)) + np.radians(30.0)
+    cone = np.arccos(np.clip(area.view_spread_cos[points], -1.0, 1.0)) + np.radians(beyond_views_deg)
     return np.asarray(points[inside & (angle <= cone)], dtype=np.int64)
 
 

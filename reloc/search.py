@@ -12,9 +12,16 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.acceptance import agreement, coverage, independent_inliers, log_nfa
+from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa
 from reloc.candidates import Cluster, IndexedArea, find_clusters
-from reloc.matching import Matches, guided_matches, match_cluster, visible_points
+from reloc.matching import (
+    EXPECTED_DEG,
+    POSSIBLE_DEG,
+    Matches,
+    guided_matches,
+    match_cluster,
+    visible_points,
+)
 from reloc.options import LocaliseOptions
 from reloc.pose import (
     CameraSource,
@@ -25,6 +32,8 @@ from reloc.pose import (
 )
 from reloc.result import Evidence, LocaliseRequest, Reason
 from reloc.stopwatch import Stopwatch
+
+_FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -237,8 +246,7 @@ def _with_evidence(
     error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
     blind = _independent(features, area, pose, unguided, error < tolerance_px)
     inlier_pixels = features.xy[matches.feature[own]]
-    visible = visible_points(area, cluster.points.astype(np.int64), pose.camera, pose.cam_from_local)
-    expected_pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
+    visible, expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
     evidence = Evidence(
         inliers=len(own),
         log_nfa=log_nfa(
@@ -256,6 +264,23 @@ def _with_evidence(
     return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
 
 
+def _expected(
+    area: Area, points: NDArray[np.int64], pose: PoseHypothesis
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Points that the photo should show, and their pixels: as the map has seen them, or else farther from it.
+
+    Where the map knows hardly anything from that side, what SIFT may still find is what there is to agree
+    with.
+    """
+    visible, pixels = points[:0], np.zeros((0, 2))
+    for beyond_deg in (EXPECTED_DEG, POSSIBLE_DEG):
+        visible = visible_points(area, points, pose.camera, pose.cam_from_local, beyond_deg)
+        pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
+        if expected_cells(pixels, pose.camera.width, pose.camera.height) >= _FEWEST_CELLS:
+            break
+    return visible, pixels
+
+
 def _independent(
     features: Features, area: Area, pose: PoseHypothesis, matches: Matches, inlier: NDArray[np.bool_]
 ) -> NDArray[np.intp]:
@@ -264,7 +289,7 @@ def _independent(
     A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
     """
     rows = np.flatnonzero(inlier)
-    seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local)
+    seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     rows = rows[np.isin(matches.point[rows], seen)]
     pixels, points = pairs(features, area, matches)
     gap_px = 0.002 * max(pose.camera.width, pose.camera.height)

@@ -16,7 +16,7 @@ from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
 from reloc.localise import Localised, localise_features
-from reloc.matching import Matches, guided_matches, visible_points
+from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
 from reloc.options import LocaliseOptions
 from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
 from reloc.result import LocaliseRequest
@@ -163,7 +163,7 @@ def match_each_map(
     within the tolerance than a pose needs are left out: chance alone gives a few.
     """
     everything = np.arange(len(area.points), dtype=np.int64)
-    visible = visible_points(area, everything, pose.camera, pose.cam_from_local)
+    visible = visible_points(area, everything, pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     parts = []
     tolerance_px = options.localise.pose.tolerance_rel * max(pose.camera.width, pose.camera.height)
     for map_row in np.unique(area.point_map[visible]):
