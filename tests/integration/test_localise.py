@@ -99,6 +99,19 @@ def test_a_known_camera_within_centimetres(
     assert pose.horizontal_68_m < 0.1
 
 
+@pytest.mark.parametrize("tilt_deg", [45.0, 55.0])
+def test_a_view_far_aside_from_those_of_the_map(
+    area: IndexedArea, texture: NDArray[np.uint8], tilt_deg: float
+) -> None:
+    """The map looks down, at most 15 degrees aside; from 40 degrees farther SIFT finds hundreds of points."""
+    truth = view(0.0, -40.0 * np.tan(np.radians(tilt_deg)), 40.0, tilt_deg, 0.0)
+    result = localise(render(texture, truth, seed=3), KNOWN, [area])
+    position_m, angle_deg = pose_errors(result, truth)
+    assert position_m < 0.1
+    assert angle_deg < 0.1
+    assert result.inliers > 200
+
+
 @pytest.mark.parametrize(
     "request_", [LocaliseRequest(), LocaliseRequest(exif_focal_px=560.0)], ids=["unknown", "exif"]
 )

@@ -8,7 +8,7 @@ import pytest
 from featuredb.features.features import Features
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.candidates import Cluster, IndexedArea
-from reloc.matching import guided_matches, match_cluster, visible_points
+from reloc.matching import EXPECTED_DEG, POSSIBLE_DEG, guided_matches, match_cluster, visible_points
 from reloc.options import MatchOptions
 from tests.support.scenes import (
     CAMERA,
@@ -157,6 +157,31 @@ def test_visible_points_against_a_loop() -> None:
     for pose in (west, below):
         assert pixels_inside(CAMERA, pose, area.points)[1].sum() > 100
         assert len(visible_points(area, rows, CAMERA, pose)) == 0
+
+
+def test_points_are_matched_from_farther_aside_than_they_are_expected() -> None:
+    """From 50 degrees beside the map's views nothing must be found, and what is found may count."""
+    first = ring(6)[0]
+    area = one_map(poses=[first]).area
+    rows = np.arange(len(area.points))
+
+    def beside(angle_deg: float) -> Rigid3:
+        turn = np.radians(angle_deg)
+        turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        return looking_at(turned @ first.center, np.zeros(3))
+
+    known = len(visible_points(area, rows, CAMERA, first))
+    for angle_deg, expected, possible in ((15.0, 0.8, 0.8), (62.0, 0.0, 0.5), (130.0, 0.0, 0.0)):
+        found = [
+            len(visible_points(area, rows, CAMERA, beside(angle_deg), beyond))
+            for beyond in (EXPECTED_DEG, POSSIBLE_DEG)
+        ]
+        assert found[0] >= expected * known
+        assert found[1] >= possible * known
+        if angle_deg > 60.0:
+            assert found[0] < 0.1 * known
+        if angle_deg > 120.0:
+            assert found[1] == 0
 
 
 def test_nothing_behind_the_camera_is_visible() -> None:
