@@ -61,20 +61,20 @@ def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
 
 def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> None:
     """Anna's map reaches beyond the anchor; Ben's map, quarantined too, shows the same from elsewhere."""
-    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     database = _database(tmp_path, _ANCHOR, mine)
     outcome = _promoted(database)["m"]
     assert not outcome.promoted
     assert outcome.reason_code == "ONE_SOURCE"
     assert _status(database, "m") == "quarantined"
-    database.commit_map(strip_map("n", 78.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    database.commit_map(strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
     outcomes = _promoted(database)
     assert outcomes["m"].promoted
     assert outcomes["n"].promoted
 
 
 def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     database, work = _database(tmp_path, _ANCHOR, mine), tmp_path / "work"
 
     def ask() -> Promotion:
@@ -84,7 +84,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     with monkeypatch.context() as patch:
         patch.setattr("ingest.growth.promotion.examine", None)
         assert ask() == first
-    database.commit_map(strip_map("n", 78.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    database.commit_map(strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
     assert ask().promoted  # something new has come
 
 
@@ -285,7 +285,7 @@ def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -
 
 
 def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
-    mine = strip_map("m", 75.0, owners=["anna"], parents=[_ANCHOR], seed=1)
+    mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     options = PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=("anna",)))
     assert _promoted(_database(tmp_path, _ANCHOR, mine), options)["m"].promoted
 
