@@ -137,6 +137,11 @@ def settle(
     if loose:
         message = f"hardly a photo is held well enough: {next(iter(loose.values()))}"
         return _refused(LOOSE, message, rows, asked)
+    held_by = tuple(r for r in placement.agreeing if rows.index(r) not in outside)
+    gate = gates.agreeing_photos(len(held_by), placing.min_agreeing)
+    if not gate.passes:  # those that agreed are among the photos that were left out
+        return _refused(gate.reason, gate.message, rows, asked)
+    asked = replace(asked, agreeing=held_by)
     return _settled(adjusted, fixed, good.take(sharp), spread, outside, left_out, asked, placing)
 
 
