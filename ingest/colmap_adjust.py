@@ -25,9 +25,9 @@ from ingest.focal_prior import (
     FocalPriorOptions,
     add_focal_priors,
     fix_gauge,
-    shared_variance_px2,
     take_adjusted,
 )
+from ingest.precision import shared_variance_px2
 
 _LOG = logging.getLogger(__name__)
 _MORE_OF_RADIAL = 1  # the second radial coefficient

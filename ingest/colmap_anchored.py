@@ -17,7 +17,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
-from ingest.focal_prior import FocalPriorOptions, add_focal_priors, fix_gauge, shared_variance_px2
+from ingest.focal_prior import FocalPriorOptions, add_focal_priors, fix_gauge
+from ingest.precision import shared_variance_px2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

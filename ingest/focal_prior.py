@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
 
 # COLMAP leaves points out that a single image sees.
 _IMAGES = 2
@@ -37,9 +35,9 @@ class FocalPriorOptions:
         sigma_rel: of the focal length. 35 mm equivalents are rounded to whole millimetres (1 % at 28 mm),
             nominal focal lengths are met within 1 to 2 %.
         weight: how many times an independent residual of one sigma the prior counts, of the size that the
-            residuals have with what neighbours share (`shared_variance_px2`). Above one because a lens
-            model's faults are common to whole photos too, which neighbours do not show: with 50 `brighton`
-            comes to 2325 px. Where residuals are those of keypoints alone, as in simulated photos, the photos
+            residuals have with what neighbours share (`ingest.precision.shared_variance_px2`). Above one
+            because a lens model's faults are common to whole photos too, which neighbours do not show: with
+            50 `brighton` comes to 2325 px (`tools/lens_study.py --focal-weights`). Where residuals are those of keypoints alone, as in simulated photos, the photos
             still decide: there EXIF's rounding of 1.4 % moves a focal length by less than 0.1 %.
     """
 
@@ -69,7 +67,7 @@ def add_focal_priors(
     Beyond two sigmas the Cauchy loss lets go: an EXIF entry that is wrong loses to photos that know.
 
     Args:
-        variance_px2: of `shared_variance_px2`.
+        variance_px2: of `ingest.precision.shared_variance_px2`.
     """
     next_id = max(reconstruction.images, default=0) + 1
     # Of the sum of squares at one sigma no residual takes more than half the loss scale.
@@ -101,38 +99,6 @@ def add_focal_priors(
             config.add_constant_point(
                 reconstruction.add_point3D(np.array([angle * x, angle * y, 1.0]), track)
             )
-
-
-def shared_variance_px2(
-    residuals: FloatArray, pixels: FloatArray, photo_of: NDArray[np.int64], side_px: float
-) -> float:
-    """Variance of a coordinate of the residuals, times their design effect; arguments as there."""
-    if len(residuals) == 0:
-        return 0.0
-    return _variance_px2(residuals) * design_effect(residuals, pixels, photo_of, side_px)
-
-
-def design_effect(
-    residuals: FloatArray, pixels: FloatArray, photo_of: NDArray[np.int64], side_px: float
-) -> float:
-    """How much more sums over parts of photos vary than without what neighbours share; at least 1.
-
-    Kish, Survey Sampling, 1965, 8.2.
-
-    Args:
-        residuals, pixels: (m, 2). photo_of: (m,) their photos.
-        side_px: longer side of the photos, of which a part is a quarter.
-    """
-    squared = (residuals**2).sum(axis=1)
-    weighted = residuals / (1.0 + squared / max(4.0 * _variance_px2(residuals), 1e-12))[:, None]
-    place = np.floor(4.0 * pixels / side_px).astype(np.int64)
-    part = np.unique(np.column_stack([photo_of, place]), axis=0, return_inverse=True)[1].reshape(-1)
-    sums = np.stack([np.bincount(part, weights=weighted[:, k]) for k in range(2)])
-    return max(1.0, float((sums**2).sum() / max((weighted**2).sum(), 1e-12)))
-
-
-def _variance_px2(residuals: FloatArray) -> float:
-    return (1.4826 * float(np.median(np.abs(residuals)))) ** 2
 
 
 def fix_gauge(reconstruction: Any, config: Any, image_id: int, focal_px: Mapping[int, float]) -> None:

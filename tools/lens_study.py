@@ -1,4 +1,6 @@
-"""Which lens model does a map need? The same photos with SIMPLE_RADIAL and with the adjustment to OPENCV.
+"""Which lens does a map need: the same photos with SIMPLE_RADIAL and with the ladder to OPENCV.
+
+EXIF's focal length counts as much as --focal-weights says; the program's default otherwise.
 
 Judged by something the reconstruction never saw: the truth of a simulated world, or a laser scan of the same
 place, to which the map's points are fitted by a similarity (trimmed iterative closest points).
@@ -21,6 +23,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import read_truth
 from featuredb.store import Database
+from ingest.focal_prior import FocalPriorOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 
@@ -34,6 +37,13 @@ def main() -> None:
     parser.add_argument("--world", type=Path, help="folder of a simulated world")
     parser.add_argument("--scan", type=Path, help="LAS/LAZ file in a UTM zone, metres")
     parser.add_argument("--gps-sigma", type=float, default=None, help="of the photos' positions, metres")
+    parser.add_argument(
+        "--focal-weights",
+        type=float,
+        nargs="+",
+        default=[FocalPriorOptions().weight],
+        help="0: EXIF is ignored",
+    )
     parser.add_argument("--work", type=Path, default=None, help="keep unfinished work here")
     args = parser.parse_args()
     photos = args.world / "drone" if args.world else args.photos
@@ -42,9 +52,13 @@ def main() -> None:
     logging.basicConfig(format="%(message)s")
     logging.getLogger("ingest.colmap_adjust").setLevel(logging.INFO)  # tells the gain of each step
     with tempfile.TemporaryDirectory() as scratch:
-        print(f"{'lens':<16}{'photos':>7}{'points':>8}{'GPS RMS m':>11}  against the independent truth")
-        for fuller in (False, True):
-            feature_map = make_map(photos, Path(scratch) / f"{fuller}", fuller, args.gps_sigma, args.work)
+        print(
+            f"{'lens':<16}{'weight':>7}{'focal px':>10}{'residual px':>13}"
+            f"{'photos':>7}{'points':>8}{'GPS RMS m':>11}  against the independent truth"
+        )
+        for fuller, weight in [(False, args.focal_weights[0]), *((True, w) for w in args.focal_weights)]:
+            folder = Path(scratch) / f"{fuller}-{weight:g}"
+            feature_map = make_map(photos, folder, fuller, weight, args.gps_sigma, args.work)
             name = feature_map.cameras[0].model
             judged = []
             if args.world:
@@ -53,17 +67,24 @@ def main() -> None:
                 median, p80 = distance_to_scan_m(feature_map, args.scan)
                 judged.append(f"points to scan median {median:.3f} m, 80 % within {p80:.3f} m")
             print(
-                f"{name:<16}{len(feature_map.images):>7}{len(feature_map.points):>8}"
+                f"{name:<16}{weight:>7g}{feature_map.cameras[0].focal_px:>10.1f}"
+                f"{feature_map.provenance['residual_sigma_px']:>13.3f}{len(feature_map.images):>7}{len(feature_map.points):>8}"
                 f"{feature_map.placement.residual_rms_m:>11.3f}  {'; '.join(judged)}"
             )
 
 
 def make_map(
-    photos: Path, folder: Path, fuller_lens: bool, gps_sigma_m: float | None, work: Path | None
+    photos: Path,
+    folder: Path,
+    fuller_lens: bool,
+    focal_weight: float,
+    gps_sigma_m: float | None,
+    work: Path | None,
 ) -> FeatureMap:
-    """Ingest the photos with or without the fuller lens; the largest map."""
+    """Ingest the photos with or without the fuller lens, with that weight of EXIF; the largest map."""
     making = MapMakingOptions()
-    adjust = replace(making.sfm.adjust, fuller_lens=fuller_lens)
+    prior = FocalPriorOptions(weight=focal_weight)
+    adjust = replace(making.sfm.adjust, fuller_lens=fuller_lens, focal_prior=prior)
     options = IngestOptions(
         making=replace(making, sfm=replace(making.sfm, adjust=adjust)),
         gps_sigma_m=(gps_sigma_m, gps_sigma_m) if gps_sigma_m else None,

@@ -5,7 +5,7 @@ not. That is in the normal equations of the adjustment: poses and lenses with th
 existing points known to what they are. Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, 6 and 9.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,8 +17,9 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap_anchored import FixedPoints, with_observations
 from ingest.colmap_bridge import Model
-from ingest.focal_prior import design_effect
-from ingest.precision import Linearised, linearise
+from ingest.focal_prior import FocalPriorOptions
+from ingest.growth.refine import Lenses
+from ingest.precision import Linearised, design_effect, linearise
 
 _LEAST_FREEDOM = 0.1
 _LEAST_OBSERVATIONS = 100  # of a camera; fewer show no pattern
@@ -44,22 +45,9 @@ class DriftOptions:
     adopted_distortion: float = 0.0005
     own_focal_rel: float = 0.15
     own_distortion: float = 0.1
-    exif_focal_rel: float = 0.02
+    exif_focal_rel: float = FocalPriorOptions().sigma_rel
     max_photos: int = 300
     max_points: int = 20_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LensKnowledge:
-    """What is known of a model's lenses without its photos.
-
-    Attributes:
-        adopted: cameras whose lens was a map's.
-        by_exif: cameras whose focal length EXIF tells.
-    """
-
-    adopted: Collection[int] = ()
-    by_exif: Collection[int] = ()
 
 
 def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
@@ -94,7 +82,7 @@ def photo_covariances(
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
-    lenses: LensKnowledge,
+    lenses: Lenses,
     options: DriftOptions,
 ) -> FloatArray:
     """(k, 6, 6) of the left perturbation of each cam_from_local, relative to the existing points.
@@ -208,12 +196,12 @@ def _lens_columns(model: Model) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
 
 
-def _lens_information(model: Model, lenses: LensKnowledge, options: DriftOptions) -> FloatArray:
+def _lens_information(model: Model, lenses: Lenses, options: DriftOptions) -> FloatArray:
     """Inverse variances of all lens parameters."""
     known: list[float] = []
     for c, camera in enumerate(model.cameras):
-        own = c not in lenses.adopted
-        focal = options.exif_focal_rel if c in lenses.by_exif else options.own_focal_rel
+        own = c not in lenses.constant
+        focal = options.exif_focal_rel if c in lenses.focal_px else options.own_focal_rel
         focal = focal if own else options.adopted_focal_rel
         distortion = options.own_distortion if own else options.adopted_distortion
         for index in camera.lens_parameters():

@@ -18,7 +18,6 @@ from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.drift import (
     DriftOptions,
-    LensKnowledge,
     bending_variance_m2,
     center_covariances,
     photo_covariances,
@@ -103,7 +102,6 @@ def settle(
     placement = held.placement
     assert placement.local_from_sfm is not None
     rows = tuple(int(r) for r in model.rows)
-    known = LensKnowledge(adopted=lenses.constant, by_exif=lenses.focal_px)
     outside = [rows.index(r) for r in placement.disagreeing]
     weak = weak_photos(model, outside, [rows.index(r) for r in placement.agreeing], options.min_link)
     left_out = {rows[k]: (WEAK_LINK, message) for k, message in weak.items()}
@@ -123,7 +121,7 @@ def settle(
         if not gate.passes:
             return _refused(gate.reason, gate.message, rows, asked)
         spread = photo_covariances(
-            adjusted.model, keypoints, fixed, adjusted.fixed_kept, known, options.drift
+            adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, options.drift
         )
         loose = {
             k: message

@@ -10,15 +10,15 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
 from ingest.growth.drift import (
     DriftOptions,
-    LensKnowledge,
     bending_variance_m2,
     center_covariances,
     photo_covariances,
 )
+from ingest.growth.refine import Lenses
 from tests.support.new_photos import NewPhotos, take_photos
-from tests.support.scenes import box_points, looking_at, random_descriptors
+from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 
-GIVEN = LensKnowledge(adopted=[0])
+GIVEN, FREE = Lenses(constant=(0,), focal_px={}), Lenses(constant=(), focal_px={})
 COUNT = 40  # world points that the existing map has; they lie in the west
 PHOTOS = 6
 
@@ -118,7 +118,11 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
         np.sqrt(np.linalg.eigvalsh(center_covariances(new.model, spread))[-1, -1])
         for spread in (
             photo_covariances(*arguments, lenses, DriftOptions())
-            for lenses in (GIVEN, LensKnowledge(by_exif=[0]), LensKnowledge())
+            for lenses in (
+                GIVEN,
+                Lenses(constant=(), focal_px={0: CAMERA.focal_px}),
+                Lenses(constant=(), focal_px={}),
+            )
         )
     ]
     assert sigmas[0] < sigmas[1] < sigmas[2]
