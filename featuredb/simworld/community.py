@@ -51,7 +51,7 @@ class CommunityOptions:
         sights: places that people visit.
         width: of the widest camera, pixels.
         geotags: how wrong they are.
-        texel_m: resolution of the painted ground.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 1
@@ -70,6 +70,7 @@ class CommunityOptions:
     width: int = 1600
     geotags: GeotagOptions = field(default_factory=GeotagOptions)
     texel_m: float = 0.06
+    pieces: int = 16
 
     def __post_init__(self) -> None:
         if min(self.photos, self.other_town, self.copies, self.indoor, self.portraits) < 0:
@@ -93,6 +94,7 @@ class CommunityOptions:
             portraits=2,
             sights=6,
             width=1200,
+            pieces=4,
         )
 
     def scene(self, key: str) -> Scene:
@@ -103,13 +105,16 @@ class CommunityOptions:
 @lru_cache(maxsize=4)
 def _base(options: CommunityOptions, town: str) -> Scene:
     if town == "home":
-        return make_town(options.seed, size_m=options.town_size_m, texel_m=options.texel_m)
+        return make_town(
+            options.seed, size_m=options.town_size_m, texel_m=options.texel_m, pieces=options.pieces
+        )
     return make_town(
         options.seed + _OTHER_SEED,
         name="other town",
         size_m=options.town_size_m,
         place=OTHER_TOWN_PLACE,
         texel_m=options.texel_m,
+        pieces=options.pieces,
     )
 
 

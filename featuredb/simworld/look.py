@@ -13,7 +13,7 @@ from featuredb.simworld.texture import Texture
 
 def scene_look(scene: Scene, water_seed: int = 0) -> Look:
     """Textures and light of a scene; the water is that of the moment `water_seed`."""
-    still = _materials(scene.seed)
+    still = _materials(scene.seed, scene.pieces)
     painted = {"water": water_texture(water_seed), "ground": _ground(scene.plan, scene.texel_m)}
     textures = tuple(painted.get(name) or still[name] for name in TEXTURES)
     to_sun = scene.enu_from_town @ np.asarray(scene.plan.to_sun)
@@ -21,8 +21,8 @@ def scene_look(scene: Scene, water_seed: int = 0) -> Look:
 
 
 @lru_cache(maxsize=4)
-def _materials(seed: int) -> dict[str, Texture]:
-    return town_textures(seed)
+def _materials(seed: int, pieces: int) -> dict[str, Texture]:
+    return town_textures(seed, pieces)
 
 
 @lru_cache(maxsize=2)

@@ -2,6 +2,9 @@
 
 Light varies little over them (the sun is in `Faces.tint`); what they must have is structure at all scales,
 since that is what features feed on, and honest sameness where a town has it.
+
+Walls and tiled roofs are painted in pieces: with one, every brick wall of the town is cut from the same 24 m,
+down to the flower pots; with more, buildings are of one design and yet not the same.
 """
 
 from collections.abc import Callable
@@ -19,23 +22,29 @@ BAY_M = 3.0  # one window axis of a facade
 STOREY_M = 3.0
 _FACADE_TEXEL_M = 0.0234375  # 8 bays of 128 texels, 5 storeys plus a row of brick
 _SIZE = 1024
+_TILE_TEXEL_M = 0.025
 _DETAIL_TEXEL_M = 0.0125
 
 FACADE_LENGTH_M = _SIZE * _FACADE_TEXEL_M
+ROOF_LENGTH_M = _SIZE * _TILE_TEXEL_M
 
 
-def town_textures(seed: int) -> dict[str, Texture]:
-    """Every texture but the painted ground and the water, plus `detail`, by name."""
+def town_textures(seed: int, pieces: int = 1) -> dict[str, Texture]:
+    """Every texture but the painted ground and the water, plus `detail`, by name.
+
+    Args:
+        pieces: of each wall and each tiled roof, one beside the other along u.
+    """
     painters: dict[str, Callable[[np.random.Generator], Texture]] = {
         "fields": _fields,
-        "facade_brick": lambda r: _facade(r, (150, 84, 66), brick=True),
-        "facade_plaster": lambda r: _facade(r, (214, 206, 190), brick=False),
-        "facade_ochre": lambda r: _facade(r, (206, 170, 110), brick=False),
-        "facade_panel": lambda r: _facade(r, (168, 172, 176), brick=False, panel=True),
-        "facade_stone": lambda r: _facade(r, (172, 160, 140), brick=True, course=(0.6, 0.3)),
-        "roof_red": lambda r: _tiles(r, (158, 78, 56)),
-        "roof_brown": lambda r: _tiles(r, (112, 82, 66)),
-        "roof_slate": lambda r: _tiles(r, (92, 96, 104)),
+        "facade_brick": lambda r: _facade(r, (150, 84, 66), pieces, brick=True),
+        "facade_plaster": lambda r: _facade(r, (214, 206, 190), pieces, brick=False),
+        "facade_ochre": lambda r: _facade(r, (206, 170, 110), pieces, brick=False),
+        "facade_panel": lambda r: _facade(r, (168, 172, 176), pieces, brick=False, panel=True),
+        "facade_stone": lambda r: _facade(r, (172, 160, 140), pieces, brick=True, course=(0.6, 0.3)),
+        "roof_red": lambda r: _tiles(r, (158, 78, 56), pieces),
+        "roof_brown": lambda r: _tiles(r, (112, 82, 66), pieces),
+        "roof_slate": lambda r: _tiles(r, (92, 96, 104), pieces),
         "roof_bitumen": _bitumen,
         "roof_metal": _metal,
         "plain": lambda r: _noisy(r, (200, 200, 200), 0.05),
@@ -97,18 +106,38 @@ def _masonry(rng: np.random.Generator, texel_m: float, course: tuple[float, floa
 def _facade(
     rng: np.random.Generator,
     base: tuple[int, int, int],
+    pieces: int,
     *,
     brick: bool,
     panel: bool = False,
     course: tuple[float, float] = (0.25, 0.094),
 ) -> Texture:
-    """Eight bays by eight storeys; row 0 is at the ground, so v grows upward."""
+    """Pieces of eight bays by eight storeys; row 0 is at the ground, so v grows upward."""
+    first, design = _facade_piece(rng, base, None, brick=brick, panel=panel, course=course)
+    more = [
+        _facade_piece(rng, base, design, brick=brick, panel=panel, course=course)[0] for _ in range(1, pieces)
+    ]
+    return Texture.from_image(to_image(np.concatenate([first, *more], axis=1)), _FACADE_TEXEL_M)
+
+
+def _facade_piece(
+    rng: np.random.Generator,
+    base: tuple[int, int, int],
+    design: tuple[float, float] | None,
+    *,
+    brick: bool,
+    panel: bool,
+    course: tuple[float, float],
+) -> tuple[Canvas, tuple[float, float]]:
+    """One piece, and its design: width and height of its windows, as shares of bay and storey."""
     level = 1.0 + 0.05 * periodic(_SIZE, rng, exponent=0.9)
     if brick:
         level = level * _masonry(rng, _FACADE_TEXEL_M, course)
     image = _coloured(base, level.astype(np.float32))
     bay, storey = round(BAY_M / _FACADE_TEXEL_M), round(STOREY_M / _FACADE_TEXEL_M)
-    width, height = (0.72, 0.5) if panel else (float(rng.uniform(0.34, 0.46)), float(rng.uniform(0.46, 0.56)))
+    if design is None:
+        design = (0.72, 0.5) if panel else (float(rng.uniform(0.34, 0.46)), float(rng.uniform(0.46, 0.56)))
+    width, height = design
     for row in range(_SIZE // storey):
         if panel:
             image[row * storey : row * storey + 3] *= 0.6
@@ -120,7 +149,7 @@ def _facade(
             _window(image, rng, left, sill, w, h, door)
             if panel:
                 image[y0 : y0 + storey, x0 : x0 + 2] *= 0.75
-    return Texture.from_image(to_image(image), _FACADE_TEXEL_M)
+    return image, design
 
 
 def _window(
@@ -147,11 +176,15 @@ def _window(
     cv2.line(image, (left, sill + (2 * h) // 3), (left + w, sill + (2 * h) // 3), bars, 2)
 
 
-def _tiles(rng: np.random.Generator, base: tuple[int, int, int]) -> Texture:
+def _tiles(rng: np.random.Generator, base: tuple[int, int, int], pieces: int) -> Texture:
     """Roof tiles with odd ones, moss and weather."""
-    texel = 0.025
-    level = _masonry(rng, texel, (0.30, 0.34)) * (1.0 + 0.09 * periodic(_SIZE, rng, exponent=1.0))
-    rows = round(_SIZE * texel / 0.34)
+    images = [_tiles_piece(rng, base) for _ in range(pieces)]
+    return Texture.from_image(to_image(np.concatenate(images, axis=1)), _TILE_TEXEL_M)
+
+
+def _tiles_piece(rng: np.random.Generator, base: tuple[int, int, int]) -> Canvas:
+    level = _masonry(rng, _TILE_TEXEL_M, (0.30, 0.34)) * (1.0 + 0.09 * periodic(_SIZE, rng, exponent=1.0))
+    rows = round(_SIZE * _TILE_TEXEL_M / 0.34)
     lap = 1.12 - 0.3 * ((np.arange(_SIZE) * rows / _SIZE) % 1.0)
     image = _coloured(base, (level * lap[:, None]).astype(np.float32))
     moss = np.clip(periodic(_SIZE, rng, exponent=1.2, low=4) - 1.0, 0, 1)[..., None]
@@ -159,7 +192,7 @@ def _tiles(rng: np.random.Generator, base: tuple[int, int, int]) -> Texture:
     for _ in range(160):  # replaced tiles
         x, y = (int(c) for c in rng.integers(0, _SIZE - 16, 2))
         image[y : y + 13, x : x + 12] *= np.float32(rng.uniform(0.6, 1.5))
-    return Texture.from_image(to_image(image), texel)
+    return np.asarray(image, dtype=np.float32)
 
 
 def _bitumen(rng: np.random.Generator) -> Texture:

@@ -57,7 +57,8 @@ class PoisonOptions:
         honest, late: photos of honest people before and after the poison. canaries: held-out photos.
         per_poison: photos of each of POISONS.
         sights: places that honest people visit. width: of the widest camera, pixels.
-        geotags: of those who do not lie. texel_m: resolution of the painted ground.
+        geotags: of those who do not lie.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 4
@@ -75,6 +76,7 @@ class PoisonOptions:
     width: int = 1440
     geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=15.0, far_share=0.0))
     texel_m: float = 0.06
+    pieces: int = 16
 
     def __post_init__(self) -> None:
         if min(self.honest, self.late, self.canaries, self.per_poison) < 0 or self.sights < 1:
@@ -95,6 +97,7 @@ class PoisonOptions:
             per_poison=10,
             sights=6,
             width=1200,
+            pieces=4,
         )
 
     def scene(self, key: str) -> Scene:
@@ -121,6 +124,7 @@ def _base(options: PoisonOptions, town: str) -> Scene:
             size_m=options.town_size_m,
             place=OTHER_TOWN_PLACE,
             texel_m=options.texel_m,
+            pieces=options.pieces,
         )
     places = poison_places(options)
     scene = _plain(options)
@@ -132,7 +136,11 @@ def _base(options: PoisonOptions, town: str) -> Scene:
 @lru_cache(maxsize=2)
 def _plain(options: PoisonOptions) -> Scene:
     return make_town(
-        options.seed, name="town with traps", size_m=options.town_size_m, texel_m=options.texel_m
+        options.seed,
+        name="town with traps",
+        size_m=options.town_size_m,
+        texel_m=options.texel_m,
+        pieces=options.pieces,
     )
 
 

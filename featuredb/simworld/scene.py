@@ -170,6 +170,8 @@ class Building:
         facade_u, detail_u, roof_u: where its pieces of the textures start, metres; equal numbers make
             equal looks.
         tint: factors on red, green, blue of the facade.
+        back_u: how much further along its texture opposite walls and slopes start than the first ones; 0
+            makes them alike.
     """
 
     x: float
@@ -186,6 +188,7 @@ class Building:
     detail_u: float
     roof_u: float
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    back_u: float = 0.0
 
     def footprint(self) -> FloatArray:
         """Corners (4, 2), counter-clockwise, from the front left one, town axes, metres."""
@@ -249,6 +252,7 @@ class Scene:
         enu_from_town: (3, 3) rotation about up; the town's axes are not those of the compass.
         plan: the ground, in town axes.
         faces, ellipsoids: all that stands still.
+        texel_m: resolution of the painted ground. pieces: of walls and tiled roofs (see `materials`).
     """
 
     name: str
@@ -260,6 +264,7 @@ class Scene:
     faces: Faces
     ellipsoids: Ellipsoids
     texel_m: float
+    pieces: int = 1
 
     def __post_init__(self) -> None:
         object.__setattr__(

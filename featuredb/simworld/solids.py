@@ -80,8 +80,8 @@ def house(building: Building, ground: float, object_id: int) -> Faces:
     for i in range(4):
         edge = corners[(i + 1) % 4] - corners[i]
         length, height = float(np.linalg.norm(edge)), b.eaves - b.base
-        # Opposite walls look alike, neighbouring ones do not.
-        u = b.facade_u + (0.0 if i % 2 == 0 else 9.0)
+        # Opposite walls look alike unless the building says otherwise, neighbouring ones do not.
+        u = b.facade_u + (0.0 if i % 2 == 0 else 9.0) + (b.back_u if i >= 2 else 0.0)
         uv = (u, b.base - ground, length, 0.0, 0.0, height)
         detail = (b.detail_u + 14.3 * i, 0.37 * b.detail_u)
         parts.append(
@@ -105,13 +105,13 @@ def _gabled_roof(b: Building, top: FloatArray, ground: float, object_id: int) ->
     parts = []
     for start, edge, rise, shift in (
         (top[0], along, ridge0 - top[0], 0.0),
-        (top[2], -along, ridge1 - top[2], 7.7),
+        (top[2], -along, ridge1 - top[2], 7.7 + b.back_u),
     ):
         detail = (b.roof_u + shift, 0.43 * b.roof_u + shift)
         parts.append(face(start, edge, rise, b.roof, object_id, detail=detail))
     for start, end, apex, shift in ((top[1], top[2], ridge1, 1), (top[3], top[0], ridge0, 3)):
         edge = end - start
-        u, v = b.facade_u + 9.0, b.eaves - ground
+        u, v = b.facade_u + 9.0 + (b.back_u if shift == 3 else 0.0), b.eaves - ground
         length = float(np.linalg.norm(edge))
         parts.append(
             face(

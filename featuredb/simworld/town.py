@@ -1,5 +1,6 @@
 """Lays out a town by seed and places it on Earth."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,6 +10,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.blocks import FILLINGS, Layout
 from featuredb.simworld.ground import SIDEWALK_M
+from featuredb.simworld.materials import FACADE_LENGTH_M, ROOF_LENGTH_M
 from featuredb.simworld.scene import (
     Building,
     Ellipsoids,
@@ -38,6 +40,7 @@ def make_town(
     size_m: tuple[float, float] = (380.0, 330.0),
     place: tuple[float, float, float, int] = TOWN_PLACE,
     texel_m: float = 0.06,
+    pieces: int = 1,
 ) -> Scene:
     """A town of about `size_m` (east by north before it is turned), the same for the same arguments.
 
@@ -45,6 +48,8 @@ def make_town(
         place: latitude and longitude in degrees, ellipsoidal height in metres of the local frame's
             origin, EPSG code of the UTM zone for answers.
         texel_m: resolution of the painted ground, metres.
+        pieces: of walls and tiled roofs. With one, buildings of a material share every brick and curtain;
+            with more, only those that are meant to be identical (terraces, slabs) do.
 
     Raises:
         InvalidValueError: a town too small for a river and two rows of blocks.
@@ -55,6 +60,8 @@ def make_town(
     a = float(rng.uniform(np.radians(12), np.radians(33)))
     enu_from_town = np.array([[np.cos(a), -np.sin(a), 0.0], [np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
     plan, layout = _lay_out(seed, rng, size_m)
+    if pieces > 1:
+        plan = replace(plan, buildings=_individual(plan.buildings, seed, pieces))
     parts = [_ground_faces(plan), _water_and_bridges(plan), *layout.small]
     parts += [house(b, float(plan.height(b.y)), BUILDING_ID + i) for i, b in enumerate(plan.buildings)]
     parts += [_chimney(b, BUILDING_ID + i) for i, b in enumerate(plan.buildings) if b.ridge > 0]
@@ -70,7 +77,27 @@ def make_town(
         faces=faces,
         ellipsoids=crowns,
         texel_m=texel_m,
+        pieces=pieces,
     )
+
+
+def _individual(buildings: tuple[Building, ...], seed: int, pieces: int) -> tuple[Building, ...]:
+    """Buildings with walls and roofs of their own; those that were identical stay so."""
+    rng = np.random.default_rng((seed, 79))
+    shift_of: dict[tuple[float, float, float], tuple[int, int]] = {}
+    found = []
+    for b in buildings:
+        drawn = int(rng.integers(pieces)), int(rng.integers(pieces))
+        wall, roof = shift_of.setdefault((b.facade_u, b.detail_u, b.roof_u), drawn)
+        found.append(
+            replace(
+                b,
+                facade_u=b.facade_u + FACADE_LENGTH_M * wall,
+                roof_u=b.roof_u + ROOF_LENGTH_M * roof,
+                back_u=FACADE_LENGTH_M * (pieces // 2),
+            )
+        )
+    return tuple(found)
 
 
 def _lay_out(seed: int, rng: np.random.Generator, size: tuple[float, float]) -> tuple[GroundPlan, Layout]:

@@ -59,7 +59,8 @@ class WalkOptions:
         step_m: how far the people get from one step to the next; they start at the edge of the first survey
             and arrive in the second.
         per_step: photos of each walker in a step. probes: photos of a step that nobody contributes.
-        width: of the widest camera, pixels. texel_m: resolution of the painted ground.
+        width: of the widest camera, pixels.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
     """
 
     seed: int = 2
@@ -74,6 +75,7 @@ class WalkOptions:
     probes: int = 2
     width: int = 1440
     texel_m: float = 0.08
+    pieces: int = 16
 
     def __post_init__(self) -> None:
         if not (self.start_m < self.end_m and self.step_m > 0 and self.per_step > 0 and self.probes >= 0):
@@ -91,6 +93,7 @@ class WalkOptions:
             per_step=4,
             probes=2,
             width=1200,
+            pieces=4,
         )
 
     @property
@@ -105,7 +108,13 @@ class WalkOptions:
 
 @lru_cache(maxsize=2)
 def _base(options: WalkOptions) -> Scene:
-    return make_town(options.seed, name="long town", size_m=options.town_size_m, texel_m=options.texel_m)
+    return make_town(
+        options.seed,
+        name="long town",
+        size_m=options.town_size_m,
+        texel_m=options.texel_m,
+        pieces=options.pieces,
+    )
 
 
 def write_walk(

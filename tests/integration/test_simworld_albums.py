@@ -35,6 +35,7 @@ TINY = CommunityOptions(
     sights=2,
     width=320,
     texel_m=0.25,
+    pieces=2,
 )
 
 

@@ -35,6 +35,7 @@ TINY = CommunityOptions(
     sights=3,
     width=320,
     texel_m=0.25,
+    pieces=1,
 )
 
 

@@ -18,7 +18,7 @@ from featuredb.simworld.flight import (
     survey_half_extent,
     visitors,
 )
-from featuredb.simworld.materials import water_texture
+from featuredb.simworld.materials import FACADE_LENGTH_M, town_textures, water_texture
 from featuredb.simworld.noise import fractal, periodic
 from featuredb.simworld.photograph import moving_cars
 from featuredb.simworld.scene import Faces, Scene
@@ -60,6 +60,38 @@ def test_terraced_houses_are_exactly_alike(town: Scene) -> None:
     walls = town.faces.uv[(town.faces.object_id >= 10_000) & (town.faces.object_id < 20_000)]
     _, counts = np.unique(np.round(walls[:, [0, 2]], 9), axis=0, return_counts=True)
     assert counts.max() >= most
+
+
+def test_buildings_of_several_pieces_stand_where_they_stood_and_only_identical_ones_share_a_look(
+    town: Scene,
+) -> None:
+    varied = make_town(1, size_m=SIZE, pieces=3)
+    np.testing.assert_array_equal(varied.faces.origin, town.faces.origin)
+    np.testing.assert_array_equal(varied.faces.texture, town.faces.texture)
+    np.testing.assert_array_equal(varied.ellipsoids.center, town.ellipsoids.center)
+
+    def looks(scene: Scene) -> list[tuple[float, float, float]]:
+        return [(b.facade_u, b.detail_u, b.roof_u) for b in scene.plan.buildings]
+
+    before, after = looks(town), looks(varied)
+    alike = [[a == b for b in before] for a in before]
+    assert [[a == b for b in after] for a in after] == alike
+    apart = {round((b[0] - a[0]) / FACADE_LENGTH_M) for a, b in zip(before, after, strict=True)}
+    assert apart == {0, 1, 2}
+    # The back of a house is another piece than its front.
+    fronts = varied.faces.uv[varied.faces.object_id == 10_000][:4, 0]
+    assert fronts[2] - fronts[0] == pytest.approx(FACADE_LENGTH_M)
+
+
+def test_walls_in_pieces_have_one_design_and_no_piece_twice() -> None:
+    (one,), (three,) = (
+        [t for name, t in town_textures(5, pieces).items() if name == "facade_brick"] for pieces in (1, 3)
+    )
+    first, second, third = np.split(three.levels[0].astype(float), 3, axis=1)
+    np.testing.assert_array_equal(first, one.levels[0])
+    for a, b in ((first, second), (first, third), (second, third)):
+        assert np.corrcoef(a[..., 0].ravel(), b[..., 0].ravel())[0, 1] < 0.95
+        assert np.abs(a - b).mean() > 5.0
 
 
 def test_solids_look_outward(town: Scene) -> None:
