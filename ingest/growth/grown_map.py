@@ -85,16 +85,12 @@ def grow_component(
         return Refused(
             reason=placement.reason or "", message=placement.message, rows=rows, gates=placement.gates
         )
-    if needed and set(needed) <= set(placement.disagreeing):
-        return Refused(
-            reason="PHOTOS_DISAGREE",
-            message="the new photos contradict the placement that photos of existing maps give them",
-            rows=rows,
-            gates=placement.gates,
-        )
-    settled = settle(model, held, anchors, keypoints, lenses, options.placement, options.settle)
+    settled = settle(model, held, anchors, mine, keypoints, lenses, options.placement, options.settle)
     if isinstance(settled, Refused):
         return settled
+    if needed and not set(needed) & set(settled.model.rows.tolist()):
+        reason, message = settled.left_out[needed[0]]
+        return Refused(reason=reason, message=message, rows=rows, gates=settled.placement.gates)
     final, more = settled.placement, settled.evidence()
     grown = assemble(settled.model, final, held, photos, features_of, near, identity, options, more)
     if isinstance(grown, Refused):

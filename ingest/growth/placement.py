@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.index.area import Area
 from ingest.colmap_bridge import Model
@@ -42,11 +41,8 @@ class PlacementOptions:
     Attributes:
         fit: how the similarity is found.
         min_agreeing: photos; one alone proves nothing.
-        photo_sigmas: a photo agrees up to so many sigmas between its localised and its placed pose. The
-            sigmas are those of the localisation times the fit's spread and neighbours factor: poses from
-            the same map points share these points' errors.
         max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
-            above 0.95; a third wrong means that the model is bent, or the place repeats itself.
+            above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
         min_shared_points: distinct points of the parents; twice what a single pose needs.
         max_rim_sigma: at the rim of the model, over the viewing distance.
         max_residual: root mean square of centres, over the viewing distance. Models of few photos, bent
@@ -65,7 +61,6 @@ class PlacementOptions:
 
     fit: FitOptions = field(default_factory=FitOptions)
     min_agreeing: int = 2
-    photo_sigmas: float = 3.0
     max_disagreeing: float = 0.34
     min_shared_points: int = 30
     max_rim_sigma: float = 0.02
@@ -139,7 +134,6 @@ def place_by_maps(
         model, fit, agree, own, anchors, used, edges, photos, areas, frame, on_earth, ranked, options
     )
     refusal = gates.first_refusal(asked)
-    offsets = [_offset(model, fit.local_from_sfm, k, own[k])[3:] for k in sorted(agree)]
     placement = MapsPlacement(
         reason=refusal.reason if refusal else None,
         message=refusal.message if refusal else f"placed by {', '.join(e.map_id for e in edges)}",
@@ -150,7 +144,7 @@ def place_by_maps(
         agreeing=tuple(int(model.rows[k]) for k in sorted(agree)),
         disagreeing=tuple(int(model.rows[k]) for k in sorted(set(own) - agree)),
         edges=edges,
-        residual_rms_m=_rms(np.array(offsets).reshape(-1, 3)),
+        residual_rms_m=_rms(_center_offsets(model, fit.local_from_sfm, own, agree)),
         gates=asked,
     )
     return Held(placement=placement, anchors=anchors, fit=fit, used=used)
@@ -181,8 +175,8 @@ def _settled(
             return None
         fit = fit_similarity(model, sim, anchors, near, options.fit)
         sim = fit.local_from_sfm
-        by_pixels = agreeing_photos(fit.errors_px, tolerance, anchors, options.fit.least_share)
-        again = {int(k) for k in by_pixels if _chi_square(model, fit, int(k), own[int(k)]) <= _limit(options)}
+        agreed = agreeing_photos(fit.errors_px, tolerance, anchors, options.fit.least_share)
+        again = {int(k) for k in agreed} & own.keys()
         if not again:
             return None
         if again == chosen:
@@ -192,27 +186,13 @@ def _settled(
     return fit, chosen
 
 
-def _limit(options: PlacementOptions) -> float:
-    return gates.sigmas_limit(options.photo_sigmas, 6)
-
-
-def _offset(model: Model, sim: Sim3, k: int, photo: LocalisedPhoto) -> FloatArray:
-    """(6,) small rotation (rad) and displacement (m) from the placed to the localised pose, local axes."""
-    placed = sim.act_on_pose(model.cam_from_sfm[k])
-    turn = so3_log(photo.cam_from_local.rotation.T @ placed.rotation)
-    return np.concatenate([turn, photo.cam_from_local.center - placed.center])
-
-
-def _chi_square(model: Model, fit: Fit, k: int, photo: LocalisedPhoto) -> float:
-    """Squared Mahalanobis length of `_offset`; the localisation's sigma is diluted as in the fit."""
-    center = fit.local_from_sfm.act(model.cam_from_sfm[k].center)
-    by_placement = np.zeros((6, 7))
-    by_placement[:3, 1:4] = np.eye(3)
-    by_placement[3:] = point_jacobian(center)
-    dilution = max(fit.spread, 1.0) ** 2 * fit.neighbours_factor
-    spread = photo.covariance * dilution + by_placement @ fit.covariance @ by_placement.T
-    offset = _offset(model, fit.local_from_sfm, k, photo)
-    return float(offset @ np.linalg.solve(spread, offset))
+def _center_offsets(
+    model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]
+) -> FloatArray:
+    """(n, 3) metres, from the placed to the localised centres of the photos that agree."""
+    return np.array(
+        [own[k].cam_from_local.center - sim.act(model.cam_from_sfm[k].center) for k in sorted(agree)]
+    ).reshape(-1, 3)
 
 
 def _ask(
@@ -236,7 +216,6 @@ def _ask(
     reach = (
         float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
     )
-    offsets = np.array([_offset(model, sim, k, own[k])[3:] for k in sorted(agree)]).reshape(-1, 3)
     rim = np.concatenate([centers, sim.act(_corners(model.xyz))]) if len(model.xyz) else centers
     rivals = _rival_photos(model, sim, ranked, agree, reach, options)
     offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
@@ -245,7 +224,7 @@ def _ask(
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
         gates.spread(largest_sigma_m(fit.covariance, rim), reach, options.max_rim_sigma),
-        gates.residuals(_rms(offsets), reach, options.max_residual),
+        gates.residuals(_rms(_center_offsets(model, sim, own, agree)), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
         gates.visibility(

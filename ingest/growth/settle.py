@@ -1,7 +1,7 @@
 """Step: a placed reconstruction is refined, and photos that do not hold firmly enough are left out.
 
-Photos are left out that contradict the placement, that hang on the others by little, and that may be further
-off than allowed; the others are adjusted without them, and say anew how sure they are.
+Photos are left out that contradict the placement before or after, that hang on the others by little, and that
+may be further off than allowed; the others are adjusted without them, and say anew how sure they are.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,11 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_anchored import Anchored, FixedPoints
+from ingest.colmap_anchored import Anchored
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
+from ingest.growth.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.drift import (
     DriftOptions,
     bending_variance_m2,
@@ -28,10 +29,12 @@ from ingest.growth.parents import edges_of
 from ingest.growth.placement import Held, PlacementOptions
 from ingest.growth.refine import Lenses, RefineOptions, refine_with_maps
 from ingest.growth.similarity_fit import Fit, fit_similarity
-from ingest.growth.values import MapsPlacement, Refused
+from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
 
-# Reasons of photos that nothing holds well enough, and of those that hang on others by little.
-LOOSE, WEAK_LINK = "DRIFT_BUDGET", "WEAK_LINK"
+# Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
+# their own localisation has elsewhere.
+LOOSE, WEAK_LINK, CONTRADICTS = "DRIFT_BUDGET", "WEAK_LINK", "CONTRADICTS"
+_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +52,7 @@ class SettleOptions:
         max_photo_bound_m: photos that may be further off (95 %), against the existing points and with what
             their lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
         max_rounds: of leaving such photos out; the others are adjusted without them.
+        contradiction: when a photo's own localisation is elsewhere than the refined reconstruction has it.
         drift: how far the refined reconstruction may bend beyond what holds it.
     """
 
@@ -57,6 +61,7 @@ class SettleOptions:
     min_link: float = 0.08
     max_photo_bound_m: float = 0.5
     max_rounds: int = 4
+    contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
     drift: DriftOptions = field(default_factory=DriftOptions)
 
 
@@ -88,6 +93,7 @@ def settle(
     model: Model,
     held: Held,
     anchors: Anchors,
+    localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
     lenses: Lenses,
     placing: PlacementOptions,
@@ -96,15 +102,17 @@ def settle(
     """Refine an accepted placement with the existing points held fixed.
 
     Args:
+        localised: the model's photos that the existing maps localise, by row.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
-        placing: how the similarity was fitted.
+        placing: how the similarity was fitted, and when it is believed.
     """
     placement = held.placement
     assert placement.local_from_sfm is not None
     rows = tuple(int(r) for r in model.rows)
     outside = [rows.index(r) for r in placement.disagreeing]
     weak = weak_photos(model, outside, [rows.index(r) for r in placement.agreeing], options.min_link)
-    left_out = {rows[k]: (WEAK_LINK, message) for k, message in weak.items()}
+    left_out = dict.fromkeys(placement.disagreeing, (CONTRADICTS, _ELSEWHERE))
+    left_out |= {rows[k]: (WEAK_LINK, message) for k, message in weak.items()}
     outside += sorted(weak)
     for _ in range(options.max_rounds):
         good = anchors.take(np.flatnonzero(held.used & ~np.isin(anchors.photo_of, outside)))
@@ -123,45 +131,61 @@ def settle(
         spread = photo_covariances(
             adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, options.drift
         )
+        held_anchors = good.take(sharp)
+        fit = fit_similarity(adjusted.model, Sim3.identity(), held_anchors, adjusted.fixed_kept, placing.fit)
+        inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
+        against = contradicting_photos(adjusted.model, inside, spread, fit, options.contradiction)
         loose = {
             k: message
             for k, message in loose_photos(adjusted.model, spread, options.max_photo_bound_m).items()
-            if k not in outside
+            if k not in outside and k not in against
         }
+        left_out |= {rows[k]: (CONTRADICTS, message) for k, message in against.items()}
         left_out |= {rows[k]: (LOOSE, message) for k, message in loose.items()}
-        outside += sorted(loose)
-        if not loose or len(outside) > len(rows) - 2:
+        outside += sorted({**against, **loose})
+        if not (against or loose) or len(outside) > len(rows) - 2:
             break
     if loose:
         message = f"hardly a photo is held well enough: {next(iter(loose.values()))}"
         return _refused(LOOSE, message, rows, asked)
-    held_by = tuple(r for r in placement.agreeing if rows.index(r) not in outside)
-    gate = gates.agreeing_photos(len(held_by), placing.min_agreeing)
+    if against:
+        message = f"photos contradict the others again and again: {next(iter(against.values()))}"
+        return _refused(CONTRADICTS, message, rows, asked)
+    asked = _with_fit(asked, adjusted, held_anchors, fit, placing)
+    whole = with_existing(adjusted, fixed, held_anchors, asked.parents)
+    for k in sorted(set(range(len(rows))) - set(outside) - set(whole.photo_of.tolist())):
+        left_out[rows[k]] = LOOSE, "the photo shows nothing that another photo of the map shows as well"
+        outside.append(k)
+    asked = _agreeing_still(asked, outside, left_out, rows)
+    gate = gates.disagreeing_share(len(asked.agreeing), len(asked.disagreeing), placing.max_disagreeing)
+    if not gate.passes:
+        return _refused(gate.reason, f"once refined, {gate.message}", rows, asked)
+    gate = gates.agreeing_photos(len(asked.agreeing), placing.min_agreeing)
     if not gate.passes:  # those that agreed are among the photos that were left out
         return _refused(gate.reason, gate.message, rows, asked)
-    asked = replace(asked, agreeing=held_by)
-    return _settled(adjusted, fixed, good.take(sharp), spread, outside, left_out, asked, placing)
-
-
-def _settled(
-    adjusted: Anchored,
-    fixed: FixedPoints,
-    anchors: Anchors,
-    spread: FloatArray,
-    outside: Sequence[int],
-    left_out: Mapping[int, tuple[str, str]],
-    placement: MapsPlacement,
-    placing: PlacementOptions,
-) -> Settled:
-    placement, fit = _with_fit(placement, adjusted, anchors, placing)
     bending_m2 = bending_variance_m2(adjusted.model, fit.covariance, spread)
-    inside = [k for k in range(len(adjusted.model.rows)) if k not in outside]
+    kept = [k for k in range(len(rows)) if k not in outside]
     return Settled(
-        model=only_photos(with_existing(adjusted, fixed, anchors, placement.parents), inside),
-        placement=_widened(placement, bending_m2),
-        spread=spread[inside],
+        model=only_photos(whole, kept),
+        placement=_widened(asked, bending_m2),
+        spread=spread[kept],
         bending_m=float(np.sqrt(bending_m2)),
         left_out=left_out,
+    )
+
+
+def _agreeing_still(
+    placement: MapsPlacement,
+    outside: Sequence[int],
+    left_out: Mapping[int, tuple[str, str]],
+    rows: tuple[int, ...],
+) -> MapsPlacement:
+    """The placement with the photos that agree once it is refined, and with those that contradict it then."""
+    against = {r for r, (reason, _) in left_out.items() if reason == CONTRADICTS}
+    return replace(
+        placement,
+        agreeing=tuple(r for r in placement.agreeing if rows.index(r) not in outside),
+        disagreeing=tuple(sorted({*placement.disagreeing, *against})),
     )
 
 
@@ -170,28 +194,25 @@ def _refused(reason: str, message: str, rows: tuple[int, ...], placement: MapsPl
 
 
 def _with_fit(
-    placement: MapsPlacement, adjusted: Anchored, anchors: Anchors, options: PlacementOptions
-) -> tuple[MapsPlacement, Fit]:
-    """The placement with the covariances of the refined model, and their fit.
+    placement: MapsPlacement, adjusted: Anchored, anchors: Anchors, fit: Fit, options: PlacementOptions
+) -> MapsPlacement:
+    """The placement with the covariances of the refined model's fit.
 
     Until then the reconstruction was bent as it came, and its residuals said more of that than of where it
     lies. What photos lack beyond the similarity is added to it afterwards.
     """
-    model, used = adjusted.model, adjusted.fixed_kept
-    fit = fit_similarity(model, Sim3.identity(), anchors, used, options.fit)
-    edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
+    edges = edges_of(adjusted.model, fit, anchors, adjusted.fixed_kept, options.parents, options.fit)
     if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
         edges = placement.edges
     assert placement.covariance is not None
     assert placement.covariance_relative is not None
     on_earth = placement.covariance - placement.covariance_relative
-    settled = replace(
+    return replace(
         placement,
         edges=edges,
         covariance_relative=fit.covariance,
         covariance=fit.covariance + on_earth,
     )
-    return settled, fit
 
 
 def _widened(placement: MapsPlacement, bending_m2: float) -> MapsPlacement:

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.anchors import Anchors, find_anchors
@@ -17,8 +16,7 @@ from ingest.growth.similarity_fit import (
     neighbours_factor,
     tolerances_px,
 )
-from ingest.growth.values import LocalisedPhoto
-from reloc.result import LocaliseResult
+from tests.support.localised_photos import localised_photo
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import box_points, random_descriptors, ring
 
@@ -155,31 +153,15 @@ def test_anchors_are_carried_along_tracks() -> None:
     new, points = world(7)
     rows = np.arange(20)
     world_rows = new.world_of[0][rows]
-    photo = LocalisedPhoto(
-        row=0,
-        frame=LocalFrame(latitude_deg=49.0, longitude_deg=8.0, height_m=0.0),
-        cam_from_local=new.poses[0],
-        covariance=np.eye(6) * 1e-6,
+    photo = localised_photo(
+        0,
+        new.poses[0],
         camera=new.model.cameras[0],
         feature_rows=rows,
         pixels=new.features[0].features.xy[rows].astype(np.float64),
-        map_ids=("old",),
-        map_of=np.zeros(20, dtype=np.int64),
         point_of=world_rows,
         points=points[world_rows],
         point_covariance=np.tile(np.eye(3) * 1e-4, (20, 1, 1)),
-        by_prior=False,
-        result=LocaliseResult(
-            reason="TOO_FEW_MATCHES",
-            detail="made by hand",
-            pose=None,
-            confidence=0.0,
-            features=100,
-            matches=20,
-            inliers=20,
-            runner_up=None,
-            snapshot=0,
-        ),
     )
     anchors = find_anchors(new.model, {0: photo}, new.keypoints())
     assert (~anchors.carried).sum() == 20

@@ -1,0 +1,73 @@
+"""Step: do the photos' own localisations still fit the refined reconstruction, each by its own sigmas?
+
+Asked after the refinement, not before: as it comes, a reconstruction of a few photos is bent by more than
+localised poses are uncertain. Photos see the existing points within a pixel or two of where it has them and
+yet stand dozens of sigmas from it. Adjusted to the existing points it is bent no more, and what still
+differs contradicts.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_log
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.similarity_fit import Fit
+from ingest.growth.values import LocalisedPhoto
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContradictionOptions:
+    """When a photo contradicts.
+
+    Attributes:
+        sigmas: between its localised and its refined pose. They are those of the localisation, times the
+            spread and the neighbours factor of the similarity (poses from the same existing points share
+            the errors of these points), and those of the refined pose.
+    """
+
+    sigmas: float = 3.0
+
+
+def pose_offset(pose: Rigid3, photo: LocalisedPhoto) -> FloatArray:
+    """(6,) small rotation (rad) and displacement (m) from a pose to the localised one, local axes."""
+    turn = so3_log(photo.cam_from_local.rotation.T @ pose.rotation)
+    return np.concatenate([turn, photo.cam_from_local.center - pose.center])
+
+
+def contradicting_photos(
+    model: Model,
+    localised: Mapping[int, LocalisedPhoto],
+    spread: FloatArray,
+    fit: Fit,
+    options: ContradictionOptions,
+) -> dict[int, str]:
+    """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+
+    Args:
+        model: refined, in metres.
+        localised: by place in the model; others than those that agreed with the placement are not asked.
+        spread: (k, 6, 6) of `photo_covariances`; unknown ones (NaN) add nothing.
+        fit: of the refined model to the existing points.
+    """
+    limit = gates.sigmas_limit(options.sigmas, 6)
+    dilution = max(fit.spread, 1.0) ** 2 * fit.neighbours_factor
+    found: dict[int, str] = {}
+    for k, photo in sorted(localised.items()):
+        pose = model.cam_from_sfm[k]
+        offset = pose_offset(pose, photo)
+        into_local = block_diag(pose.rotation.T, pose.rotation.T)
+        own = into_local @ np.nan_to_num(spread[k]) @ into_local.T
+        square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
+        if square > limit:
+            found[k] = (
+                f"the photo by itself is {float(np.linalg.norm(offset[3:])):.2f} m and "
+                f"{float(np.degrees(np.linalg.norm(offset[:3]))):.2f} degrees from where the others put it, "
+                f"chi-square {square:.0f}, {limit:.0f} is allowed"
+            )
+    return found
