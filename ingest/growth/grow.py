@@ -103,6 +103,7 @@ class _Run:
     promotions: dict[str, Promotion] = field(default_factory=dict)
     replacements: list[Replacement] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
     lost: set[int] = field(default_factory=set)  # not localised in the last round
     fresh: set[str] = field(default_factory=set)  # promoted in the last round
     rounds: int = 0
@@ -277,6 +278,7 @@ def _promote(
         rows=[row for row in range(len(new.photos)) if row not in run.map_of],
         features_of=new.features_of,
         localised=localised,
+        heard=run.heard,
     )
     outcomes = promote_confirmed(
         database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m, work=work

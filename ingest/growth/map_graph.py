@@ -265,12 +265,17 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
     Args:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
+    return _SIGMAS_95 * rim_sigma_m(covariance_relative, places)
+
+
+def rim_sigma_m(covariance: FloatArray, places: FloatArray) -> float:
+    """Largest standard deviation at 99 % of the places (n, 3), metres, of a similarity (7, 7)."""
     if not len(places):
         return 0.0
     jacobian = point_jacobian(places)
-    spread = jacobian @ covariance_relative @ np.swapaxes(jacobian, -1, -2)
+    spread = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
     largest = np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)
-    return float(_SIGMAS_95 * np.sqrt(np.quantile(largest, _SHARE_OF_PLACES, method="higher")))
+    return float(np.sqrt(np.quantile(largest, _SHARE_OF_PLACES, method="higher")))
 
 
 def places_of(feature_map: FeatureMap) -> FloatArray:

@@ -110,13 +110,6 @@ def map_agreements(placement: MapsPlacement, held: Anchors) -> tuple[MapAgreemen
     return tuple(found)
 
 
-def largest_sigma_m(covariance: FloatArray, points: FloatArray) -> float:
-    """Largest standard deviation, over points (n, 3), of where a similarity of that covariance puts them."""
-    jacobian = point_jacobian(points)
-    spread = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
-    return float(np.sqrt(np.linalg.eigvalsh(spread)[:, -1].max()))
-
-
 def drift_covariance(parents: Sequence[tuple[FeatureMap, int]], frame: LocalFrame) -> FloatArray:
     """(7, 7) of the parents relative to their anchors, weighted by shared points; nothing for anchors.
 

@@ -18,7 +18,8 @@ from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.gates import Gate
-from ingest.growth.parents import ParentOptions, edges_of, largest_sigma_m, parents_covariance
+from ingest.growth.map_graph import rim_sigma_m
+from ingest.growth.parents import ParentOptions, edges_of, parents_covariance
 from ingest.growth.similarity_fit import (
     Fit,
     FitOptions,
@@ -216,14 +217,14 @@ def _ask(
     reach = (
         float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
     )
-    rim = np.concatenate([centers, sim.act(_corners(model.xyz))]) if len(model.xyz) else centers
+    rim = np.concatenate([centers, sim.act(model.xyz[:: max(1, len(model.xyz) // 2000)])])
     rivals = _rival_photos(model, sim, ranked, agree, reach, options)
     offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     return (
         gates.agreeing_photos(len(agree), options.min_agreeing),
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
-        gates.spread(largest_sigma_m(fit.covariance, rim), reach, options.max_rim_sigma),
+        gates.spread(rim_sigma_m(fit.covariance, rim), reach, options.max_rim_sigma),
         gates.residuals(_rms(_center_offsets(model, sim, own, agree)), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
@@ -299,14 +300,6 @@ def visible_parts(
             seen = held.pixels[held.photo_of == k]
             found.append(agreement(seen, expected, camera.width, camera.height))
     return np.array(found)
-
-
-def _corners(points: FloatArray) -> FloatArray:
-    """(8, 3) corners of the box that holds 98 % of the points along each axis."""
-    low, high = np.quantile(points, (0.01, 0.99), axis=0)
-    return np.array(
-        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    )
 
 
 def _rms(offsets: FloatArray) -> float:

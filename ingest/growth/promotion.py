@@ -174,7 +174,12 @@ def examine(
     """How far others confirm a map: by its own photos alone if they do, else with photos from outside."""
     confirmation = confirm(feature_map, options.confirmation)
     heard = hear_witnesses(
-        feature_map, _others(feature_map.map_id, snapshot), new, options.confirmation, options.witnesses
+        feature_map,
+        _others(feature_map.map_id, snapshot),
+        new,
+        options.confirmation,
+        options.witnesses,
+        write_id=snapshot.get(feature_map.map_id).write_id,
     )
     if not confirmation.confirmed_by_others:
         confirmation = confirm(feature_map, options.confirmation, heard.witnesses)

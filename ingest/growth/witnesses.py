@@ -45,12 +45,15 @@ class NewPhotos:
     Attributes:
         rows: of `photos` that may be asked.
         localised: those that the active maps localise, by row.
+        heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
+            map is examined again whenever another one changes, and its own photos are the same.
     """
 
     photos: Sequence[Photo]
     rows: Sequence[int]
     features_of: FeaturesOf
     localised: dict[int, LocalisedPhoto]
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,11 +70,14 @@ def hear_witnesses(
     new: NewPhotos | None,
     by: ConfirmationOptions,
     options: WitnessOptions | None = None,
+    *,
+    write_id: str,
 ) -> Heard:
     """Localise photos of sources that are not the map's own in the map alone.
 
     Args:
         others: maps around it, active or quarantined.
+        write_id: of the map as it is.
     """
     options = options or WitnessOptions()
     area = build_area([feature_map])
@@ -93,7 +99,7 @@ def hear_witnesses(
         what = f"{image.name} of map {other.map_id}"
         _sort_in(found, source_of(image, other.camera_keys), what, apart, spread, options, witnesses, against)
     if new is not None:
-        _hear_new(feature_map, indexed, new, own, names, by, options, witnesses, against)
+        _hear_new(feature_map, write_id, indexed, new, own, names, by, options, witnesses, against)
     return Heard(witnesses=tuple(witnesses), contradictions=tuple(against))
 
 
@@ -105,6 +111,7 @@ def source_of_photo(photo: Photo) -> Source:
 
 def _hear_new(
     feature_map: FeatureMap,
+    write_id: str,
     indexed: IndexedArea,
     new: NewPhotos,
     own: set[Source],
@@ -119,8 +126,11 @@ def _hear_new(
         source = source_of_photo(photo)
         if photo.sha256 in names or not any(independent(source, s, by.independent_by) for s in own):
             continue
-        found = localise_photo(photo, row, new.features_of(row).features, [indexed], options.localise)
-        if not isinstance(found, LocalisedPhoto):
+        if (write_id, row) not in new.heard:
+            said = localise_photo(photo, row, new.features_of(row).features, [indexed], options.localise)
+            new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
+        found = new.heard[write_id, row]
+        if found is None:
             continue
         found = in_frame(found, feature_map.frame)
         apart, spread = 0.0, _spread(found)
