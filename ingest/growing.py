@@ -30,7 +30,8 @@ class GrowingOptions:
     Attributes:
         growth: from reconstructions to promoted maps.
         making: from photos to reconstructions; whether descriptors are upright follows the active maps.
-        workers: processes of extraction, matching and reconstruction; 1 runs everything in this process.
+        workers: processes of extraction, matching and reconstruction, threads of localisation; 1 runs
+            everything in one thread of this process.
         work: work folder; default inside the database.
         give_up_days: photos that have waited so long without any use are refused: each run tries all that
             wait. Their owner, or `featuredb candidates`, can open them again.
@@ -69,7 +70,7 @@ def grow_candidates(
     else:
         with PoolExecutor(options.workers) as pool:
             new, unreadable = _prepared(database, waiting, work, options, pool, progress)
-    report = grow(database, new, work, options.growth)
+    report = grow(database, new, work, options.growth.with_threads(options.workers))
     refused = _refuse(database, {**waiting.unusable, **unreadable}, report, now, options)
     left = len(waiting.photos) - len(photos)
     notes = (*report.notes, *((f"{left} photos wait for the next run",) if left else ()))

@@ -8,7 +8,7 @@ from featuredb.geometry.arrays import FloatArray
 
 
 def use_threads(count: int) -> None:
-    """Cap the threads of FAISS in this process."""
+    """Cap the threads of FAISS in what the calling thread does."""
     faiss.omp_set_num_threads(count)
 
 

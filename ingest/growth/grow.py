@@ -59,6 +59,13 @@ class GrowthOptions:
     promotion: PromotionOptions = field(default_factory=PromotionOptions)
     replacing: ReplaceOptions = field(default_factory=ReplaceOptions)
 
+    def with_threads(self, threads: int) -> "GrowthOptions":
+        """The same with so many photos localised at a time."""
+        localise = replace(self.localise, threads=threads)
+        witnesses = self.promotion.witnesses
+        witnesses = replace(witnesses, localise=replace(witnesses.localise, threads=threads))
+        return replace(self, localise=localise, promotion=replace(self.promotion, witnesses=witnesses))
+
     def with_budget(self) -> "GrowthOptions":
         """The same where no photo of a map may be further off than the budget either."""
         growing = self.grow.grow

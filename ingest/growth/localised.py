@@ -1,7 +1,8 @@
 """Step: every new photo is localised by the existing maps, by itself."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
+from featuredb.index.codebook import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
@@ -37,12 +39,15 @@ class LocaliseEachOptions:
             of the positions of community photos are wrong by kilometres.
         least_inliers_of_map: a map counts among a photo's maps from so many inliers on; the number that a
             pose itself needs at least.
+        threads: photos that are localised at a time; the work is done outside of Python's lock, two threads
+            take half the time. Results are the same.
     """
 
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)
     max_features: int = 4000
     retry_without_geotag: bool = True
     least_inliers_of_map: int = 15
+    threads: int = 1
 
 
 def localise_photos(
@@ -64,14 +69,32 @@ def localise_photos(
     options = options or LocaliseEachOptions()
     found: dict[int, LocalisedPhoto] = {}
     reasons: dict[int, str] = {}
-    for row in rows:
-        outcome = localise_photo(photos[row], row, features_of(row).features, areas, options)
+    for row, outcome in localise_each(photos, rows, features_of, areas, options):
         if isinstance(outcome, LocalisedPhoto):
             found[row] = outcome
         else:
             reasons[row] = outcome
     _LOG.info("%d of %d photos localised in %d areas", len(found), len(rows), len(areas))
     return found, reasons
+
+
+def localise_each(
+    photos: Sequence[Photo],
+    rows: Sequence[int],
+    features_of: FeaturesOf,
+    areas: Sequence[IndexedArea],
+    options: LocaliseEachOptions,
+) -> Iterator[tuple[int, LocalisedPhoto | str]]:
+    """Each row with what `localise_photo` says of it, in their order."""
+
+    def one(row: int) -> tuple[int, LocalisedPhoto | str]:
+        return row, localise_photo(photos[row], row, features_of(row).features, areas, options)
+
+    if options.threads <= 1 or len(rows) < 2:
+        yield from map(one, rows)
+        return
+    with ThreadPoolExecutor(options.threads, initializer=use_threads, initargs=(1,)) as pool:
+        yield from pool.map(one, rows)
 
 
 def localise_photo(

@@ -11,7 +11,7 @@ from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.canaries import features_and_points
 from ingest.growth.confirmation import ConfirmationOptions, Source, Witness, independent, source_of
-from ingest.growth.localised import LocaliseEachOptions, in_frame, localise_photo
+from ingest.growth.localised import LocaliseEachOptions, in_frame, localise_each
 from ingest.growth.overlaps import localise_image
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
@@ -121,14 +121,16 @@ def _hear_new(
     witnesses: list[Witness],
     against: list[str],
 ) -> None:
-    for row in new.rows:
-        photo = new.photos[row]
-        source = source_of_photo(photo)
-        if photo.sha256 in names or not any(independent(source, s, by.independent_by) for s in own):
-            continue
-        if (write_id, row) not in new.heard:
-            said = localise_photo(photo, row, new.features_of(row).features, [indexed], options.localise)
-            new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
+    sources = {row: source_of_photo(new.photos[row]) for row in new.rows}
+    asked = [
+        row
+        for row, source in sources.items()
+        if new.photos[row].sha256 not in names and any(independent(source, s, by.independent_by) for s in own)
+    ]
+    unheard = [row for row in asked if (write_id, row) not in new.heard]
+    for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], options.localise):
+        new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
+    for row in asked:
         found = new.heard[write_id, row]
         if found is None:
             continue
@@ -138,7 +140,7 @@ def _hear_new(
             there = in_frame(new.localised[row], feature_map.frame)
             apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
             spread += _spread(there)
-        _sort_in(found, source, photo.name, apart, spread, options, witnesses, against)
+        _sort_in(found, sources[row], new.photos[row].name, apart, spread, options, witnesses, against)
 
 
 def _sort_in(

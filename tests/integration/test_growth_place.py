@@ -13,10 +13,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
+from ingest.growth.confirmation import ConfirmationOptions
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.localised import LocaliseEachOptions, localise_photos, with_lens
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
+from ingest.growth.witnesses import NewPhotos as WitnessPhotos
+from ingest.growth.witnesses import hear_witnesses
 from reloc.candidates import IndexedArea
 from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
 from tests.support.scenes import (
@@ -79,6 +82,33 @@ def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
     found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
     assert not reasons
     return found
+
+
+def test_two_threads_localise_as_one_does(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    options = LocaliseEachOptions(threads=2)
+    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], options)
+    assert not reasons
+    assert list(again) == list(localised)
+    for row, photo in localised.items():
+        np.testing.assert_array_equal(again[row].feature_rows, photo.feature_rows)
+        np.testing.assert_array_equal(again[row].covariance, photo.covariance)
+
+
+def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
+    """Photos of an owner of their own see the map; the second time the answers are those of the first."""
+    photos = [replace(photo, owner="somebody") for photo in new.photos]
+    asked = WitnessPhotos(photos=photos, rows=range(len(photos)), features_of=new.features_of, localised={})
+    here = existing()
+    here = replace(here, images=tuple(replace(image, owner="keeper") for image in here.images))
+    first = hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1")
+    assert {w.name for w in first.witnesses} == {photo.name for photo in photos}
+    assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
+    asked.heard.update(dict.fromkeys(asked.heard, None))
+    assert not hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1").witnesses
+    # Written anew, the map may show something else.
+    assert hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w2").witnesses
 
 
 def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
