@@ -1,0 +1,54 @@
+"""Which photos of a map that has drifted too far are within the budget by themselves."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import GROWTH
+from ingest.growth.budget import drift_gate, rows_within
+from tests.support.scenes import box_points, random_descriptors, ring, scene_map
+
+RNG = np.random.default_rng(4)
+POINTS = box_points(RNG, 300)
+BUDGET_M, BENDING_M = 0.5, 0.3  # 1.96 sigmas of the bending are beyond the budget
+
+
+def bent(own_sigma_m: list[float | None]) -> FeatureMap:
+    """A map whose images know so much of their own centres; its bending is that of the worst."""
+    plain = scene_map(
+        points=POINTS, descriptors=random_descriptors(RNG, 300), poses=ring(len(own_sigma_m)), map_id="bent"
+    )
+    images = tuple(
+        image if sigma is None else replace(image, covariance=np.diag([1e-8] * 3 + [sigma**2] * 3))
+        for image, sigma in zip(plain.images, own_sigma_m, strict=True)
+    )
+    evidence = {GROWTH: {"bending_m": BENDING_M}}
+    return replace(plain, images=images, placement=replace(plain.placement, evidence=evidence))
+
+
+def relative(sigma_m: float) -> FloatArray:
+    """Covariance relative to the anchors: a shift of that sigma, and the bending."""
+    return np.diag([0.0] * 4 + [sigma_m**2 + BENDING_M**2] * 3)
+
+
+def test_photos_are_judged_by_their_own_bending() -> None:
+    feature_map = bent([0.02, 0.05, 0.29, 0.1])
+    assert rows_within(feature_map, [7, 3, 9, 4], relative(0.05), BUDGET_M) == [7, 3, 4]
+
+
+def test_photos_that_know_nothing_of_themselves_bend_as_the_worst() -> None:
+    assert rows_within(bent([None, 0.02]), [0, 1], relative(0.05), BUDGET_M) == [1]
+
+
+def test_where_the_map_as_a_whole_has_drifted_no_photo_is_within() -> None:
+    assert rows_within(bent([0.01, 0.01]), [0, 1], relative(0.3), BUDGET_M) == []
+
+
+@pytest.mark.parametrize(("drift_m", "passes"), [(0.5, True), (0.51, False)])
+def test_the_gate_of_drift(drift_m: float, passes: bool) -> None:
+    gate = drift_gate(drift_m, BUDGET_M)
+    assert gate.passes == passes
+    assert f"{drift_m:.2f} m" in gate.message
