@@ -16,7 +16,13 @@ from ingest.colmap_anchored import with_observations
 from ingest.growth.confirmation import ConfirmationOptions
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
-from ingest.growth.localised import LocaliseEachOptions, localise_photos, with_lens
+from ingest.growth.localised import (
+    LocaliseEachOptions,
+    localise_photo,
+    localise_photos,
+    share_shown,
+    with_lens,
+)
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.growth.witnesses import NewPhotos as WitnessPhotos
 from ingest.growth.witnesses import hear_witnesses
@@ -264,6 +270,25 @@ def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> Non
         assert grown.reason == "CONTRADICTS_GPS"
     else:
         assert isinstance(grown, GrownMap), grown
+
+
+def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
+    """A third of what the map shows is enough for a pose; not against the photo's own position."""
+    pose = walk(1)[0]
+
+    def found_by(gps: GeoPrior | None) -> LocalisedPhoto | str:
+        new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [pose], camera_key=KEY, gps=[gps])
+        features = new.features_of(0).features
+        shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
+        return localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
+
+    for gps in (None, prior(pose, (2.0, 1.0))):
+        there = found_by(gps)
+        assert isinstance(there, LocalisedPhoto), there
+        assert 0.2 < share_shown(there, area.area) < 0.7
+    away = found_by(prior(pose, (150.0, 0.0)))
+    assert isinstance(away, str)
+    assert away.startswith("CONTRADICTS_GEOTAG")
 
 
 def test_photos_blind_for_what_they_should_show(
