@@ -10,6 +10,7 @@ reconstructions.
 
 import copy
 import logging
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -114,7 +115,8 @@ def adjust_posed(
     enough points are no longer registered.
 
     Returns:
-        Rows of the registered photos.
+        Rows of the registered photos; none, and no files, where poses and matches have nothing to do with
+        each other.
     """
     with quiet():
         reconstruction = pycolmap.Reconstruction(str(folder))
@@ -123,6 +125,9 @@ def adjust_posed(
             reconstruction = _triangulated_anew(reconstruction, database, folder)
             reconstruction = _adjusted(reconstruction, folder, database, known, loss_scale_px, step)
             _filter(reconstruction, loss_scale_px)
+            if reconstruction.num_reg_images() < 2:
+                shutil.rmtree(folder)
+                return []
         reconstruction.write(str(folder))
     return sorted(image_id - 1 for image_id in reconstruction.reg_image_ids())
 

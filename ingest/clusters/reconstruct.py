@@ -1,7 +1,9 @@
 """Stage: structure from motion of clusters. Blocks are tasks, joining a cluster's blocks is one more."""
 
 import logging
+import shutil
 import tempfile
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import Block, Cluster
 from ingest.clusters.join import Joined, JoinOptions, join
 from ingest.colmap_adjust import adjust_posed
@@ -30,6 +33,7 @@ from ingest.sfm import (
 from ingest.workspace import Workspace, atomic_folder
 
 _LOG = logging.getLogger(__name__)
+_MOSTLY = 0.5  # of joined photos; right joints lose single ones
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -247,7 +251,11 @@ def _reconstruct_block(task: _BlockTask) -> None:
 
 
 def _join_blocks(task: _JoinTask) -> None:
-    """Join the models of a cluster's blocks and adjust each of what comes of it."""
+    """Join the models of a cluster's blocks and adjust each of what comes of it.
+
+    Where most photos of joined models no longer fit their matches, the joint was wrong (look-alikes): each
+    model is adjusted by itself.
+    """
     if task.folder.is_dir():
         return
     models, own = _block_models(task)
@@ -260,12 +268,16 @@ def _join_blocks(task: _JoinTask) -> None:
         database = Path(scratch) / "colmap.db"
         photos = task.sfm.write_database(database)
         taken: set[int] = set()
-        for number, group in enumerate(join(models, task.options)):
+        groups = deque(join(models, task.options))
+        number = 0
+        while groups:
+            group = groups.popleft()
             poses = {r: p for r, p in _poses(group, models, own).items() if r not in taken}
             if len(poses) < task.sfm.options.min_model_photos:
                 continue
             folder = output / str(number)
             folder.mkdir()
+            number += 1
             write_posed(folder, _cameras(group, models, task.sfm), photos, poses)
             kept = adjust_posed(
                 folder,
@@ -274,6 +286,13 @@ def _join_blocks(task: _JoinTask) -> None:
                 loss_scale_px(task.sfm),
                 adjust_options(task.sfm.options),
             )
+            if len(group.members) > 1 and len(kept) < _MOSTLY * len(poses):
+                _LOG.info("%s: %d of %d photos fit the joint; apart again", task, len(kept), len(poses))
+                shutil.rmtree(folder, ignore_errors=True)
+                groups.extendleft(
+                    Joined(members=(m,), first_from=(Sim3.identity(),)) for m in reversed(group.members)
+                )
+                continue
             taken |= {int(row) for row in kept}
 
 

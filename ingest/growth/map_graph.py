@@ -265,17 +265,19 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
     Args:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
-    return _SIGMAS_95 * rim_sigma_m(covariance_relative, places)
+    return _SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
 
 
-def rim_sigma_m(covariance: FloatArray, places: FloatArray) -> float:
-    """Largest standard deviation at 99 % of the places (n, 3), metres, of a similarity (7, 7)."""
-    if not len(places):
-        return 0.0
+def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
+    """(n,) largest standard deviation of each of the places (n, 3) under a similarity (7, 7), metres."""
     jacobian = point_jacobian(places)
     spread = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
-    largest = np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)
-    return float(np.sqrt(np.quantile(largest, _SHARE_OF_PLACES, method="higher")))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)))
+
+
+def at_most_places(values: FloatArray) -> float:
+    """The largest of the values (n,), one hundredth of them left out; 0 for none."""
+    return float(np.quantile(values, _SHARE_OF_PLACES, method="higher")) if len(values) else 0.0
 
 
 def places_of(feature_map: FeatureMap) -> FloatArray:

@@ -18,7 +18,7 @@ from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.gates import Gate
-from ingest.growth.map_graph import rim_sigma_m
+from ingest.growth.map_graph import at_most_places, place_sigmas_m
 from ingest.growth.parents import ParentOptions, edges_of, parents_covariance
 from ingest.growth.similarity_fit import (
     Fit,
@@ -45,7 +45,7 @@ class PlacementOptions:
         max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
             above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
         min_shared_points: distinct points of the parents; twice what a single pose needs.
-        max_rim_sigma: at the rim of the model, over the viewing distance.
+        max_rim_sigma: at the rim of the model, over the viewing distance; further off, over the distance.
         max_residual: root mean square of centres, over the viewing distance. Models of few photos, bent
             and with a lens not their own, reached 0.4 %; a placement by a look-alike place shows in pixels
             long before.
@@ -217,14 +217,13 @@ def _ask(
     reach = (
         float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
     )
-    rim = np.concatenate([centers, sim.act(model.xyz[:: max(1, len(model.xyz) // 2000)])])
     rivals = _rival_photos(model, sim, ranked, agree, reach, options)
     offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     return (
         gates.agreeing_photos(len(agree), options.min_agreeing),
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
-        gates.spread(rim_sigma_m(fit.covariance, rim), reach, options.max_rim_sigma),
+        gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
         gates.residuals(_rms(_center_offsets(model, sim, own, agree)), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
@@ -232,6 +231,18 @@ def _ask(
             visible_parts(model, sim, held, areas, frame, options), options.min_visible, options.max_blind
         ),
     )
+
+
+def _rim_sigma_m(model: Model, fit: Fit, reach_m: float) -> float:
+    """How well the model's points and cameras are held; what lies further off than the reach, as seen there.
+
+    A tower on the horizon may be off by its share of its distance, as a house is by that of its own.
+    """
+    sim = fit.local_from_sfm
+    centers, points = sim.act(model.centers()), sim.act(model.xyz[:: max(1, len(model.xyz) // 2000)])
+    away = np.linalg.norm(points - centers.mean(axis=0), axis=1)
+    at_reach = place_sigmas_m(fit.covariance, points) * np.minimum(1.0, reach_m / np.maximum(away, 1e-9))
+    return at_most_places(np.concatenate([place_sigmas_m(fit.covariance, centers), at_reach]))
 
 
 def _rival_photos(
