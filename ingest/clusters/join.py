@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
@@ -250,3 +252,19 @@ def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[Joined]:
         )
         left = [k for k in left if k not in ways]
     return sorted(groups, key=lambda g: -sum(len(models[k].rows) for k in g.members))
+
+
+def hangs_together(model: Model, parts: Sequence[Sequence[int]], least_points: int) -> bool:
+    """Whether chains of photos with so many points in common tie most photos of each part to one whole.
+
+    Args:
+        model: of all of them. parts: rows of the models that were joined; others do not count.
+    """
+    sees = csr_array(
+        (np.ones(len(model.point_of)), (model.photo_of, model.point_of)),
+        shape=(len(model.rows), max(len(model.xyz), 1)),
+    )
+    tied = ((sees @ sees.T) >= least_points).astype(np.int8)
+    _, label = connected_components(tied, directed=False)
+    whole = label == np.bincount(label).argmax()
+    return all(float(whole[here].mean()) > 0.5 for part in parts if (here := np.isin(model.rows, part)).any())

@@ -15,9 +15,9 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import Block, Cluster
-from ingest.clusters.join import Joined, JoinOptions, join
+from ingest.clusters.join import Joined, JoinOptions, hangs_together, join
 from ingest.colmap_adjust import adjust_posed
-from ingest.colmap_bridge import Model, read_models, write_posed
+from ingest.colmap_bridge import Model, read_model, read_models, write_posed
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.pairs import Pair
@@ -253,8 +253,8 @@ def _reconstruct_block(task: _BlockTask) -> None:
 def _join_blocks(task: _JoinTask) -> None:
     """Join the models of a cluster's blocks and adjust each of what comes of it.
 
-    Where most photos of joined models no longer fit their matches, the joint was wrong (look-alikes): each
-    model is adjusted by itself.
+    Where joined models have no points in common once these are triangulated from all matches, or most of the
+    photos no longer fit theirs, the joint was wrong (look-alikes): each model is adjusted by itself.
     """
     if task.folder.is_dir():
         return
@@ -286,8 +286,15 @@ def _join_blocks(task: _JoinTask) -> None:
                 loss_scale_px(task.sfm),
                 adjust_options(task.sfm.options),
             )
-            if len(group.members) > 1 and len(kept) < _MOSTLY * len(poses):
-                _LOG.info("%s: %d of %d photos fit the joint; apart again", task, len(kept), len(poses))
+            if len(group.members) > 1 and (
+                len(kept) < _MOSTLY * len(poses)
+                or not hangs_together(
+                    read_model(folder),
+                    [models[m].rows.tolist() for m in group.members],
+                    task.options.min_points,
+                )
+            ):
+                _LOG.info("%s: the joint of %d photos does not hold; apart again", task, len(poses))
                 shutil.rmtree(folder, ignore_errors=True)
                 groups.extendleft(
                     Joined(members=(m,), first_from=(Sim3.identity(),)) for m in reversed(group.members)

@@ -3,7 +3,7 @@
 import csv
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 from featuredb.features.extractor import ExtractorOptions
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
+from ingest.clusters import reconstruct
 from ingest.clusters.graph import ClusterOptions
+from ingest.clusters.join import Joined, JoinOptions
+from ingest.colmap_bridge import Model
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from ingest.report import IngestReport
@@ -69,6 +73,30 @@ def test_blocks_are_joined_into_one_map_that_agrees_with_the_truth(
         assert cam_from_frame.angle_to_deg(poses[image.name]) < 0.1
     # Tracks run across the seams.
     assert feature_map.points.track_length.max() >= 9
+
+
+def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
+    hills: tuple[Path, list[HillPhoto]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks laid on top of each other at random: no match fits, yet no block is lost for it."""
+
+    def at_random(models: Sequence[Model], options: JoinOptions) -> list[Joined]:
+        rng = np.random.default_rng(1)
+        turned = [Sim3.exp(np.append(rng.normal(0, 1, 4), rng.normal(0, 5, 3))) for _ in models]
+        return [Joined(members=tuple(range(len(models))), first_from=tuple(turned))]
+
+    monkeypatch.setattr(reconstruct, "join", at_random)
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, hills[0], _OPTIONS)
+    poses = {photo.name: photo.cam_from_local for photo in hills[1]}
+    snapshot = database.snapshot()
+    maps = [snapshot.load_map(m.map_id) for m in snapshot.maps()]
+    assert len(maps) >= 2, [(m.status, m.reason) for m in report.maps]
+    assert report.count("registered") >= 16
+    for feature_map in maps:
+        for image in feature_map.images:
+            cam_from_frame = image.cam_from_local @ FRAME.enu_from(feature_map.frame).inverse()
+            assert np.linalg.norm(cam_from_frame.center - poses[image.name].center) < 0.2
 
 
 def test_the_pool_gives_the_same_map(

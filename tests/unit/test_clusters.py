@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import ClusterOptions, Graph, find_clusters
-from ingest.clusters.join import JoinOptions, common_points, join
+from ingest.clusters.join import JoinOptions, common_points, hangs_together, join
 from ingest.colmap_bridge import Model
 from ingest.pairs import Pair
 from tests.support.planar_map import CAMERA
+from tests.support.posed_models import model_of
 
 
 def _grid(columns: int, rows: int, start: int = 0) -> dict[Pair, int]:
@@ -181,3 +182,15 @@ def test_a_joint_that_contradicts_the_others_breaks_the_weakest() -> None:
     groups = join(models, JoinOptions())
     # Two of the three joints hold, or fewer: never all three models in one frame by contradicting joints.
     assert len(groups) == 2
+
+
+def test_joined_models_hang_together_by_points_in_common() -> None:
+    first, second = range(100), range(1000, 1100)
+    apart = model_of(first, first, second, second)
+    assert not hangs_together(apart, [[0, 1], [2, 3]], 30)
+    tied = model_of(first, range(60, 130), range(90, 1050), second)
+    assert hangs_together(tied, [[0, 1], [2, 3]], 30)
+    assert not hangs_together(tied, [[0, 1], [2, 3]], 51)
+    # A single photo that is hardly tied does not make a joint wrong.
+    loose = model_of(first, first, first, first, range(95, 105))
+    assert hangs_together(loose, [[0, 1], [2, 3, 4]], 30)
