@@ -36,6 +36,7 @@ _MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the 
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
 _MAX_ERROR_OVER_SCALE = 8.0
 _MIN_ANGLE_DEG = 1.5
+_FOCAL_OVER_SIDE, _MAX_DISTORTION = (0.1, 10.0), 1.0  # COLMAP's own for bogus lenses
 _MIN_OBSERVATIONS = 15
 
 
@@ -102,6 +103,7 @@ def adjust_models(
         with quiet():
             reconstruction = pycolmap.Reconstruction(str(folder))
             adjusted = _adjusted(reconstruction, folder, database, known, loss_scale_px, options)
+            _drop_bogus_lenses(adjusted)
             adjusted.write(str(folder))
 
 
@@ -132,8 +134,20 @@ def adjust_posed(
     return sorted(image_id - 1 for image_id in reconstruction.reg_image_ids())
 
 
+def _drop_bogus_lenses(reconstruction: Any) -> None:
+    """Photos whose lens is none are no longer registered.
+
+    Photos of nothing common, or of one flat thing, say nothing of a focal length that nobody knows: it runs
+    away, to 10^7 pixels in the simulated community.
+    """
+    manager = pycolmap.ObservationManager(reconstruction)
+    for frame_id in manager.filter_frames(*_FOCAL_OVER_SIDE, _MAX_DISTORTION, 0):
+        manager.deregister_frame(frame_id)
+
+
 def _filter(reconstruction: Any, loss_scale_px: float) -> None:
-    """Observations that do not fit go, then photos that are left with too few."""
+    """Observations that do not fit go, then photos that are left with too few, or without a lens."""
+    _drop_bogus_lenses(reconstruction)
     manager = pycolmap.ObservationManager(reconstruction)
     manager.filter_all_points3D(_MAX_ERROR_OVER_SCALE * loss_scale_px, _MIN_ANGLE_DEG)
     for frame_id in sorted(reconstruction.reg_frame_ids()):

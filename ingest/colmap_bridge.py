@@ -3,6 +3,7 @@
 In come photos as values, out go reconstructions as plain arrays.
 """
 
+import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
@@ -13,9 +14,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,8 +243,13 @@ def write_posed(
 
 
 def read_models(output: Path) -> list[Model]:
-    """The models of a finished mapping, largest first, ties by first photo."""
-    models = [read_model(folder) for folder in sorted(output.iterdir()) if folder.is_dir()]
+    """The models of a finished mapping, largest first, ties by first photo, without those with no lens."""
+    models = []
+    for folder in sorted(f for f in output.iterdir() if f.is_dir()):
+        try:
+            models.append(read_model(folder))
+        except InvalidValueError as error:
+            _LOG.warning("%s is left out: %s", folder, error)
     return sorted(models, key=lambda m: (-len(m.rows), m.rows.tolist()))
 
 
