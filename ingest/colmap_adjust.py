@@ -351,7 +351,10 @@ def _residuals(reconstruction: Any) -> FloatArray:
 
 
 def _residuals_by_image(reconstruction: Any) -> Iterator[tuple[int, FloatArray, FloatArray]]:
-    """Image id, pixels (k, 2) and residuals (k, 2) of every registered image that sees points."""
+    """Image id, pixels (k, 2) and residuals (k, 2) of every registered image that sees points.
+
+    A point that the camera cannot see (behind it, or beyond what its lens can bend) is a picture off.
+    """
     for image_id in sorted(reconstruction.reg_image_ids()):
         image = reconstruction.image(image_id)
         seen = [p for p in image.points2D if p.has_point3D()]
@@ -362,4 +365,6 @@ def _residuals_by_image(reconstruction: Any) -> Iterator[tuple[int, FloatArray, 
         matrix = np.asarray(image.cam_from_world().matrix())
         camera = reconstruction.camera(image.camera_id)
         in_camera = np.ascontiguousarray(points @ matrix[:, :3].T + matrix[:, 3])
-        yield image_id, pixels, np.asarray(camera.img_from_cam(in_camera)) - pixels
+        off = float(max(camera.width, camera.height))
+        residuals = np.asarray(camera.img_from_cam(in_camera)) - pixels
+        yield image_id, pixels, np.nan_to_num(residuals, nan=off, posinf=off, neginf=-off)

@@ -6,7 +6,7 @@ yet stand dozens of sigmas from it. Adjusted to the existing points it is bent n
 differs contradicts.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,8 +27,9 @@ class ContradictionOptions:
 
     Attributes:
         sigmas: between its localised and its refined pose. They are those of the localisation, times the
-            spread and the neighbours factor of the similarity (poses from the same existing points share
-            the errors of these points), and those of the refined pose.
+            spread and the neighbours factor of the similarity, and those of the refined pose. Spread and
+            factor are the larger ones of before and after the refinement: poses from the same existing points
+            and with the same lens share their errors, which the refined model has taken over.
     """
 
     sigmas: float = 3.0
@@ -44,7 +45,7 @@ def contradicting_photos(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
-    fit: Fit,
+    fits: Sequence[Fit],
     options: ContradictionOptions,
 ) -> dict[int, str]:
     """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
@@ -53,10 +54,10 @@ def contradicting_photos(
         model: refined, in metres.
         localised: by place in the model; others than those that agreed with the placement are not asked.
         spread: (k, 6, 6) of `photo_covariances`; unknown ones (NaN) add nothing.
-        fit: of the refined model to the existing points.
+        fits: of the model to the existing points, as it came and refined.
     """
     limit = gates.sigmas_limit(options.sigmas, 6)
-    dilution = max(fit.spread, 1.0) ** 2 * fit.neighbours_factor
+    dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
     found: dict[int, str] = {}
     for k, photo in sorted(localised.items()):
         pose = model.cam_from_sfm[k]

@@ -108,6 +108,7 @@ def settle(
     """
     placement = held.placement
     assert placement.local_from_sfm is not None
+    assert held.fit is not None
     rows = tuple(int(r) for r in model.rows)
     outside = [rows.index(r) for r in placement.disagreeing]
     weak = weak_photos(model, outside, [rows.index(r) for r in placement.agreeing], options.min_link)
@@ -134,7 +135,7 @@ def settle(
         held_anchors = good.take(sharp)
         fit = fit_similarity(adjusted.model, Sim3.identity(), held_anchors, adjusted.fixed_kept, placing.fit)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
-        against = contradicting_photos(adjusted.model, inside, spread, fit, options.contradiction)
+        against = contradicting_photos(adjusted.model, inside, spread, (held.fit, fit), options.contradiction)
         loose = {
             k: message
             for k, message in loose_photos(adjusted.model, spread, options.max_photo_bound_m).items()

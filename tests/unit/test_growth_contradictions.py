@@ -57,7 +57,7 @@ def found(scale: float, fit: Fit, spread: FloatArray | None = None) -> float:
     rng = np.random.default_rng(7)
     photos = {k: drawn(rng, k, pose, scale) for k, pose in enumerate(poses)}
     spread = np.tile(REFINED, (600, 1, 1)) if spread is None else spread
-    return len(contradicting_photos(model, photos, spread, fit, OPTIONS)) / 600
+    return len(contradicting_photos(model, photos, spread, [fit], OPTIONS)) / 600
 
 
 def test_honest_photos_hardly_ever_contradict() -> None:
@@ -73,6 +73,17 @@ def test_poses_that_share_errors_of_points_are_as_uncertain_as_the_fit_says() ->
     assert found(5.0, fit_of(spread=2.0, neighbours_factor=40.0)) < 7 / 600
 
 
+def test_the_larger_of_both_fits_counts() -> None:
+    model, poses = posed(50)
+    rng = np.random.default_rng(7)
+    photos = {k: drawn(rng, k, pose, 5.0) for k, pose in enumerate(poses)}
+    spread = np.tile(REFINED, (50, 1, 1))
+    alone = contradicting_photos(model, photos, spread, [fit_of()], OPTIONS)
+    before = fit_of(spread=2.0, neighbours_factor=40.0)
+    assert len(alone) > 40
+    assert not contradicting_photos(model, photos, spread, [before, fit_of()], OPTIONS)
+
+
 def test_without_a_covariance_of_its_own_a_pose_is_taken_as_exact() -> None:
     assert found(1.0, fit_of(), np.full((600, 6, 6), np.nan)) > 7 / 600
 
@@ -83,10 +94,10 @@ def test_only_photos_that_are_asked_are_named_and_with_figures() -> None:
         rotation=poses[1].rotation, translation=poses[1].translation + poses[1].rotation @ [0, 3, 0]
     )
     spread = np.tile(REFINED, (3, 1, 1))
-    named = contradicting_photos(model, {1: localised_photo(1, away)}, spread, fit_of(), OPTIONS)
+    named = contradicting_photos(model, {1: localised_photo(1, away)}, spread, [fit_of()], OPTIONS)
     assert list(named) == [1]
     assert "3.00 m and 0.00 degrees" in named[1]
-    assert contradicting_photos(model, {}, spread, fit_of(), OPTIONS) == {}
+    assert contradicting_photos(model, {}, spread, [fit_of()], OPTIONS) == {}
 
 
 @pytest.mark.parametrize("sigmas", [1.0, 6.0])
@@ -95,6 +106,6 @@ def test_the_limit_is_that_of_so_many_sigmas(sigmas: float) -> None:
     rng = np.random.default_rng(9)
     photos = {k: drawn(rng, k, pose) for k, pose in enumerate(poses)}
     options = ContradictionOptions(sigmas=sigmas)
-    named = contradicting_photos(model, photos, np.tile(REFINED, (400, 1, 1)), fit_of(), options)
+    named = contradicting_photos(model, photos, np.tile(REFINED, (400, 1, 1)), [fit_of()], options)
     expected = {1.0: 0.317, 6.0: 0.0}[sigmas]
     assert len(named) / 400 == pytest.approx(expected, abs=0.08)
