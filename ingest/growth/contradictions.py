@@ -19,6 +19,7 @@ from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.similarity_fit import Fit
 from ingest.growth.values import LocalisedPhoto
+from ingest.precision import linearise
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -29,10 +30,14 @@ class ContradictionOptions:
         sigmas: between its localised and its refined pose. They are those of the localisation, times the
             spread and the neighbours factor of the similarity, and those of the refined pose. Spread and
             factor are the larger ones of before and after the refinement: poses from the same existing points
-            and with the same lens share their errors, which the refined model has taken over.
+            share their errors, which the refined model has taken over.
+        focal_rel: what the focal length of a localisation may be off (one sigma). A photo at the rim of a map
+            sees it in a corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where
+            its pixels say 0.1 m; `brighton`'s lens is off by 1.3 % (tools/lens_study.py).
     """
 
     sigmas: float = 3.0
+    focal_rel: float = 0.01
 
 
 def pose_offset(pose: Rigid3, photo: LocalisedPhoto) -> FloatArray:
@@ -63,7 +68,8 @@ def contradicting_photos(
         pose = model.cam_from_sfm[k]
         offset = pose_offset(pose, photo)
         into_local = block_diag(pose.rotation.T, pose.rotation.T)
-        own = into_local @ np.nan_to_num(spread[k]) @ into_local.T
+        by_focal = pose_by_focal(photo) * options.focal_rel
+        own = into_local @ (np.nan_to_num(spread[k]) + np.outer(by_focal, by_focal)) @ into_local.T
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
             found[k] = (
@@ -72,3 +78,25 @@ def contradicting_photos(
                 f"chi-square {square:.0f}, {limit:.0f} is allowed"
             )
     return found
+
+
+def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
+    """(6,) how a localised pose moves (left perturbation) as its focal length grows by its own size."""
+    count = len(photo.pixels)
+    if count < 4:
+        return np.zeros(6)
+    camera = photo.camera
+    linear = linearise(
+        [camera],
+        np.zeros(1, dtype=np.int64),
+        [photo.cam_from_local],
+        photo.points,
+        np.arange(count),
+        np.zeros(count, dtype=np.int64),
+        photo.pixels,
+    )
+    good = np.isfinite(linear.by_pose).all(axis=(1, 2))
+    by_pose = linear.by_pose[good].reshape(-1, 6)
+    middle = camera.project(np.array([[0.0, 0.0, 1.0]]))
+    by_focal = (photo.pixels[good] - middle).reshape(-1)
+    return np.asarray(np.linalg.lstsq(by_pose, by_focal, rcond=None)[0])

@@ -14,6 +14,7 @@ from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
 from ingest.growth.confirmation import ConfirmationOptions
+from ingest.growth.contradictions import pose_by_focal
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.localised import (
@@ -270,6 +271,19 @@ def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> Non
         assert grown.reason == "CONTRADICTS_GPS"
     else:
         assert isinstance(grown, GrownMap), grown
+
+
+def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, LocalisedPhoto]) -> None:
+    for photo in localised.values():
+        longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
+        moved = with_lens(photo, longer, LocaliseEachOptions())
+        turn = photo.cam_from_local.rotation
+        expected = 0.01 * pose_by_focal(photo)
+        offset = moved.cam_from_local.center - photo.cam_from_local.center
+        # Which way it goes is a matter of sign, and of no matter to a covariance.
+        said = turn.T @ expected[3:]
+        assert min(np.linalg.norm(offset - said), np.linalg.norm(offset + said)) < 0.15 * np.linalg.norm(said)
+        assert np.linalg.norm(said) > 0.1
 
 
 def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
