@@ -17,6 +17,7 @@ from featuredb.index.area import Area
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
+from ingest.growth.contradictions import center_variance_m2
 from ingest.growth.gates import Gate
 from ingest.growth.map_graph import at_most_places, place_sigmas_m
 from ingest.growth.parents import ParentOptions, edges_of, parents_covariance
@@ -46,9 +47,10 @@ class PlacementOptions:
             above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
         min_shared_points: distinct points of the parents; twice what a single pose needs.
         max_rim_sigma: at the rim of the model, over the viewing distance; further off, over the distance.
-        max_residual: median distance of centres, over the viewing distance. Models of few photos, bent
-            and with a lens not their own, reached 0.4 %; a placement by a look-alike place shows in pixels
-            long before.
+        max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
+            Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
+            look-alike place shows in pixels long before.
+        focal_rel: what the focal lengths of localisations may be off, as in `contradictions`.
         max_rival: share of photos that agree with another placement.
         rival_views: placements count as different if they move the model's photos by more than this share
             of the viewing distance.
@@ -66,6 +68,7 @@ class PlacementOptions:
     min_shared_points: int = 30
     max_rim_sigma: float = 0.02
     max_residual: float = 0.01
+    focal_rel: float = 0.01
     max_rival: float = 0.5
     rival_views: float = 0.05
     max_against_gps: float = 0.5
@@ -224,7 +227,7 @@ def _ask(
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
         gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
-        gates.residuals(_typical(_center_offsets(model, sim, own, agree)), reach, options.max_residual),
+        gates.residuals(_typical_excess_m(model, sim, own, agree, options), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
         gates.visibility(
@@ -313,9 +316,18 @@ def visible_parts(
     return np.array(found)
 
 
-def _typical(offsets: FloatArray) -> float:
-    """Median length of (n, 3): photos at the rim of a map are localised badly, which bends no model."""
-    return float(np.median(np.linalg.norm(offsets, axis=1))) if len(offsets) else float("nan")
+def _typical_excess_m(
+    model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int], options: PlacementOptions
+) -> float:
+    """Median distance of the localised centres from the placed ones beyond what they are uncertain by.
+
+    Photos at the rim of a map are localised badly, which bends no model.
+    """
+    if not agree:
+        return float("nan")
+    squares = (_center_offsets(model, sim, own, agree) ** 2).sum(axis=1)
+    own_m2 = np.array([center_variance_m2(own[k], options.focal_rel) for k in sorted(agree)])
+    return float(np.sqrt(np.median(np.maximum(squares - own_m2, 0.0))))
 
 
 def _rms(offsets: FloatArray) -> float:
