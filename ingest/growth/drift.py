@@ -36,9 +36,6 @@ class DriftOptions:
             points. They were made with that very lens: what it trades for height, they trade alike.
         own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
         exif_focal_rel: and where EXIF held its focal length.
-        least_exif_photos: of a camera whose EXIF is believed here. A photo that was cropped has a size of its
-            own, thus a camera of its own, and an EXIF entry that no longer fits: seen from straight above it
-            was 9.5 m off in height, with everything else in order.
         max_photos: of more, the rest is taken to be no worse; the equations are dense.
         max_points: free points that take part; fewer know less, so the bound stays one.
     """
@@ -49,7 +46,6 @@ class DriftOptions:
     own_focal_rel: float = 0.15
     own_distortion: float = 0.1
     exif_focal_rel: float = FocalPriorOptions().sigma_rel
-    least_exif_photos: int = 3
     max_photos: int = 300
     max_points: int = 20_000
 
@@ -205,8 +201,7 @@ def _lens_information(model: Model, lenses: Lenses, options: DriftOptions) -> Fl
     known: list[float] = []
     for c, camera in enumerate(model.cameras):
         own = c not in lenses.constant
-        told = c in lenses.focal_px and (model.camera_of == c).sum() >= options.least_exif_photos
-        focal = options.exif_focal_rel if told else options.own_focal_rel
+        focal = options.exif_focal_rel if c in lenses.focal_px else options.own_focal_rel
         focal = focal if own else options.adopted_focal_rel
         distortion = options.own_distortion if own else options.adopted_distortion
         for index in camera.lens_parameters():

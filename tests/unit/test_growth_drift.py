@@ -129,15 +129,3 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     none = photo_covariances(*arguments[:-1], np.zeros_like(kept), GIVEN, DriftOptions())
     assert np.isnan(none).all()  # nothing holds it
     assert bending_variance_m2(new.model, np.eye(7), none) == 0.0
-
-
-def test_exif_of_a_camera_with_few_photos_is_not_believed() -> None:
-    """What was cropped has a size of its own, and an EXIF entry that no longer fits."""
-    new, _, fixed = walk(3)
-    arguments = (new.model, list(new.keypoints().values()), fixed, np.ones(len(fixed.point_of), np.bool_))
-    told = Lenses(constant=(), focal_px={0: CAMERA.focal_px})
-    enough, few = (
-        photo_covariances(*arguments, told, DriftOptions(least_exif_photos=n)) for n in (PHOTOS, PHOTOS + 1)
-    )
-    np.testing.assert_allclose(few, photo_covariances(*arguments, FREE, DriftOptions()))
-    assert center_covariances(new.model, few)[-1].trace() > center_covariances(new.model, enough)[-1].trace()
