@@ -46,9 +46,10 @@ class SettleOptions:
         min_held_share: of the anchors that agree with the placement, the share that still fits once poses,
             lenses and new points have been adjusted to them; on real sets above 0.9. Less means that the
             reconstruction cannot be bent to what the existing maps say.
-        min_link: `firmness` that photos need which are not localised themselves. In the simulated community a
-            block of seven photos, tied to a look-alike hall 78 m from theirs, had 0.04; right photos 0.14 and
-            more.
+        min_link: `firmness` that photos need which are not localised themselves. In simulated communities
+            photos tied to look-alike halls 68 and 78 m from theirs had 0.15 and 0.04; right photos nearly
+            all 0.46 and more, single ones 0.14. Those wait, and are localised by themselves once their
+            neighbours are in an active map.
         max_photo_bound_m: photos that may be further off (95 %), against the existing points and with what
             their lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
         max_rounds: of leaving such photos out; the others are adjusted without them.
@@ -58,7 +59,7 @@ class SettleOptions:
 
     refine: RefineOptions = field(default_factory=RefineOptions)
     min_held_share: float = 0.5
-    min_link: float = 0.08
+    min_link: float = 0.25
     max_photo_bound_m: float = 0.5
     max_rounds: int = 4
     contradiction: ContradictionOptions = field(default_factory=ContradictionOptions)
