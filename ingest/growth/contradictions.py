@@ -21,6 +21,11 @@ from ingest.growth.similarity_fit import Fit
 from ingest.growth.values import LocalisedPhoto
 from ingest.precision import linearise
 
+# What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
+# corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
+# `brighton`'s lens is off by 1.3 % (tools/lens_study.py).
+FOCAL_REL = 0.01
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ContradictionOptions:
@@ -31,13 +36,9 @@ class ContradictionOptions:
             spread and the neighbours factor of the similarity, and those of the refined pose. Spread and
             factor are the larger ones of before and after the refinement: poses from the same existing points
             share their errors, which the refined model has taken over.
-        focal_rel: what the focal length of a localisation may be off (one sigma). A photo at the rim of a map
-            sees it in a corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where
-            its pixels say 0.1 m; `brighton`'s lens is off by 1.3 % (tools/lens_study.py).
     """
 
     sigmas: float = 3.0
-    focal_rel: float = 0.01
 
 
 def pose_offset(pose: Rigid3, photo: LocalisedPhoto) -> FloatArray:
@@ -68,7 +69,7 @@ def contradicting_photos(
         pose = model.cam_from_sfm[k]
         offset = pose_offset(pose, photo)
         into_local = block_diag(pose.rotation.T, pose.rotation.T)
-        by_focal = pose_by_focal(photo) * options.focal_rel
+        by_focal = pose_by_focal(photo) * FOCAL_REL
         own = into_local @ (np.nan_to_num(spread[k]) + np.outer(by_focal, by_focal)) @ into_local.T
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
@@ -80,9 +81,9 @@ def contradicting_photos(
     return found
 
 
-def center_variance_m2(photo: LocalisedPhoto, focal_rel: float) -> float:
+def center_variance_m2(photo: LocalisedPhoto) -> float:
     """Of a localised centre, all axes together, with what its focal length may be off."""
-    moved = pose_by_focal(photo)[3:] * focal_rel
+    moved = pose_by_focal(photo)[3:] * FOCAL_REL
     return float(np.trace(photo.covariance[3:, 3:]) + moved @ moved)
 
 

@@ -50,7 +50,6 @@ class PlacementOptions:
         max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
             Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
             look-alike place shows in pixels long before.
-        focal_rel: what the focal lengths of localisations may be off, as in `contradictions`.
         max_rival: share of photos that agree with another placement.
         rival_views: placements count as different if they move the model's photos by more than this share
             of the viewing distance.
@@ -68,7 +67,6 @@ class PlacementOptions:
     min_shared_points: int = 30
     max_rim_sigma: float = 0.02
     max_residual: float = 0.01
-    focal_rel: float = 0.01
     max_rival: float = 0.5
     rival_views: float = 0.05
     max_against_gps: float = 0.5
@@ -227,7 +225,7 @@ def _ask(
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
         gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
-        gates.residuals(_typical_excess_m(model, sim, own, agree, options), reach, options.max_residual),
+        gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
         gates.visibility(
@@ -316,9 +314,7 @@ def visible_parts(
     return np.array(found)
 
 
-def _typical_excess_m(
-    model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int], options: PlacementOptions
-) -> float:
+def _typical_excess_m(model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]) -> float:
     """Median distance of the localised centres from the placed ones beyond what they are uncertain by.
 
     Photos at the rim of a map are localised badly, which bends no model.
@@ -326,7 +322,7 @@ def _typical_excess_m(
     if not agree:
         return float("nan")
     squares = (_center_offsets(model, sim, own, agree) ** 2).sum(axis=1)
-    own_m2 = np.array([center_variance_m2(own[k], options.focal_rel) for k in sorted(agree)])
+    own_m2 = np.array([center_variance_m2(own[k]) for k in sorted(agree)])
     return float(np.sqrt(np.median(np.maximum(squares - own_m2, 0.0))))
 
 

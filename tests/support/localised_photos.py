@@ -7,8 +7,8 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.growth.values import LocalisedPhoto
-from reloc.result import LocaliseResult
 from tests.support.scenes import CAMERA
+from tests.support.service import not_localised
 
 
 def localised_photo(row: int, cam_from_local: Rigid3, **values: Any) -> LocalisedPhoto:
@@ -28,16 +28,6 @@ def localised_photo(row: int, cam_from_local: Rigid3, **values: Any) -> Localise
         frame=LocalFrame(latitude_deg=49.0, longitude_deg=8.0, height_m=0.0),
         cam_from_local=cam_from_local,
         by_prior=False,
-        result=LocaliseResult(
-            reason="TOO_FEW_MATCHES",
-            detail="made by hand",
-            pose=None,
-            confidence=0.0,
-            features=100,
-            matches=20,
-            inliers=20,
-            runner_up=None,
-            snapshot=0,
-        ),
+        result=not_localised(snapshot=0),
         **given,
     )
