@@ -5,73 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
-from ingest.growth.confirmation import ConfirmationOptions
-from ingest.growth.contradictions import pose_by_focal
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.localised import (
-    LocaliseEachOptions,
-    localise_photo,
     localise_photos,
-    share_shown,
-    with_lens,
 )
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
-from ingest.growth.witnesses import NewPhotos as WitnessPhotos
-from ingest.growth.witnesses import hear_witnesses
 from reloc.candidates import IndexedArea
+from tests.support.growth_box import DESCRIPTORS, EAST, FRAME, KEY, POINTS, WORLD, existing, prior, walk
 from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
 from tests.support.scenes import (
     CAMERA,
-    EASTING,
-    EPSG,
-    HEIGHT,
-    NORTHING,
-    box_points,
     indexed,
     looking_at,
-    random_descriptors,
     ring,
     scene_map,
 )
-
-FRAME = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
-KEY = "scene|camera"
-RNG = np.random.default_rng(7)
-WORLD = box_points(RNG, 900)  # 50 x 50 m, 12 m high
-EAST = WORLD + np.array([38.0, 0.0, 0.0])  # beyond the map's points
-POINTS = np.concatenate([WORLD, EAST])
-DESCRIPTORS = random_descriptors(RNG, len(POINTS))
-
-
-def walk(count: int = 6, start_m: float = 2.0, step_m: float = 6.0) -> list[Rigid3]:
-    """Cameras that walk east and look at the box and beyond."""
-    return [
-        looking_at(np.array([start_m + step_m * k, -48.0, 30.0]), np.array([6.0 + step_m * k, 0.0, 3.0]))
-        for k in range(count)
-    ]
-
-
-def existing(map_id: str = "old", *, sigma_m: float = 0.5) -> FeatureMap:
-    placed = np.diag([1e-8, 1e-8, 1e-8, 1e-8, sigma_m**2, sigma_m**2, sigma_m**2])
-    return scene_map(
-        points=WORLD,
-        descriptors=DESCRIPTORS[: len(WORLD)],
-        poses=ring(10),
-        map_id=map_id,
-        camera_keys=(KEY,),
-        placement_covariance=placed,
-        fingerprint=FINGERPRINT,
-        point_covariance=(4e-4, 0.0, 0.0, 4e-4, 0.0, 4e-4),
-    )
 
 
 @pytest.fixture(scope="module")
@@ -91,50 +45,10 @@ def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
     return found
 
 
-def test_two_threads_localise_as_one_does(
-    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
-) -> None:
-    options = LocaliseEachOptions(threads=2)
-    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], options)
-    assert not reasons
-    assert list(again) == list(localised)
-    for row, photo in localised.items():
-        np.testing.assert_array_equal(again[row].feature_rows, photo.feature_rows)
-        np.testing.assert_array_equal(again[row].covariance, photo.covariance)
-
-
-def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
-    """Photos of an owner of their own see the map; the second time the answers are those of the first."""
-    photos = [replace(photo, owner="somebody") for photo in new.photos]
-    asked = WitnessPhotos(photos=photos, rows=range(len(photos)), features_of=new.features_of, localised={})
-    here = existing()
-    here = replace(here, images=tuple(replace(image, owner="keeper") for image in here.images))
-    first = hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1")
-    assert {w.name for w in first.witnesses} == {photo.name for photo in photos}
-    assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
-    asked.heard.update(dict.fromkeys(asked.heard, None))
-    assert not hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1").witnesses
-    # Written anew, the map may show something else.
-    assert hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w2").witnesses
-
-
 def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
     truth = np.array([new.poses[int(r)].center for r in grown.model.rows])
     to_frame = grown.feature_map.frame.enu_from(FRAME)
     return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)
-
-
-def test_each_photo_is_localised_by_itself(
-    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
-) -> None:
-    for row, photo in localised.items():
-        offset = photo.cam_from_local.center - new.poses[row].center
-        sigma = np.sqrt(np.diag(photo.covariance)[3:])
-        assert np.linalg.norm(offset) < 0.1
-        assert (np.abs(offset) < 5 * sigma).all()
-        # Every inlier names the point that it is: the world row of the feature, as the map's row.
-        assert (new.world_of[row][photo.feature_rows] == photo.point_of).mean() > 0.99
-        assert photo.map_ids == ("old",)
 
 
 def test_a_reconstruction_is_placed_and_becomes_a_map(
@@ -245,17 +159,6 @@ def test_a_look_alike_elsewhere_makes_it_ambiguous(
     assert {g.name for g in grown.gates if not g.passes} >= {"runner_up"}
 
 
-def prior(pose: Rigid3, offset: tuple[float, float] = (0.0, 0.0), sigma_m: float = 5.0) -> GeoPrior:
-    lat, lon, _ = FRAME.geodetic_from_enu(pose.center + np.array([*offset, 0.0]))
-    return GeoPrior(
-        latitude_deg=float(lat),
-        longitude_deg=float(lon),
-        height_m=None,
-        sigma_horizontal_m=sigma_m,
-        sigma_vertical_m=20.0,
-    )
-
-
 @pytest.mark.parametrize(("liars", "refused"), [(1, False), (5, True)])
 def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> None:
     """One photo that lies about its place does not matter; most of them do."""
@@ -271,38 +174,6 @@ def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> Non
         assert grown.reason == "CONTRADICTS_GPS"
     else:
         assert isinstance(grown, GrownMap), grown
-
-
-def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, LocalisedPhoto]) -> None:
-    for photo in localised.values():
-        longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
-        moved = with_lens(photo, longer, LocaliseEachOptions())
-        turn = photo.cam_from_local.rotation
-        expected = 0.01 * pose_by_focal(photo)
-        offset = moved.cam_from_local.center - photo.cam_from_local.center
-        # Which way it goes is a matter of sign, and of no matter to a covariance.
-        said = turn.T @ expected[3:]
-        assert min(np.linalg.norm(offset - said), np.linalg.norm(offset + said)) < 0.15 * np.linalg.norm(said)
-        assert np.linalg.norm(said) > 0.1
-
-
-def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
-    """A third of what the map shows is enough for a pose; not against the photo's own position."""
-    pose = walk(1)[0]
-
-    def found_by(gps: GeoPrior | None) -> LocalisedPhoto | str:
-        new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [pose], camera_key=KEY, gps=[gps])
-        features = new.features_of(0).features
-        shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
-        return localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
-
-    for gps in (None, prior(pose, (2.0, 1.0))):
-        there = found_by(gps)
-        assert isinstance(there, LocalisedPhoto), there
-        assert 0.2 < share_shown(there, area.area) < 0.7
-    away = found_by(prior(pose, (150.0, 0.0)))
-    assert isinstance(away, str)
-    assert away.startswith("CONTRADICTS_GEOTAG")
 
 
 def test_photos_blind_for_what_they_should_show(
@@ -422,19 +293,3 @@ def test_photos_of_existing_maps_vouch_for_a_lone_one(
     (made,) = grown.maps
     assert sorted(made.model.rows.tolist()) == [0, 1, 2]
     assert centers_error(made, both).max() < 0.1
-
-
-def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:
-    """A longer lens stands further back; with the true lens the photo is where it was."""
-    longer = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(960.0, 500.0, 400.0, 0.01))
-    options = LocaliseEachOptions()
-    back = with_lens(localised[2], longer, options)
-    assert back.camera == longer
-    moved = back.cam_from_local.center - new.poses[2].center
-    outward = new.poses[2].center - np.median(localised[2].points, axis=0)
-    assert np.linalg.norm(moved) > 1.5
-    assert moved @ outward / np.linalg.norm(moved) / np.linalg.norm(outward) > 0.9
-    again = with_lens(back, CAMERA, options)
-    assert np.linalg.norm(again.cam_from_local.center - new.poses[2].center) < 0.1
-    other_size = Camera(model="SIMPLE_RADIAL", width=500, height=400, params=(450.0, 250.0, 200.0, 0.0))
-    assert with_lens(localised[2], other_size, options) is localised[2]

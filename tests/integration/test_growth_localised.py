@@ -1,0 +1,133 @@
+"""New photos, each localised by the existing maps by itself: poses, threads, geotags, lenses, witnesses."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import GeoPrior
+from ingest.growth.confirmation import ConfirmationOptions
+from ingest.growth.contradictions import pose_by_focal
+from ingest.growth.localised import (
+    LocaliseEachOptions,
+    localise_photo,
+    localise_photos,
+    share_shown,
+    with_lens,
+)
+from ingest.growth.values import LocalisedPhoto
+from ingest.growth.witnesses import NewPhotos as WitnessPhotos
+from ingest.growth.witnesses import hear_witnesses
+from reloc.candidates import IndexedArea
+from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
+from tests.support.new_photos import NewPhotos, take_photos
+from tests.support.scenes import (
+    CAMERA,
+    indexed,
+)
+
+
+@pytest.fixture(scope="module")
+def area() -> IndexedArea:
+    return indexed(existing())
+
+
+@pytest.fixture(scope="module")
+def new() -> NewPhotos:
+    return take_photos(np.random.default_rng(3), POINTS, DESCRIPTORS, walk(), camera_key=KEY)
+
+
+@pytest.fixture(scope="module")
+def localised(new: NewPhotos, area: IndexedArea) -> dict[int, LocalisedPhoto]:
+    found, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area])
+    assert not reasons
+    return found
+
+
+def test_each_photo_is_localised_by_itself(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    for row, photo in localised.items():
+        offset = photo.cam_from_local.center - new.poses[row].center
+        sigma = np.sqrt(np.diag(photo.covariance)[3:])
+        assert np.linalg.norm(offset) < 0.1
+        assert (np.abs(offset) < 5 * sigma).all()
+        # Every inlier names the point that it is: the world row of the feature, as the map's row.
+        assert (new.world_of[row][photo.feature_rows] == photo.point_of).mean() > 0.99
+        assert photo.map_ids == ("old",)
+
+
+def test_two_threads_localise_as_one_does(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    options = LocaliseEachOptions(threads=2)
+    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], options)
+    assert not reasons
+    assert list(again) == list(localised)
+    for row, photo in localised.items():
+        np.testing.assert_array_equal(again[row].feature_rows, photo.feature_rows)
+        np.testing.assert_array_equal(again[row].covariance, photo.covariance)
+
+
+def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
+    """Photos of an owner of their own see the map; the second time the answers are those of the first."""
+    photos = [replace(photo, owner="somebody") for photo in new.photos]
+    asked = WitnessPhotos(photos=photos, rows=range(len(photos)), features_of=new.features_of, localised={})
+    here = existing()
+    here = replace(here, images=tuple(replace(image, owner="keeper") for image in here.images))
+    first = hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1")
+    assert {w.name for w in first.witnesses} == {photo.name for photo in photos}
+    assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
+    asked.heard.update(dict.fromkeys(asked.heard, None))
+    assert not hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1").witnesses
+    # Written anew, the map may show something else.
+    assert hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w2").witnesses
+
+
+def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, LocalisedPhoto]) -> None:
+    for photo in localised.values():
+        longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
+        moved = with_lens(photo, longer, LocaliseEachOptions())
+        turn = photo.cam_from_local.rotation
+        expected = 0.01 * pose_by_focal(photo)
+        offset = moved.cam_from_local.center - photo.cam_from_local.center
+        # Which way it goes is a matter of sign, and of no matter to a covariance.
+        said = turn.T @ expected[3:]
+        assert min(np.linalg.norm(offset - said), np.linalg.norm(offset + said)) < 0.15 * np.linalg.norm(said)
+        assert np.linalg.norm(said) > 0.1
+
+
+def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
+    """A third of what the map shows is enough for a pose; not against the photo's own position."""
+    pose = walk(1)[0]
+
+    def found_by(gps: GeoPrior | None) -> LocalisedPhoto | str:
+        new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [pose], camera_key=KEY, gps=[gps])
+        features = new.features_of(0).features
+        shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
+        return localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
+
+    for gps in (None, prior(pose, (2.0, 1.0))):
+        there = found_by(gps)
+        assert isinstance(there, LocalisedPhoto), there
+        assert 0.2 < share_shown(there, area.area) < 0.7
+    away = found_by(prior(pose, (150.0, 0.0)))
+    assert isinstance(away, str)
+    assert away.startswith("CONTRADICTS_GEOTAG")
+
+
+def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:
+    """A longer lens stands further back; with the true lens the photo is where it was."""
+    longer = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(960.0, 500.0, 400.0, 0.01))
+    options = LocaliseEachOptions()
+    back = with_lens(localised[2], longer, options)
+    assert back.camera == longer
+    moved = back.cam_from_local.center - new.poses[2].center
+    outward = new.poses[2].center - np.median(localised[2].points, axis=0)
+    assert np.linalg.norm(moved) > 1.5
+    assert moved @ outward / np.linalg.norm(moved) / np.linalg.norm(outward) > 0.9
+    again = with_lens(back, CAMERA, options)
+    assert np.linalg.norm(again.cam_from_local.center - new.poses[2].center) < 0.1
+    other_size = Camera(model="SIMPLE_RADIAL", width=500, height=400, params=(450.0, 250.0, 200.0, 0.0))
+    assert with_lens(localised[2], other_size, options) is localised[2]

@@ -1,0 +1,60 @@
+"""A small made-up world: a box of points that a map has, more beyond it, and cameras that walk east."""
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from tests.support.new_photos import FINGERPRINT
+from tests.support.scenes import (
+    EASTING,
+    EPSG,
+    HEIGHT,
+    NORTHING,
+    box_points,
+    looking_at,
+    random_descriptors,
+    ring,
+    scene_map,
+)
+
+FRAME = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
+KEY = "scene|camera"
+RNG = np.random.default_rng(7)
+WORLD = box_points(RNG, 900)  # 50 x 50 m, 12 m high
+EAST = WORLD + np.array([38.0, 0.0, 0.0])  # beyond the map's points
+POINTS = np.concatenate([WORLD, EAST])
+DESCRIPTORS = random_descriptors(RNG, len(POINTS))
+
+
+def walk(count: int = 6, start_m: float = 2.0, step_m: float = 6.0) -> list[Rigid3]:
+    """Cameras that walk east and look at the box and beyond."""
+    return [
+        looking_at(np.array([start_m + step_m * k, -48.0, 30.0]), np.array([6.0 + step_m * k, 0.0, 3.0]))
+        for k in range(count)
+    ]
+
+
+def existing(map_id: str = "old", *, sigma_m: float = 0.5) -> FeatureMap:
+    placed = np.diag([1e-8, 1e-8, 1e-8, 1e-8, sigma_m**2, sigma_m**2, sigma_m**2])
+    return scene_map(
+        points=WORLD,
+        descriptors=DESCRIPTORS[: len(WORLD)],
+        poses=ring(10),
+        map_id=map_id,
+        camera_keys=(KEY,),
+        placement_covariance=placed,
+        fingerprint=FINGERPRINT,
+        point_covariance=(4e-4, 0.0, 0.0, 4e-4, 0.0, 4e-4),
+    )
+
+
+def prior(pose: Rigid3, offset: tuple[float, float] = (0.0, 0.0), sigma_m: float = 5.0) -> GeoPrior:
+    lat, lon, _ = FRAME.geodetic_from_enu(pose.center + np.array([*offset, 0.0]))
+    return GeoPrior(
+        latitude_deg=float(lat),
+        longitude_deg=float(lon),
+        height_m=None,
+        sigma_horizontal_m=sigma_m,
+        sigma_vertical_m=20.0,
+    )
