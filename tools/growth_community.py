@@ -16,6 +16,7 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     options = CommunityOptions.short(args.seed) if args.size == "short" else CommunityOptions(seed=args.seed)
-    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    if args.pieces is not None:
+        options = replace(options, pieces=args.pieces)
+    folder = args.world or args.out / f"world-{args.size}-{args.seed}-{options.pieces}"
     album = made(write_community, folder, options, args.workers)
     database = anchored(
         args.out / "db", album, "survey", max_features=args.max_features, workers=args.workers
@@ -56,7 +59,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     everything = album.of(*_OWN, *_FOREIGN, "copy")
     give(database, album, everything)
     say(f"{len(everything)} photos contributed")
-    report = grow_candidates(database, growing_options(args.max_features, args.workers, args.budget))
+    growing = growing_options(args.max_features, args.workers, args.budget)
+    if args.min_link is not None:
+        growth = growing.growth
+        grow = replace(growth.grow.grow, settle=replace(growth.grow.grow.settle, min_link=args.min_link))
+        growing = replace(growing, growth=replace(growth, grow=replace(growth.grow, grow=grow)))
+    report = grow_candidates(database, growing)
     tell(report)
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)
@@ -146,6 +154,8 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
     parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--pieces", type=int, default=None, help="of the town's walls; 1: a town of twins")
+    parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)
 
 
