@@ -8,7 +8,8 @@ from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from ingest.photo import Photo
-from ingest.reconstruction import Component, MapMakingOptions, Reconstructed, Stage, camera_key
+from ingest.photo_cameras import shared_key
+from ingest.reconstruction import Component, MapMakingOptions, Reconstructed, Stage
 from ingest.report import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
 
 
@@ -202,7 +203,7 @@ def _cameras(component: Component, options: MapMakingOptions) -> tuple[CameraOut
         ]
         outcomes.append(
             CameraOutcome(
-                name=camera_key(members[0], options),
+                name=shared_key(members[0], options.cameras),
                 model=camera.model,
                 width=camera.width,
                 height=camera.height,

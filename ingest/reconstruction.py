@@ -31,6 +31,7 @@ from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
 from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions, more_pairs
 from ingest.photo import Photo
+from ingest.photo_cameras import CameraSharing, photo_cameras
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.retrieval.aggregate import aggregate_photos
@@ -40,12 +41,8 @@ from ingest.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
-CameraSharing = Literal["shared", "per-image"]
 Stage = Literal["scan", "extract", "match", "reconstruct", "build", "commit"]
 STAGES: tuple[Stage, ...] = ("scan", "extract", "match", "reconstruct", "build", "commit")
-
-# 1.2 times the longer side is a field of view of 45 degrees, COLMAP's guess without EXIF.
-_DEFAULT_FOCAL_OVER_SIDE = 1.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +50,7 @@ class MapMakingOptions:
     """Options of every step between photos and maps.
 
     Attributes:
-        cameras: photos of one make, model and size share intrinsics, or each has its own.
+        cameras: which photos share intrinsics (ingest.photo_cameras).
     """
 
     extractor: ExtractorOptions = field(default_factory=ExtractorOptions)
@@ -174,7 +171,7 @@ def reconstruct_photos(
     if stop_after == "extract":
         return replace(done, stopped_after="extract")
 
-    cameras, camera_rows = photo_cameras(usable, options)
+    cameras, camera_rows = photo_cameras(usable, options.cameras, options.sfm.camera_model)
     views = _views(usable, features, cameras, camera_rows)
     words = vocabulary or shipped_vocabulary()
     with clock.stage("pairs"):
@@ -232,31 +229,6 @@ def place_models(
     for number, model in enumerate(done.reconstruction.models()):
         features = done.features.of(model.rows)
         yield _component(model, done.usable, features, identity(number), options, survey)
-
-
-def photo_cameras(
-    photos: Sequence[Photo], options: MapMakingOptions
-) -> tuple[list[tuple[Camera, bool]], list[int]]:
-    """Cameras (with whether EXIF gives the focal length) and the camera's row of each photo."""
-    rows: dict[str, int] = {}
-    cameras: list[tuple[Camera, bool]] = []
-    of_photo: list[int] = []
-    for photo in photos:
-        key = camera_key(photo, options)
-        if key not in rows:
-            rows[key] = len(cameras)
-            known = photo.focal_px is not None
-            focal = photo.focal_px or _DEFAULT_FOCAL_OVER_SIDE * max(photo.width, photo.height)
-            camera = Camera.from_focal(photo.width, photo.height, focal, options.sfm.camera_model)
-            cameras.append((camera, known))
-        of_photo.append(rows[key])
-    return cameras, of_photo
-
-
-def camera_key(photo: Photo, options: MapMakingOptions) -> str:
-    """Photos with equal keys share intrinsics."""
-    alone = options.cameras == "per-image" or not photo.camera_key
-    return photo.name if alone else photo.camera_key
 
 
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:

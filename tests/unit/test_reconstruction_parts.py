@@ -1,6 +1,7 @@
 """Cameras of photos, local frames, settings of structure from motion, and which models are kept."""
 
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap_bridge import Model
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.photo import Photo
-from ingest.reconstruction import MapMakingOptions, local_frame_of, photo_cameras
+from ingest.photo_cameras import photo_cameras
+from ingest.reconstruction import MapMakingOptions, local_frame_of
 from ingest.sfm import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
 
@@ -23,19 +25,36 @@ _PHOTO = Photo(
 def test_photos_of_one_camera_share_intrinsics() -> None:
     other = replace(_PHOTO, name="c.jpg", camera_key="phone", focal_px=None, width=3000, height=4000)
     photos = [_PHOTO, replace(_PHOTO, name="b.jpg"), other]
-    cameras, rows = photo_cameras(photos, MapMakingOptions())
+    cameras, rows = photo_cameras(photos, "shared", "SIMPLE_RADIAL")
     assert rows == [0, 0, 1]
     assert [(c.width, c.height, c.focal_px, known) for c, known in cameras] == [
         (4000, 3000, 2800.0, True),
         (3000, 4000, pytest.approx(4800.0), False),
     ]
-    _, rows = photo_cameras(photos, MapMakingOptions(cameras="per-image"))
+    _, rows = photo_cameras(photos, "per-image", "SIMPLE_RADIAL")
     assert rows == [0, 1, 2]
 
 
 def test_photos_that_name_no_camera_share_with_none() -> None:
     photos = [replace(_PHOTO, name=n, camera_key="") for n in ("a", "b")]
-    assert photo_cameras(photos, MapMakingOptions())[1] == [0, 1]
+    assert photo_cameras(photos, "shared", "SIMPLE_RADIAL")[1] == [0, 1]
+
+
+def test_photos_that_name_no_camera_share_with_those_of_their_owner_day_and_size() -> None:
+    noon = datetime(2024, 8, 11, 12, 0, tzinfo=UTC)
+    mine = replace(_PHOTO, camera_key="", focal_px=None, owner="elif", capture_time=noon)
+    others = [
+        replace(mine, capture_time=noon + timedelta(hours=3)),
+        replace(mine, capture_time=datetime(2024, 8, 11, 23, 0, tzinfo=timezone(timedelta(hours=-5)))),
+        replace(mine, owner="greta"),
+        replace(mine, width=3000, height=4000),
+        replace(mine, focal_px=2800.0),
+        replace(mine, owner=""),
+        replace(mine, capture_time=None),
+    ]
+    photos = [replace(p, name=str(k)) for k, p in enumerate([mine, *others])]
+    assert photo_cameras(photos, "shared", "SIMPLE_RADIAL")[1] == [0, 0, 1, 2, 3, 4, 5, 6]
+    assert photo_cameras(photos, "per-image", "SIMPLE_RADIAL")[1] == list(range(8))
 
 
 def _at(latitude: float, longitude: float, height: float | None) -> Photo:
