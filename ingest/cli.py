@@ -68,8 +68,8 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         "--cameras",
         choices=("shared", "per-image"),
         default="shared",
-        help="whether photos of one make, model, size and focal length share their intrinsics, and photos that "
-        "name no camera those of the same owner, day and size; default: shared",
+        help="whether photos of one make, model, size and focal length share their intrinsics, and photos "
+        "that name no camera those of the same owner, day and size; default: shared",
     )
     group.add_argument("--camera-model", default=None, help="COLMAP's name; default: SIMPLE_RADIAL")
     group.add_argument(
