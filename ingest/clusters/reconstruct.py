@@ -33,6 +33,8 @@ from ingest.sfm import (
 from ingest.workspace import Workspace, atomic_folder
 
 _LOG = logging.getLogger(__name__)
+# What numbers can do to a block, in COLMAP or here. A full disk is another thing: it ends the run.
+_OF_THE_DATA = (ArithmeticError, LookupError, RuntimeError, ValueError)
 _MOSTLY = 0.5  # of joined photos; right joints lose single ones
 
 
@@ -246,11 +248,31 @@ def _join_task(
     )
 
 
-def _reconstruct_block(task: _BlockTask) -> None:
-    reconstruct(task.sfm, task.folder)
+def _reconstruct_block(task: _BlockTask) -> Lost | None:
+    """What goes wrong with one block costs that block."""
+    try:
+        reconstruct(task.sfm, task.folder)
+    except _OF_THE_DATA as error:
+        return _lost(task, error)
+    return None
 
 
-def _join_blocks(task: _JoinTask) -> None:
+def _join_blocks(task: _JoinTask) -> Lost | None:
+    """What goes wrong with one cluster costs that cluster."""
+    try:
+        _join(task)
+    except _OF_THE_DATA as error:
+        return _lost(task, error)
+    return None
+
+
+def _lost(task: _BlockTask | _JoinTask, error: Exception) -> Lost:
+    _LOG.error("%s: not reconstructed", task, exc_info=error)
+    text = f"reconstruction failed with {type(error).__name__}: {error}; the next run tries it again"
+    return Lost(task=str(task), reason=text)
+
+
+def _join(task: _JoinTask) -> None:
     """Join the models of a cluster's blocks and adjust each of what comes of it.
 
     Where joined models have no points in common once these are triangulated from all matches, or most of the

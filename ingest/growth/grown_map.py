@@ -1,5 +1,6 @@
 """From a reconstruction of new photos to a map that existing maps have placed, or to the reason why not."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -24,6 +25,8 @@ from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlace
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,8 +67,32 @@ def grow_component(
         areas: of the active maps, as `localised` had them.
         identity: of the new map.
         needed: rows of photos without which there is nothing to add.
+
+    Returns:
+        The map, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this reconstruction
+        and not the others of the run, nor the next run.
     """
-    options = options or GrowOptions()
+    try:
+        return _grown(
+            model, photos, features_of, localised, areas, identity, options or GrowOptions(), needed
+        )
+    except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
+        rows = tuple(int(r) for r in model.rows)
+        _LOG.exception("a reconstruction of %d photos (%s ...)", len(rows), photos[rows[0]].name)
+        text = f"{type(error).__name__}: {error}; the log tells where. Please report it"
+        return Refused(reason="FAILED", message=text, rows=rows)
+
+
+def _grown(
+    model: Model,
+    photos: Sequence[Photo],
+    features_of: FeaturesOf,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
+    identity: MapIdentity,
+    options: GrowOptions,
+    needed: Sequence[int],
+) -> GrownMap | Refused:
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
     if not mine:

@@ -107,6 +107,24 @@ def test_nothing_localised(new: NewPhotos, area: IndexedArea) -> None:
     assert grown.reason == "NOT_LOCALISED"
 
 
+def test_what_no_step_foresaw_costs_this_reconstruction_only(
+    new: NewPhotos,
+    localised: dict[int, LocalisedPhoto],
+    area: IndexedArea,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def singular(*_: object) -> None:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr("ingest.growth.grown_map.place_by_maps", singular)
+    refused = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    assert isinstance(refused, Refused)
+    assert (refused.reason, refused.rows) == ("FAILED", tuple(range(len(new.photos))))
+    assert "LinAlgError: Singular matrix" in refused.message
+    assert "Traceback" in caplog.text
+
+
 def test_photos_that_contradict_each_other_are_refused(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:

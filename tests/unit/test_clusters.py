@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +10,14 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.clusters.graph import ClusterOptions, Graph, find_clusters
+from ingest.clusters.graph import Block, Cluster, ClusterOptions, Graph, find_clusters
 from ingest.clusters.join import JoinOptions, common_points, hangs_together, join
+from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.colmap_bridge import Model
+from ingest.executor import InProcessExecutor
 from ingest.pairs import Pair
+from ingest.sfm import SfmOptions, SfmTask, SfmView
+from ingest.workspace import Workspace
 from tests.support.planar_map import CAMERA
 from tests.support.posed_models import model_of
 
@@ -194,3 +199,46 @@ def test_joined_models_hang_together_by_points_in_common() -> None:
     # A single photo that is hardly tied does not make a joint wrong.
     loose = model_of(first, first, first, first, range(95, 105))
     assert hangs_together(loose, [[0, 1], [2, 3, 4]], 30)
+
+
+@pytest.mark.parametrize(
+    "error", [np.linalg.LinAlgError("Singular matrix"), RuntimeError("[sfm.cc:1] Check")]
+)
+def test_a_block_that_fails_costs_its_photos_and_no_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fails_in_a_town(task: SfmTask, folder: Path) -> None:
+        if task.views[0].name == "a":
+            raise error
+        folder.mkdir(parents=True)
+
+    monkeypatch.setattr("ingest.clusters.reconstruct.reconstruct", fails_in_a_town)
+    done = _two_towns(tmp_path)
+    assert list(done.lost) == [0, 1]
+    assert all(str(error) in reason for reason in done.lost.values())
+    assert [c.rows for c in done.clusters] == [(2, 3)]
+
+
+def test_a_full_disk_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(task: SfmTask, folder: Path) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("ingest.clusters.reconstruct.reconstruct", full)
+    with pytest.raises(OSError, match="No space left"):
+        _two_towns(tmp_path)
+
+
+def _two_towns(work: Path) -> Reconstruction:
+    """Two clusters of two photos each."""
+    clusters = [Cluster(blocks=(Block(own=rows),)) for rows in ((0, 1), (2, 3))]
+    views = [SfmView(name=name, camera_row=0, features=work / "features" / name) for name in "abcd"]
+    return reconstruct_clusters(
+        clusters,
+        [(CAMERA, True)],
+        views,
+        {},
+        Workspace(root=work, job_id="towns"),
+        SfmOptions(),
+        InProcessExecutor(),
+        joining=JoinOptions(),
+    )
