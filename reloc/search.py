@@ -33,6 +33,7 @@ from reloc.pose import (
 from reloc.result import Evidence, LocaliseRequest, Reason
 from reloc.stopwatch import Stopwatch
 
+_MORE_BY_REFINING = 2  # times RANSAC's inliers
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
 
 
@@ -151,6 +152,8 @@ def _poses(
     watch.split("pose")
     if pose is None or pose.count < 4:
         return []
+    if _is_hopeless(len(matches), pose, options):
+        return [_with_evidence(features, cluster, pose, matches, matches, options)]
     best = _refined(features, cluster, matches, pose, options)
     watch.split("guided")
     taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
@@ -169,6 +172,19 @@ def _poses(
         best,
         replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
     ]
+
+
+def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -> bool:
+    """Whether the pose would be refused with twice its inliers, too: refining and rivals would be idle.
+
+    What is refused costs most, since RANSAC ends early only where there is something to be found. Refining
+    adds a few to RANSAC's inliers; twice is out of reach.
+    """
+    width, height = pose.camera.width, pose.camera.height
+    tolerance_px = options.pose.tolerance_rel * max(width, height)
+    twice = min(_MORE_BY_REFINING * pose.count, matches)
+    sample = 4 if pose.focal_is_free else 3
+    return log_nfa(matches, twice, tolerance_px, width, height, sample) < options.acceptance.min_log_nfa
 
 
 def camera_hypotheses(

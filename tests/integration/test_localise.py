@@ -19,10 +19,12 @@ from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.store import Database
+from reloc import search
 from reloc.candidates import IndexedArea
 from reloc.localise import localise
 from reloc.localiser import Localiser
 from reloc.options import LocaliseOptions
+from reloc.pose import PoseHypothesis
 from reloc.result import LocaliseRequest, LocaliseResult
 from tests.support import planar_map as field
 from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, field_texture, render, view
@@ -173,6 +175,36 @@ def test_what_is_no_photo_of_the_field_is_refused(
     assert result.pose is None
     assert result.reason in ("TOO_FEW_INLIERS", "TOO_FEW_MATCHES")
     assert result.confidence == 0.0
+
+
+@pytest.mark.parametrize("request_", [KNOWN, LocaliseRequest()], ids=["known", "unknown"])
+def test_giving_up_early_changes_no_answer(
+    area: IndexedArea,
+    photo: NDArray[np.uint8],
+    request_: LocaliseRequest,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """From a photo that is easily found to one that is not: the answers of a search that never gives up."""
+    asked: list[bool] = []
+
+    def counted(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -> bool:
+        asked.append(is_hopeless(matches, pose, options))
+        return asked[-1]
+
+    is_hopeless = search._is_hopeless
+    other = render(field_texture(77), POSE, seed=3).astype(np.float64)
+    images = [np.round((1 - w) * photo + w * other).astype(np.uint8) for w in np.linspace(0.3, 0.7, 9)]
+    monkeypatch.setattr(search, "_is_hopeless", counted)
+    early = [localise(image, request_, [area]) for image in images]
+    monkeypatch.setattr(search, "_is_hopeless", lambda *_: False)
+    late = [localise(image, request_, [area]) for image in images]
+    assert {result.pose is None for result in early} == {True, False}
+    assert any(asked)
+    for a, b in zip(early, late, strict=True):
+        assert a.reason == b.reason
+        assert (a.pose is None) == (b.pose is None)
+        if a.pose is not None and b.pose is not None:
+            assert np.array_equal(a.pose.utm, b.pose.utm)
 
 
 def test_a_blank_photo_has_too_few_features(area: IndexedArea) -> None:
