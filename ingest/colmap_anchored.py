@@ -90,6 +90,8 @@ def adjust_anchored(
     constant_cameras: Sequence[int],
     options: AnchoredOptions,
     focal_px: Mapping[int, float] | None = None,
+    *,
+    free_centers: bool = False,
 ) -> Anchored:
     """Adjust poses, free points and lenses (focal lengths and distortion) but those of `constant_cameras`.
 
@@ -98,6 +100,7 @@ def adjust_anchored(
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
         focal_px: focal lengths of EXIF by camera, where there is one.
+        free_centers: adjust the principal points of these lenses, too.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
@@ -105,7 +108,15 @@ def adjust_anchored(
     for _ in range(options.rounds):
         with quiet():
             state = _adjusted(
-                state, observation, keypoints, fixed, kept, constant_cameras, focal_px or {}, options
+                state,
+                observation,
+                keypoints,
+                fixed,
+                kept,
+                constant_cameras,
+                focal_px or {},
+                free_centers,
+                options,
             )
         observation, kept = _fitting(state, keypoints, fixed, options)
         observation &= _in_tracks(state, observation)
@@ -124,6 +135,7 @@ def _adjusted(
     kept: NDArray[np.bool_],
     constant_cameras: Sequence[int],
     focal_px: Mapping[int, float],
+    free_centers: bool,
     options: AnchoredOptions,
 ) -> Model:
     """One round: the model with new poses, lenses and points."""
@@ -131,7 +143,7 @@ def _adjusted(
     side = max(max(c.width, c.height) for c in model.cameras)
     settings = pycolmap.BundleAdjustmentOptions()
     settings.print_summary = False
-    settings.refine_principal_point = False
+    settings.refine_principal_point = free_centers
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     loss_scale_px = options.loss_scale_px * max(1.0, side / options.error_reference_side_px)
     settings.ceres.loss_function_scale = loss_scale_px

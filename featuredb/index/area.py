@@ -5,6 +5,7 @@ in it.
 """
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -75,12 +76,13 @@ class Area:
         return np.flatnonzero(seen).astype(np.int32)
 
     def camera_for_key(self, camera_key: str) -> Camera | None:
-        """Intrinsics of a map camera with this EXIF key; of the map with most images if several."""
+        """Intrinsics of a map camera with this EXIF key; of the one that took most images if several."""
         found: list[tuple[int, Camera]] = []
         for feature_map in self.maps:
-            for camera, key in zip(feature_map.cameras, feature_map.camera_keys, strict=False):
+            taken = Counter(image.camera_id for image in feature_map.images)
+            for c, key in enumerate(feature_map.camera_keys[: len(feature_map.cameras)]):
                 if key and key == camera_key:
-                    found.append((len(feature_map.images), camera))
+                    found.append((taken[c], feature_map.cameras[c]))
         return max(found, key=lambda item: item[0])[1] if found else None
 
 

@@ -78,11 +78,25 @@ def adopt_lenses(
         if (lens.width, lens.height) == (cameras[c].width, cameras[c].height):
             cameras[c] = lens
             adopted.append(c)
+    lenses = Lenses(constant=tuple(adopted), focal_px=focal_px)
     if not adopted:
-        return model, Lenses(constant=(), focal_px=focal_px)
-    with_lenses = replace(model, cameras=tuple(cameras))
-    adjusted = adjust_anchored(with_lenses, keypoints, FixedPoints.none(), adopted, options.adjust, focal_px)
-    return adjusted.model, Lenses(constant=tuple(adopted), focal_px=focal_px)
+        return model, lenses
+    return hold_lenses(model, {c: cameras[c] for c in adopted}, keypoints, lenses, options), lenses
+
+
+def hold_lenses(
+    model: Model,
+    cameras: Mapping[int, Camera],
+    keypoints: Sequence[FloatArray],
+    lenses: Lenses,
+    options: RefineOptions,
+) -> Model:
+    """The model adjusted, in its own frame, to lenses that are given by camera."""
+    given = replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
+    constant = sorted({*lenses.constant, *cameras})
+    return adjust_anchored(
+        given, keypoints, FixedPoints.none(), constant, options.adjust, lenses.focal_px
+    ).model
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:

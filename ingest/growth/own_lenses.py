@@ -1,0 +1,160 @@
+"""Step: lenses that the existing points tell better than whoever lent them, or than one coefficient can.
+
+A reconstruction of a few photos does not tell its lens from its shape, so it takes a map's (`refine`). That
+lens may have been estimated from as few. Points that are held where they are leave nothing to trade a lens
+against, and a few photos are enough: 45 m above the ground a focal length that is 0.6 % off is a quarter of a
+metre, which every later photo of that camera repeats.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from ingest.colmap_adjust import information_gain
+from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
+from ingest.colmap_bridge import Model
+from ingest.growth.refine import Lenses
+
+_MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the principal point
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnLensOptions:
+    """When a camera gets a lens of its own.
+
+    Attributes:
+        evidence: how many times the penalty of the information criterion the gain must be, as for the lens
+            of a reconstruction (`ingest.colmap_adjust.AdjustOptions`).
+        opencv_evidence, max_center_shift_rel: the same, of OPENCV with a free principal point.
+        least_held: observations of existing points by the camera's photos.
+    """
+
+    evidence: float = 5.0
+    opencv_evidence: float = 20.0
+    max_center_shift_rel: float = 0.03
+    least_held: int = 100
+
+
+def own_lenses(
+    adjusted: Anchored,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    lenses: Lenses,
+    adjust: AnchoredOptions,
+    options: OwnLensOptions,
+) -> dict[int, Camera]:
+    """Lenses by camera of the model, of those cameras that explain their photos far better with one.
+
+    Cameras that hold a map's lens, or have one distortion coefficient, are adjusted along, with two of them
+    (or all that the map's lens has). Where that helps, they try tangential coefficients, a second focal
+    length and the principal point.
+
+    Args:
+        adjusted: with `lenses`, and with the existing points. keypoints: of its photos.
+    """
+    model = adjusted.model
+    held = _fitting(fixed, adjusted.fixed_kept)
+    support = np.bincount(model.camera_of[held.photo_of], minlength=len(model.cameras))
+    asked = [
+        c
+        for c, camera in enumerate(model.cameras)
+        if support[c] >= options.least_held and (c in lenses.constant or camera.model == "SIMPLE_RADIAL")
+    ]
+    if not asked:
+        return {}
+    every = replace(adjust, rounds=1, max_error_px=np.inf)  # the same observations before and after
+    constant = [c for c in lenses.constant if c not in asked]
+    freer = _with_cameras(model, {c: _fuller(model.cameras[c]) for c in asked})
+    radial = adjust_anchored(freer, keypoints, held, constant, every, lenses.focal_px).model
+    free_before = {c: 0 if c in lenses.constant else len(model.cameras[c].lens_parameters()) for c in asked}
+    more = {c: len(radial.cameras[c].lens_parameters()) - free_before[c] for c in asked}
+    gains = _gains(model, radial, keypoints, held, more)
+    chosen = {c: radial.cameras[c] for c in asked if gains[c] >= options.evidence}
+    centered = [c for c, camera in chosen.items() if camera.model == "RADIAL"]
+    if centered:
+        freer = _with_cameras(radial, {c: _as_opencv(radial.cameras[c]) for c in centered})
+        # Principal points are free for all lenses or none; the others stay as they are.
+        others = sorted(set(range(len(model.cameras))) - set(centered))
+        opencv = adjust_anchored(
+            freer, keypoints, held, others, every, lenses.focal_px, free_centers=True
+        ).model
+        gains = _gains(radial, opencv, keypoints, held, dict.fromkeys(centered, _MORE_OF_OPENCV))
+        chosen |= {
+            c: opencv.cameras[c]
+            for c in centered
+            if gains[c] >= options.opencv_evidence
+            and _center_shift_rel(opencv.cameras[c]) <= options.max_center_shift_rel
+        }
+    return chosen
+
+
+def _fitting(fixed: FixedPoints, kept: NDArray[np.bool_]) -> FixedPoints:
+    """The observations that fit."""
+    return replace(
+        fixed, point_of=fixed.point_of[kept], photo_of=fixed.photo_of[kept], pixels=fixed.pixels[kept]
+    )
+
+
+def _gains(
+    before: Model,
+    after: Model,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    more: Mapping[int, int],
+) -> dict[int, float]:
+    """`information_gain` of the photos of each camera.
+
+    Args:
+        more: parameters by camera that `after` has more.
+    """
+    was, of_camera = _residuals(before, keypoints, fixed)
+    now, _ = _residuals(after, keypoints, fixed)
+    return {c: information_gain(was[of_camera == c], now[of_camera == c], count) for c, count in more.items()}
+
+
+def _with_cameras(model: Model, cameras: Mapping[int, Camera]) -> Model:
+    return replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
+
+
+def _fuller(camera: Camera) -> Camera:
+    """The same lens with a second radial coefficient, if it has one."""
+    if camera.model != "SIMPLE_RADIAL":
+        return camera
+    return replace(camera, model="RADIAL", params=(*camera.params, 0.0))
+
+
+def _as_opencv(camera: Camera) -> Camera:
+    """The same RADIAL lens with two focal lengths and tangential coefficients."""
+    f, cx, cy, k1, k2 = camera.params
+    return replace(camera, model="OPENCV", params=(f, f, cx, cy, k1, k2, 0.0, 0.0))
+
+
+def _center_shift_rel(camera: Camera) -> float:
+    """Distance of the principal point from the image's middle, as a share of the longer side."""
+    x, y = camera.params[2:4]
+    offset = np.hypot(x - 0.5 * camera.width, y - 0.5 * camera.height)
+    return float(offset / max(camera.width, camera.height))
+
+
+def _residuals(
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints
+) -> tuple[FloatArray, NDArray[np.int64]]:
+    """(m, 2) of the model's observations, then of those of fixed points, in pixels; the camera of each."""
+    found, of_camera = [], []
+    for photo_of, xyz, point_of, pixels in (
+        (model.photo_of, model.xyz, model.point_of, None),
+        (fixed.photo_of, fixed.xyz, fixed.point_of, fixed.pixels),
+    ):
+        residuals = np.zeros((len(photo_of), 2))
+        for k, pose in enumerate(model.cam_from_sfm):
+            mine = np.flatnonzero(photo_of == k)
+            seen = keypoints[k][model.keypoint_of[mine]] if pixels is None else pixels[mine]
+            camera = model.cameras[int(model.camera_of[k])]
+            residuals[mine] = camera.project(pose.act(xyz[point_of[mine]])) - seen
+        found.append(np.nan_to_num(residuals, nan=1e3, posinf=1e3, neginf=-1e3))
+        of_camera.append(model.camera_of[photo_of])
+    return np.concatenate(found), np.concatenate(of_camera).astype(np.int64)
