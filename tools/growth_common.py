@@ -27,6 +27,7 @@ from featuredb.store.candidates import contribute
 from ingest.growing import GrowingOptions
 from ingest.growth.grow import GrowthOptions
 from ingest.growth.growth_report import GrowthReport
+from ingest.growth.map_graph import drift_m, places_of
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
@@ -70,7 +71,8 @@ class Registered:
         fact: what it is. map_id, status, generation: of its map.
         offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
         angle_deg: between the orientations.
-        drift_m: 95 % bound that its map claims; None for anchors.
+        drift_m: 95 % bound that its map claims against its anchors; None for anchors.
+        bound_m: 95 % bound that its map claims on Earth, the anchors' own uncertainty included.
     """
 
     fact: AlbumFact
@@ -80,6 +82,7 @@ class Registered:
     offset_m: FloatArray | None
     angle_deg: float
     drift_m: float | None
+    bound_m: float
 
     @property
     def error_m(self) -> float:
@@ -198,6 +201,7 @@ def registered(database: Database, album: Album) -> list[Registered]:
     for summary in database.snapshot().maps():
         feature_map = _load(database, summary.map_id)
         here = album.truth.frame.enu_from(feature_map.frame)
+        bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
         for image in feature_map.images:
             fact = _fact_of(album, feature_map, image.name)
             true = album.truth.images.get(fact.name)
@@ -216,6 +220,7 @@ def registered(database: Database, album: Album) -> list[Registered]:
                     offset_m=offset,
                     angle_deg=angle,
                     drift_m=summary.drift_m,
+                    bound_m=bound_m,
                 )
             )
     return found

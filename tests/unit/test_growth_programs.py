@@ -45,6 +45,7 @@ def placed(f: AlbumFact, error_m: float | None, status: str = "active", drift_m:
         offset_m=None if error_m is None else np.array([0.0, error_m, 0.0]),
         angle_deg=0.0,
         drift_m=drift_m,
+        bound_m=2.0 * drift_m,
     )
 
 
@@ -87,6 +88,7 @@ def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: flo
             drift_m=drift,
             true_m=ratio * drift,
             ratio=ratio,
+            worst_m=ratio * drift,
             stopped=stopped,
             probes=probes,
         )
@@ -103,7 +105,7 @@ def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
         "coverage follows"
     ]
     far = steps(ratio=1.2)
-    assert not holding(growth_walk.judge(far, good[0], 1, 0.5, world))["true drift inside the bound"]
+    assert not holding(growth_walk.judge(far, good[0], 1, 0.5, world))["true error inside the bound"]
     over = steps(drift=0.6)
     assert not holding(growth_walk.judge(over, good[0], 1, 0.5, world))["budget"]
     assert not holding(growth_walk.judge(good, good[0], 2, 0.5, world))["second anchor"]
@@ -112,11 +114,11 @@ def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
     assert not holding(growth_walk.judge([off], good[0], 1, 0.5, world))["probes inside their 95 %"]
 
 
-def test_the_worst_map_is_the_one_furthest_beyond_its_claim() -> None:
+def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
     first = [placed(fact(i), 0.1, drift_m=0.4) for i in range(5)]
     second = [replace(placed(fact(i), 0.08, drift_m=0.1), map_id="m2") for i in range(5, 10)]
     true, ratio = worst_map([*first, *second])
-    assert (true, ratio) == pytest.approx((0.08, 0.8))
+    assert (true, ratio) == pytest.approx((0.08, 0.4))
 
 
 def test_poison_that_gets_in_fails() -> None:
