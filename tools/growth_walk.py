@@ -7,11 +7,12 @@ and `featuredb grow` runs once. After each step photos that nobody contributes (
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
 
-For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %, against the anchor),
-the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error (length of the median
-error of a map's photos) of the map where the two are closest, the photo that is worst, probes answered, their errors, how many lie inside their own
-95 % ellipsoid. Writes walk.json, walk.png (error and bound along the way) and plan-before.png,
-plan-after.png; everything is kept in DIR, and a run that was interrupted goes on.
+For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %, against the
+anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error (length of the
+median error of a map's photos) of the map where the two are closest, the photo that is worst, probes
+answered, their errors, how many lie inside their own 95 % ellipsoid. Writes walk.json, walk.png (error and
+bound along the way) and plan-before.png, plan-after.png; everything is kept in DIR, and a run that was
+interrupted goes on.
 
 Exit code 0 if: coverage follows for at least 600 m or to the budget; the true drift of every map stays inside
 its bound at every step; no active map exceeds the budget, and growth stopped for it or came to the end; after
@@ -132,7 +133,8 @@ def take_step(database: Database, album: Album, batch: int, options: GrowingOpti
     worst = max((p.error_m or 0.0 for p in answered), default=float("nan"))
     say(
         f"step {batch + 1}: reach {step.reach_m:.0f} m, drift claimed {step.drift_m:.2f} m, "
-        f"true {step.true_m:.2f} m ({step.ratio:.0%} of its bound), worst photo {step.worst_m:.2f} m, probes {len(answered)}/{len(step.probes)}, worst {worst:.2f} m"
+        f"true {step.true_m:.2f} m ({step.ratio:.0%} of its bound), worst photo {step.worst_m:.2f} m, "
+        f"probes {len(answered)}/{len(step.probes)}, worst {worst:.2f} m"
     )
     return step
 
@@ -270,7 +272,8 @@ def step_table(steps: Sequence[Step]) -> str:
         inside = sum((p.normalised or 0.0) <= _INSIDE for p in s.probes if p.normalised is not None)
         rows.append(
             (
-                s.step + 1, s.reach_m, s.maps, s.quarantined, s.drift_m, s.true_m, s.ratio, s.worst_m, s.stopped,
+                s.step + 1, s.reach_m, s.maps, s.quarantined, s.drift_m, s.true_m, s.ratio, s.worst_m,
+                s.stopped,
                 f"{len(errors)}/{len(s.probes)}", float(np.median(errors)) if errors else float("nan"),
                 max(errors, default=float("nan")), f"{inside}/{len(errors)}",
             )
