@@ -260,11 +260,17 @@ def _triangulated(
     own. Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
     """
     place = {r: k for k, r in enumerate(rows)}
+    cameras = list(dict.fromkeys(photos[r].camera for r in rows))
     sfm = [
-        SfmPhoto(name=str(r), camera_row=k, keypoints=features_of(r).features.xy) for k, r in enumerate(rows)
+        SfmPhoto(
+            name=str(r),
+            camera_row=cameras.index(photos[r].camera),
+            keypoints=features_of(r).features.xy,
+        )
+        for r in rows
     ]
     model = triangulate_posed(
-        [photos[r].camera for r in rows],
+        cameras,
         sfm,
         [photos[r].cam_from_local for r in rows],
         {(place[a], place[b]): view for (a, b), view in geometries.items()},

@@ -6,9 +6,11 @@ from dataclasses import dataclass, field
 from ingest.colmap_bridge import Model
 from ingest.growth.groups import GroupOptions, lone_groups
 from ingest.growth.grown_map import GrowOptions, grow_component
+from ingest.growth.lone_lenses import with_shared_lenses
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photo import Photo
+from ingest.photo_cameras import shared_key
 from reloc.candidates import IndexedArea
 
 
@@ -67,8 +69,11 @@ def grow_photos(
             taken |= set(rows)
         else:
             refused.append(outcome)
-    lone = {r: photo for r, photo in localised.items() if r not in taken}
-    bystanders = known or {}
+    alone = {r: photo for r, photo in {**(known or {}), **localised}.items() if r not in taken}
+    keys = {r: shared_key(photos[r], "shared") for r in alone}
+    one_lens = with_shared_lenses(alone, keys, options.grow.localise)
+    lone = {r: photo for r, photo in one_lens.items() if r in localised}
+    bystanders = {r: photo for r, photo in one_lens.items() if r not in localised}
     groups, waiting = lone_groups({**bystanders, **lone}, sorted(lone), features_of, options.groups)
     for group in groups:
         members = {r: p for r, p in {**bystanders, **lone}.items() if r in set(group.model.rows.tolist())}

@@ -13,12 +13,14 @@ from ingest.colmap_anchored import with_observations
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.localised import (
+    LocaliseEachOptions,
     localise_photos,
 )
+from ingest.growth.lone_lenses import with_shared_lenses
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from reloc.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, EAST, FRAME, KEY, POINTS, WORLD, existing, prior, walk
-from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
+from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, moved, take_photos
 from tests.support.scenes import (
     CAMERA,
     indexed,
@@ -302,6 +304,23 @@ def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> 
     assert sorted(made.model.rows.tolist()) == [0, 1, 2]
     assert centers_error(made, new).max() < 0.1
     assert np.quantile(made.feature_map.points_local(FRAME)[:, 0], 0.9) > 25.0
+
+
+def test_lone_photos_of_one_camera_have_one_lens(new: NewPhotos, area: IndexedArea) -> None:
+    """One of them came with a focal length a quarter too long and stands as much farther away."""
+    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    long = CAMERA.with_focal(1.25 * CAMERA.focal_px)
+    pose = found[1].cam_from_local
+    back = pose.center + 0.25 * (pose.center - np.median(found[1].points, axis=0))
+    off = replace(found[1], camera=long, cam_from_local=moved(pose, back - pose.center))
+    given = {**found, 1: off}
+    options = LocaliseEachOptions()
+    one = with_shared_lenses(given, dict.fromkeys(range(3), "unnamed"), options)
+    assert {p.camera for p in one.values()} == {CAMERA}
+    assert np.linalg.norm(one[1].cam_from_local.center - new.poses[1].center) < 0.1
+    assert one[0] is found[0]
+    apart = with_shared_lenses(given, {0: "a", 1: "b", 2: "a"}, options)
+    assert apart[1] is off
 
 
 def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
