@@ -36,6 +36,9 @@ class DriftOptions:
             points. They were made with that very lens: what it trades for height, they trade alike.
         own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
         exif_focal_rel: and where EXIF held its focal length.
+        pattern_px: of a lens that nobody knew before: what SIMPLE_RADIAL, RADIAL and fuller models leave over
+            in all their photos alike, as far as it passes for another focal length
+            (`tools/lens_patterns.py` prints it). Flat places from above know nothing better.
         max_photos: of more, the rest is taken to be no worse; the equations are dense.
         max_points: free points that take part; fewer know less, so the bound stays one.
     """
@@ -46,6 +49,7 @@ class DriftOptions:
     own_focal_rel: float = 0.15
     own_distortion: float = 0.1
     exif_focal_rel: float = FocalPriorOptions().sigma_rel
+    pattern_px: tuple[float, float, float] = (0.3, 0.1, 0.03)
     max_photos: int = 300
     max_points: int = 20_000
 
@@ -125,7 +129,46 @@ def photo_covariances(
     for k in seen.tolist():
         block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
         spread[k] = (block + block.T) / 2
+    for c in sorted(set(range(len(model.cameras))) - {*lenses.constant, *lenses.focal_px}):
+        parts = [(linear, lens[c]) for linear, lens in ((free, free_lens), (held, held_lens))]
+        for k, moves in _by_unknown_focal(model, c, parts, options).items():
+            spread[k] += np.outer(moves, moves)
     return spread
+
+
+def _by_unknown_focal(
+    model: Model, c: int, parts: Sequence[tuple[Linearised, FloatArray]], options: DriftOptions
+) -> dict[int, FloatArray]:
+    """How the poses of a camera's photos move, each (6,), with what its focal length may be off at one sigma.
+
+    The photos tell a focal length by what a pose cannot take over of it: the relief of what they show. A
+    pattern that the lens model leaves over passes for that, however many observations there are.
+
+    Args:
+        parts: observations of the model with, of those of this camera, the derivatives by its lens.
+    """
+    camera = model.cameras[c]
+    columns = [camera.params[i] if camera.params[i] > 10.0 else 0.0 for i in camera.lens_parameters()]
+    moves: dict[int, FloatArray] = {}
+    square, count = 0.0, 0
+    for k in np.flatnonzero(model.camera_of == c).tolist():
+        by_pose, by_focal = [], []
+        for linear, by_lens in parts:
+            own = model.camera_of[linear.photo_of] == c
+            mine = linear.photo_of[own] == k
+            good = np.isfinite(linear.by_pose[own][mine]).all(axis=(1, 2))
+            by_pose.append(linear.by_pose[own][mine][good].reshape(-1, 6))
+            by_focal.append((by_lens[mine][good] @ columns).reshape(-1))
+        pose, focal = np.concatenate(by_pose), np.concatenate(by_focal)
+        if len(focal) < 8:
+            continue
+        moves[k] = np.linalg.lstsq(pose, focal, rcond=None)[0]
+        square += float(((focal - pose @ moves[k]) ** 2).sum())
+        count += len(focal) // 2
+    told_px = np.sqrt(square / max(count, 1))  # for a focal length that is off by its own size
+    pattern_px = options.pattern_px[{"SIMPLE_RADIAL": 0, "RADIAL": 1}.get(camera.model, 2)]
+    sigma = 1.0 / np.hypot(1.0 / options.own_focal_rel, told_px / pattern_px)
+    return {k: move * sigma for k, move in moves.items()}
 
 
 def _sigmas_px(model: Model, linear: Linearised, pixels: FloatArray, options: DriftOptions) -> FloatArray:

@@ -50,8 +50,8 @@ def own_lenses(
     """Lenses by camera of the model, of those cameras that explain their photos far better with one.
 
     Cameras that hold a map's lens, or have one distortion coefficient, are adjusted along, with two of them
-    (or all that the map's lens has). Where that helps, they try tangential coefficients, a second focal
-    length and the principal point.
+    (or all that the map's lens has). Where that helps, and where they have two already, tangential
+    coefficients, a second focal length and the principal point are tried.
 
     Args:
         adjusted: with `lenses`, and with the existing points. keypoints: of its photos.
@@ -62,7 +62,8 @@ def own_lenses(
     asked = [
         c
         for c, camera in enumerate(model.cameras)
-        if support[c] >= options.least_held and (c in lenses.constant or camera.model == "SIMPLE_RADIAL")
+        if support[c] >= options.least_held
+        and (c in lenses.constant or camera.model in ("SIMPLE_RADIAL", "RADIAL"))
     ]
     if not asked:
         return {}
@@ -72,9 +73,9 @@ def own_lenses(
     radial = adjust_anchored(freer, keypoints, held, constant, every, lenses.focal_px).model
     free_before = {c: 0 if c in lenses.constant else len(model.cameras[c].lens_parameters()) for c in asked}
     more = {c: len(radial.cameras[c].lens_parameters()) - free_before[c] for c in asked}
-    gains = _gains(model, radial, keypoints, held, more)
-    chosen = {c: radial.cameras[c] for c in asked if gains[c] >= options.evidence}
-    centered = [c for c, camera in chosen.items() if camera.model == "RADIAL"]
+    gains = _gains(model, radial, keypoints, held, {c: count for c, count in more.items() if count})
+    chosen = {c: radial.cameras[c] for c, gain in gains.items() if gain >= options.evidence}
+    centered = [c for c in asked if radial.cameras[c].model == "RADIAL" and (c in chosen or more[c] == 0)]
     if centered:
         freer = _with_cameras(radial, {c: _as_opencv(radial.cameras[c]) for c in centered})
         # Principal points are free for all lenses or none; the others stay as they are.

@@ -15,10 +15,12 @@ from ingest.growth.drift import (
     photo_covariances,
 )
 from ingest.growth.refine import Lenses
+from ingest.growth.settle import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 
 GIVEN, FREE = Lenses(constant=(0,), focal_px={}), Lenses(constant=(), focal_px={})
+EXIF = Lenses(constant=(), focal_px={0: CAMERA.focal_px})
 COUNT = 40  # world points that the existing map has; they lie in the west
 PHOTOS = 6
 
@@ -129,3 +131,38 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     none = photo_covariances(*arguments[:-1], np.zeros_like(kept), GIVEN, DriftOptions())
     assert np.isnan(none).all()  # nothing holds it
     assert bending_variance_m2(new.model, np.eye(7), none) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("relief_m", "lenses", "told"),
+    [(0.6, FREE, False), (25.0, FREE, True), (0.6, GIVEN, True), (0.6, EXIF, True)],
+    ids=["flat", "towers", "flat, lens lent", "flat, EXIF"],
+)
+def test_a_flat_place_from_above_does_not_tell_a_lens_that_nobody_knew(
+    relief_m: float, lenses: Lenses, told: bool
+) -> None:
+    """2,000 observations of a fifth of a pixel say centimetres; the pattern of a lens model is metres."""
+    rng = np.random.default_rng(4)
+    points = np.column_stack([rng.uniform(-25, 25, 2000), rng.uniform(-20, 20, 2000), np.zeros(2000)])
+    points[:, 2] = rng.uniform(0, relief_m, 2000)
+    poses = [looking_at(np.array([3.0 * k, -1.0, 40.0]), np.array([3.0 * k, 0.0, 0.0])) for k in range(2)]
+    new = take_photos(
+        rng,
+        points,
+        random_descriptors(rng, len(points)),
+        poses,
+        sfm_from_local=Sim3.identity(),
+        noise_px=0.2,
+        point_noise_m=0.01,
+        pose_noise_m=0.0,
+    )
+    fixed = FixedPoints(
+        xyz=points,
+        point_of=np.concatenate(new.world_of),
+        photo_of=np.repeat([0, 1], [len(w) for w in new.world_of]),
+        pixels=np.concatenate(list(new.keypoints().values())),
+    )
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    spread = photo_covariances(new.model, list(new.keypoints().values()), fixed, kept, lenses, DriftOptions())
+    loose = loose_photos(new.model, spread, 0.5)
+    assert sorted(loose) == ([] if told else [0, 1])
