@@ -69,7 +69,7 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         choices=("shared", "per-image"),
         default="shared",
         help="whether photos of one make, model, size and focal length share their intrinsics, and photos "
-        "that name no camera those of the same owner, day and size; default: shared",
+        "that name no camera those of the same owner, day (if known) and size; default: shared",
     )
     group.add_argument("--camera-model", default=None, help="COLMAP's name; default: SIMPLE_RADIAL")
     group.add_argument(

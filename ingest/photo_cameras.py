@@ -36,15 +36,16 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
 
     Those of one make, model, size and focal length do. A photo that names no camera shares with those of the
     same owner, day and size: left alone, a view straight down finds a focal length a quarter off and a height
-    to go with it. Without owner or time it is alone.
+    to go with it. Where no day is known, which is so for most contributions without EXIF, owner and size
+    must do; without an owner it is alone.
     """
     if sharing == "per-image":
         return photo.name
     if photo.camera_key:
         return photo.camera_key
-    if not photo.owner or photo.capture_time is None:
+    if not photo.owner:
         return photo.name
     time = photo.capture_time
-    day = (time.astimezone(UTC) if time.tzinfo else time).date()
+    day = "some day" if time is None else str((time.astimezone(UTC) if time.tzinfo else time).date())
     focal = "" if photo.focal_px is None else f", {photo.focal_px:.1f} px"
     return f"unnamed camera of {photo.owner}, {day}, {photo.width} x {photo.height}{focal}"

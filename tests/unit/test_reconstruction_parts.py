@@ -51,10 +51,11 @@ def test_photos_that_name_no_camera_share_with_those_of_their_owner_day_and_size
         replace(mine, focal_px=2800.0),
         replace(mine, owner=""),
         replace(mine, capture_time=None),
+        replace(mine, capture_time=None),
     ]
     photos = [replace(p, name=str(k)) for k, p in enumerate([mine, *others])]
-    assert photo_cameras(photos, "shared", "SIMPLE_RADIAL")[1] == [0, 0, 1, 2, 3, 4, 5, 6]
-    assert photo_cameras(photos, "per-image", "SIMPLE_RADIAL")[1] == list(range(8))
+    assert photo_cameras(photos, "shared", "SIMPLE_RADIAL")[1] == [0, 0, 1, 2, 3, 4, 5, 6, 6]
+    assert photo_cameras(photos, "per-image", "SIMPLE_RADIAL")[1] == list(range(9))
 
 
 def _at(latitude: float, longitude: float, height: float | None) -> Photo:
