@@ -253,7 +253,9 @@ def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
     area: IndexedArea, real: Camera
 ) -> None:
     """The map's lens is 0.7 % off and lacks what the photos show; every later photo would repeat it."""
-    new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real)
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.15
+    )
     found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
     assert {p.camera for p in found.values()} == {CAMERA}
     lent = replace(new.model, cameras=(CAMERA,))
