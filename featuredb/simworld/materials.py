@@ -33,10 +33,12 @@ def town_textures(seed: int, pieces: int = 1) -> dict[str, Texture]:
     """Every texture but the painted ground and the water, plus `detail`, by name.
 
     Args:
-        pieces: of each wall and each tiled roof, one beside the other along u.
+        pieces: of each wall and each tiled roof, one beside the other along u. With several, the land around
+            the town repeats every 1,024 m only, not every 256 m: photos that look out of a long town find
+            their twins otherwise.
     """
     painters: dict[str, Callable[[np.random.Generator], Texture]] = {
-        "fields": _fields,
+        "fields": lambda r: _fields(r, pieces),
         "facade_brick": lambda r: _facade(r, (150, 84, 66), pieces, brick=True),
         "facade_plaster": lambda r: _facade(r, (214, 206, 190), pieces, brick=False),
         "facade_ochre": lambda r: _facade(r, (206, 170, 110), pieces, brick=False),
@@ -223,9 +225,11 @@ def _leaves(rng: np.random.Generator) -> Texture:
     return Texture.from_image(to_image(image), 0.03)
 
 
-def _fields(rng: np.random.Generator) -> Texture:
-    """Land around the town, coarse."""
-    level = 1.0 + 0.16 * periodic(_SIZE, rng, exponent=1.0)
+def _fields(rng: np.random.Generator, pieces: int) -> Texture:
+    """Land around the town, coarse; of one look whatever its period."""
+    times = 1 if pieces == 1 else 4
+    size, low = _SIZE * times, float(times)
+    level = 1.0 + 0.16 * periodic(size, rng, exponent=1.0, low=low)
     image = _coloured((112, 122, 74), level.astype(np.float32))
-    image[..., 0] += 14 * periodic(_SIZE, rng, exponent=1.6)
+    image[..., 0] += 14 * periodic(size, rng, exponent=1.6, low=low)
     return Texture.from_image(to_image(image), 0.25)

@@ -295,3 +295,14 @@ def test_flight_options_are_checked() -> None:
         FlightOptions(gps_error="perfect")  # type: ignore[arg-type]
     with pytest.raises(InvalidValueError, match="out of range"):
         FlightOptions(forward_overlap=1.0)
+
+
+def test_the_land_around_a_town_of_pieces_does_not_repeat_every_256_m() -> None:
+    plain, varied = (town_textures(3, pieces)["fields"] for pieces in (1, 2))
+    side = plain.levels[0].shape[0]
+    land = varied.levels[0].astype(np.float64)[..., 1]
+    assert land.shape == (4 * side, 4 * side)
+    for shift in ((side, 0), (0, side), (2 * side, side)):
+        again = np.roll(land, shift, axis=(0, 1))
+        assert abs(np.corrcoef(land[::8, ::8].ravel(), again[::8, ::8].ravel())[0, 1]) < 0.3
+    assert varied.levels[0].std() == pytest.approx(plain.levels[0].std(), rel=0.1)
