@@ -26,7 +26,7 @@ class Photo:
             orientation is kept for display only.
         make, model: camera maker and model from EXIF, "" where absent.
         camera_key: photos with equal keys share one set of intrinsics (see featuredb.features.exif); ""
-            where the photo names no camera, so that it shares with none.
+            where the photo names no camera (who it shares with then: ingest.photo_cameras).
         focal_px: focal length from EXIF in pixels of the stored image, or None.
         capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.
         gps: position prior from EXIF or a table, or None.

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import information_gain
+from ingest.colmap_adjust import AdjustOptions, information_gain
 from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
 from ingest.colmap_bridge import Model
-from ingest.growth.refine import Lenses
+from ingest.growth.refine import Lenses, with_cameras
 
 _LOG = logging.getLogger(__name__)
 _MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the principal point
@@ -34,12 +34,13 @@ class OwnLensOptions:
             photos there bend their lens after it: they gained 21, 26 and 40 on `brighton` and `copr`, with
             focal lengths 1 to 3 % off. Lenses that truly are otherwise gained 157 and 820 in the simulated
             walk. Every gain is logged at level INFO.
-        max_center_shift_rel: of OPENCV, see `ingest.colmap_adjust.AdjustOptions`.
-        least_held: observations of existing points by the camera's photos.
+        max_center_shift_rel: of OPENCV, as for the lens of a reconstruction.
+        least_held: observations of existing points by the camera's photos; fewer do not tell eight parameters
+            of a lens from the poses.
     """
 
     evidence: float = 75.0
-    max_center_shift_rel: float = 0.03
+    max_center_shift_rel: float = AdjustOptions().max_center_shift_rel
     least_held: int = 100
 
 
@@ -73,7 +74,7 @@ def own_lenses(
         return {}
     every = replace(adjust, rounds=1, max_error_px=np.inf)  # the same observations before and after
     constant = [c for c in lenses.constant if c not in asked]
-    freer = _with_cameras(model, {c: _fuller(model.cameras[c]) for c in asked})
+    freer = with_cameras(model, {c: _fuller(model.cameras[c]) for c in asked})
     radial = adjust_anchored(freer, keypoints, held, constant, every, lenses.focal_px).model
     free_before = {c: 0 if c in lenses.constant else len(model.cameras[c].lens_parameters()) for c in asked}
     more = {c: len(radial.cameras[c].lens_parameters()) - free_before[c] for c in asked}
@@ -81,7 +82,7 @@ def own_lenses(
     chosen = {c: radial.cameras[c] for c, gain in gains.items() if gain >= options.evidence}
     centered = [c for c in asked if radial.cameras[c].model == "RADIAL" and (c in chosen or more[c] == 0)]
     if centered:
-        freer = _with_cameras(radial, {c: _as_opencv(radial.cameras[c]) for c in centered})
+        freer = with_cameras(radial, {c: _as_opencv(radial.cameras[c]) for c in centered})
         # Principal points are free for all lenses or none; the others stay as they are.
         others = sorted(set(range(len(model.cameras))) - set(centered))
         opencv = adjust_anchored(
@@ -118,11 +119,20 @@ def _gains(
     """
     was, of_camera = _residuals(before, keypoints, fixed)
     now, _ = _residuals(after, keypoints, fixed)
-    return {c: information_gain(was[of_camera == c], now[of_camera == c], count) for c, count in more.items()}
-
-
-def _with_cameras(model: Model, cameras: Mapping[int, Camera]) -> Model:
-    return replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
+    gains = {
+        c: information_gain(was[of_camera == c], now[of_camera == c], count) for c, count in more.items()
+    }
+    for c, gain in gains.items():
+        _LOG.info(
+            "%d photos: %s, %.1f px, gains %.1f times the penalty over %s, %.1f px",
+            int((before.camera_of == c).sum()),
+            after.cameras[c].model,
+            after.cameras[c].focal_px,
+            gain,
+            before.cameras[c].model,
+            before.cameras[c].focal_px,
+        )
+    return gains
 
 
 def _fuller(camera: Camera) -> Camera:

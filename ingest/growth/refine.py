@@ -92,11 +92,16 @@ def hold_lenses(
     options: RefineOptions,
 ) -> Model:
     """The model adjusted, in its own frame, to lenses that are given by camera."""
-    given = replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
+    given = with_cameras(model, cameras)
     constant = sorted({*lenses.constant, *cameras})
     return adjust_anchored(
         given, keypoints, FixedPoints.none(), constant, options.adjust, lenses.focal_px
     ).model
+
+
+def with_cameras(model: Model, cameras: Mapping[int, Camera]) -> Model:
+    """The model with other lenses, by camera; nothing else is changed."""
+    return replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:

@@ -1,5 +1,6 @@
 """Growth on a small made-up world whose truth is known: placed, refined, refused."""
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -250,7 +251,7 @@ def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
     ids=["radial", "opencv"],
 )
 def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
-    area: IndexedArea, real: Camera
+    area: IndexedArea, real: Camera, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The map's lens is 0.7 % off and lacks what the photos show; every later photo would repeat it."""
     new = take_photos(
@@ -259,8 +260,10 @@ def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
     found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
     assert {p.camera for p in found.values()} == {CAMERA}
     lent = replace(new.model, cameras=(CAMERA,))
-    grown = grow_component(lent, new.photos, new.features_of, found, [area], identity())
+    with caplog.at_level(logging.INFO, logger="ingest.growth.own_lenses"):
+        grown = grow_component(lent, new.photos, new.features_of, found, [area], identity())
     assert isinstance(grown, GrownMap), grown
+    assert "times the penalty over SIMPLE_RADIAL" in caplog.text
     (camera,) = grown.model.cameras
     assert camera.model == real.model
     assert camera.focal_px == pytest.approx(real.focal_px, rel=1e-3)
