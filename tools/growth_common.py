@@ -1,6 +1,7 @@
 """What the programs that measure growth share: an anchored database, contributions, errors, a plan."""
 
 import json
+import logging
 import shutil
 import sys
 import time
@@ -106,6 +107,12 @@ class Verdict:
 def say(text: str) -> None:
     sys.stdout.write(f"{time.strftime('%H:%M:%S')} {text}\n")
     sys.stdout.flush()
+
+
+def log_to_stderr(verbose: bool) -> None:
+    """What growth logs goes to stderr: everything, or warnings and failures alone."""
+    logging.basicConfig(format="%(message)s", level=logging.INFO if verbose else logging.WARNING)
+    logging.getLogger("faiss").setLevel(logging.WARNING)
 
 
 def made(write: Callable[..., Path], folder: Path, options: Any, workers: int) -> "Album":

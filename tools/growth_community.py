@@ -32,6 +32,7 @@ from tools.growth_common import (
     conclude,
     give,
     growing_options,
+    log_to_stderr,
     made,
     plan_view,
     registered,
@@ -47,6 +48,7 @@ _SHARE, _MEDIAN_M = 0.70, 0.30
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
+    log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     options = CommunityOptions.short(args.seed) if args.size == "short" else CommunityOptions(seed=args.seed)
     if args.pieces is not None:
@@ -154,6 +156,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
     parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     parser.add_argument("--pieces", type=int, default=None, help="of the town's walls; 1: a town of twins")
     parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)

@@ -45,6 +45,7 @@ from ingest.register.gps import similarity_closed_form
 from ingest.scan import ScanOptions, require_usable, scan_folder
 from ingest.workspace import Workspace
 from reloc.localiser import Localiser
+from tools.growth_common import log_to_stderr
 
 _PORTIONS = 3
 _LIMIT_M = 0.3
@@ -79,8 +80,7 @@ class State:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    logging.basicConfig(format="%(message)s", level=logging.INFO if args.verbose else logging.WARNING)
-    logging.getLogger("faiss").setLevel(logging.WARNING)
+    log_to_stderr(args.verbose)
     photos = list(require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2))
     making = MapMakingOptions()
     started = time.process_time()

@@ -47,6 +47,7 @@ from tools.growth_common import (
     conclude,
     give,
     growing_options,
+    log_to_stderr,
     made,
     plan_view,
     registered,
@@ -98,6 +99,7 @@ class Step:
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
+    log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     world = WalkOptions.short(args.seed) if args.size == "short" else WalkOptions(seed=args.seed)
     folder = args.world or args.out / f"world-{args.size}-{args.seed}"
@@ -335,6 +337,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
     parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     return parser.parse_args(argv)
 
 
