@@ -12,7 +12,7 @@ import copy
 import logging
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 import pycolmap
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from ingest.colmap_bridge import SfmPhoto, quiet
 from ingest.focal_prior import (
     FocalPriorOptions,
@@ -28,11 +29,17 @@ from ingest.focal_prior import (
     fix_gauge,
     take_adjusted,
 )
+from ingest.lens_ladder import (
+    MORE_OF_OPENCV,
+    MORE_OF_RADIAL,
+    as_opencv,
+    as_radial,
+    center_shift_rel,
+    information_gain,
+)
 from ingest.precision import shared_variance_px2
 
 _LOG = logging.getLogger(__name__)
-_MORE_OF_RADIAL = 1  # the second radial coefficient
-_MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the principal point
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
 _MAX_ERROR_OVER_SCALE = 8.0
 _MIN_ANGLE_DEG = 1.5
@@ -169,9 +176,9 @@ def _adjusted(
     if fuller:
         radial = copy.deepcopy(reconstruction)
         for camera_id in fuller:
-            _as_radial(radial.camera(camera_id))
+            _climb(radial.camera(camera_id), as_radial)
         _bundle(radial, known, loss_scale_px, [], options)
-        gain = information_gain(_residuals(reconstruction), _residuals(radial), _MORE_OF_RADIAL * len(fuller))
+        gain = information_gain(_residuals(reconstruction), _residuals(radial), MORE_OF_RADIAL * len(fuller))
         _LOG.info("%s: RADIAL gains %.1f times the penalty", folder.name, gain)
         if gain >= options.radial_evidence:
             return _with_opencv(radial, fuller, folder, database, known, loss_scale_px, options)
@@ -191,32 +198,16 @@ def _with_opencv(
     """The better of RADIAL and OPENCV, with points triangulated anew."""
     opencv = copy.deepcopy(radial)
     for camera_id in fuller:
-        _as_opencv(opencv.camera(camera_id))
+        _climb(opencv.camera(camera_id), as_opencv)
     _bundle(opencv, known, loss_scale_px, fuller, options)
-    gain = information_gain(_residuals(radial), _residuals(opencv), _MORE_OF_OPENCV * len(fuller))
+    gain = information_gain(_residuals(radial), _residuals(opencv), MORE_OF_OPENCV * len(fuller))
     _LOG.info("%s: OPENCV gains %.1f times the penalty", folder.name, gain)
-    shift = max(_center_shift_rel(opencv.camera(camera_id)) for camera_id in fuller)
+    shift = max(center_shift_rel(Camera.from_pycolmap(opencv.camera(camera_id))) for camera_id in fuller)
     measured = gain >= options.opencv_evidence and shift <= options.max_center_shift_rel
     chosen, free_center = (opencv, fuller) if measured else (radial, [])
     chosen = _triangulated_anew(chosen, database, folder)
     _bundle(chosen, known, loss_scale_px, free_center, options)
     return chosen
-
-
-def information_gain(before: FloatArray, after: FloatArray, more_parameters: int) -> float:
-    """Drop of twice the negative log-likelihood, over the criterion's penalty for the parameters.
-
-    Residuals (m, 2) of the same observations, Cauchy-distributed with the scale that `before` shows.
-    Schwarz, Estimating the dimension of a model, 1978.
-    """
-    scale = 1.4826 * max(float(np.median(np.abs(before))), 1e-6)
-    drop = 2.0 * (_cauchy_cost(before, scale) - _cauchy_cost(after, scale))
-    return float(drop / (more_parameters * np.log(before.size)))
-
-
-def _cauchy_cost(residuals: FloatArray, scale: float) -> float:
-    squared = np.sum(residuals**2, axis=1) / scale**2
-    return float(np.log1p(np.where(np.isfinite(squared), squared, 1e12)).sum())
 
 
 def _cameras_to_free(reconstruction: Any, options: AdjustOptions) -> list[int]:
@@ -230,26 +221,11 @@ def _cameras_to_free(reconstruction: Any, options: AdjustOptions) -> list[int]:
     )
 
 
-def _as_radial(camera: Any) -> None:
-    """The same SIMPLE_RADIAL lens as a RADIAL camera."""
-    f, cx, cy, k = camera.params
-    camera.model = pycolmap.CameraModelId.RADIAL
-    camera.params = [f, cx, cy, k, 0.0]
-
-
-def _as_opencv(camera: Any) -> None:
-    """The same RADIAL lens as an OPENCV camera."""
-    f, cx, cy, k1, k2 = camera.params
-    camera.model = pycolmap.CameraModelId.OPENCV
-    camera.params = [f, f, cx, cy, k1, k2, 0.0, 0.0]
-
-
-def _center_shift_rel(camera: Any) -> float:
-    """Distance of the principal point from the image's middle, as a share of the longer side."""
-    offset = np.hypot(
-        camera.principal_point_x - 0.5 * camera.width, camera.principal_point_y - 0.5 * camera.height
-    )
-    return float(offset / max(camera.width, camera.height))
+def _climb(camera: Any, rung: Callable[[Camera], Camera]) -> None:
+    """Turn a camera of a reconstruction into the same lens one rung further up."""
+    fuller = rung(Camera.from_pycolmap(camera))
+    camera.model = pycolmap.CameraModelId.__members__[fuller.model]
+    camera.params = list(fuller.params)
 
 
 def _bundle(

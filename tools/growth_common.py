@@ -283,6 +283,15 @@ def tell(report: GrowthReport) -> None:
         say(line[:300])
 
 
+def failures(report: GrowthReport) -> int:
+    """Photos that a step lost by an exception that it did not foresee, not by a reason."""
+    return sum(p.reason_code == "FAILED" for p in report.photos)
+
+
+def none_failed(count: int) -> Verdict:
+    return Verdict(name="no step failed", text=f"{count} photos lost by an exception", holds=count == 0)
+
+
 def plan_view(
     path: Path, album: Album, found: Sequence[Registered], title: str, among: Sequence[str]
 ) -> None:

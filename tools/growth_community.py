@@ -30,10 +30,12 @@ from tools.growth_common import (
     Verdict,
     anchored,
     conclude,
+    failures,
     give,
     growing_options,
     log_to_stderr,
     made,
+    none_failed,
     plan_view,
     registered,
     say,
@@ -71,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)
     sys.stdout.write(breakdown(album, found))
-    verdicts = judge(album, found)
+    verdicts = [*judge(album, found), none_failed(failures(report))]
     for status in ("active", "quarantined"):
         some = [r for r in found if r.status == status]
         plan_view(args.out / f"plan-{status}.png", album, some, f"community, {status} maps", _OWN)

@@ -48,10 +48,13 @@ from tools.growth_common import (
     Verdict,
     anchored,
     conclude,
+    failures,
     give,
     growing_options,
+    log_to_stderr,
     made,
     newest_copy,
+    none_failed,
     plan_view,
     registered,
     say,
@@ -74,6 +77,7 @@ class Outcome:
         off_share: largest share of points off the true surface among active grown maps with poison.
         forced: maps that were forced in. restored: whether all answers came back; changed: whether any had
             changed meanwhile.
+        failed: photos lost by an exception.
     """
 
     poison: str
@@ -86,10 +90,12 @@ class Outcome:
     forced: int = 0
     changed: bool = False
     restored: bool = True
+    failed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
+    log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     world = PoisonOptions.short(args.seed) if args.size == "short" else PoisonOptions(seed=args.seed)
     folder = args.world or args.out / f"world-{args.size}-{args.seed}"
@@ -151,10 +157,12 @@ def try_poison(
     name = poison.replace(" ", "-")
     database = newest_copy(Path(base.url), out / f"db-{name}")
     sent = album.of(*kinds)
-    give(database, album, sent)
-    tell(grow_candidates(database, options))
-    give(database, album, album.of("late"))
-    tell(grow_candidates(database, options))
+    failed = 0
+    for arrived in (sent, album.of("late")):
+        give(database, album, arrived)
+        report = grow_candidates(database, options)
+        tell(report)
+        failed += failures(report)
     found = registered(database, album)
     plan_view(out / f"plan-{name}.png", album, found, poison, (*kinds, "late", "honest"))
     active = [r for r in found if r.status == "active" and r.generation > 0]
@@ -175,6 +183,7 @@ def try_poison(
         forced=forced["forced"],
         changed=forced["changed"],
         restored=forced["restored"],
+        failed=failed,
     )
 
 
@@ -306,6 +315,7 @@ def judge(outcomes: Sequence[Outcome], clean: float, fabricated: dict[str, Any])
             holds=all(o.restored for o in forced) and fabricated["restored"] and fabricated["changed"],
         )
     )
+    verdicts.append(none_failed(sum(o.failed for o in outcomes)))
     return verdicts
 
 
@@ -324,6 +334,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
     parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     return parser.parse_args(argv)
 
 

@@ -23,7 +23,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +45,12 @@ from tools.growth_common import (
     Verdict,
     anchored,
     conclude,
+    failures,
     give,
     growing_options,
     log_to_stderr,
     made,
+    none_failed,
     plan_view,
     registered,
     say,
@@ -82,7 +84,7 @@ class Step:
         maps, quarantined: numbers of grown maps.
         drift_m: largest claimed of active maps. true_m: length of the median error of the map that is worst
             against its bound on Earth; ratio: that over the bound. worst_m: largest error of a photo.
-        stopped: photos that wait for the drift budget.
+        stopped: photos that wait for the drift budget. failed: photos lost by an exception.
     """
 
     step: int
@@ -95,6 +97,7 @@ class Step:
     worst_m: float
     stopped: int
     probes: tuple[Probe, ...]
+    failed: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -130,7 +133,7 @@ def take_step(database: Database, album: Album, batch: int, options: GrowingOpti
     report = grow_candidates(database, options)
     tell(report)
     stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
-    step = measure(database, album, batch, stopped)
+    step = replace(measure(database, album, batch, stopped), failed=failures(report))
     answered = [p for p in step.probes if p.error_m is not None]
     worst = max((p.error_m or 0.0 for p in answered), default=float("nan"))
     say(
@@ -219,9 +222,8 @@ def second_anchor(
         commits += any(now[i] != known[i] for i in now.keys() & known.keys())
         known = {**known, **now}
     last = max(f.batch for f in album.of("walk"))
-    return measure(
-        database, album, last, sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
-    ), commits
+    stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
+    return replace(measure(database, album, last, stopped), failed=failures(report)), commits
 
 
 def judge(
@@ -264,6 +266,7 @@ def judge(
             f"{_AFTER_M} m; {len(errors)} of {len(end.probes)} answered; maps moved in {commits} commits",
             holds=bool(errors) and max(errors) < _AFTER_M and commits == 1,
         ),
+        none_failed(sum(s.failed for s in (*steps, end))),
     ]
 
 

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import AdjustOptions, information_gain
+from ingest.colmap_adjust import AdjustOptions
 from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
 from ingest.colmap_bridge import Model
 from ingest.growth.refine import Lenses, with_cameras
+from ingest.lens_ladder import MORE_OF_OPENCV, as_opencv, as_radial, center_shift_rel, information_gain
 
 _LOG = logging.getLogger(__name__)
-_MORE_OF_OPENCV = 5  # the other focal length, two tangential coefficients, the principal point
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,7 +30,7 @@ class OwnLensOptions:
 
     Attributes:
         evidence: how many times the penalty of the information criterion the gain must be
-            (`ingest.colmap_adjust.information_gain`), at each rung. The rim of a map is bent, and a few
+            (`ingest.lens_ladder.information_gain`), at each rung. The rim of a map is bent, and a few
             photos there bend their lens after it: they gained 21, 26 and 40 on `brighton` and `copr`, with
             focal lengths 1 to 3 % off. Lenses that truly are otherwise gained 157 and 820 in the simulated
             walk. Every gain is logged at level INFO.
@@ -82,18 +82,18 @@ def own_lenses(
     chosen = {c: radial.cameras[c] for c, gain in gains.items() if gain >= options.evidence}
     centered = [c for c in asked if radial.cameras[c].model == "RADIAL" and (c in chosen or more[c] == 0)]
     if centered:
-        freer = with_cameras(radial, {c: _as_opencv(radial.cameras[c]) for c in centered})
+        freer = with_cameras(radial, {c: as_opencv(radial.cameras[c]) for c in centered})
         # Principal points are free for all lenses or none; the others stay as they are.
         others = sorted(set(range(len(model.cameras))) - set(centered))
         opencv = adjust_anchored(
             freer, keypoints, held, others, every, lenses.focal_px, free_centers=True
         ).model
-        gains = _gains(radial, opencv, keypoints, held, dict.fromkeys(centered, _MORE_OF_OPENCV))
+        gains = _gains(radial, opencv, keypoints, held, dict.fromkeys(centered, MORE_OF_OPENCV))
         chosen |= {
             c: opencv.cameras[c]
             for c in centered
             if gains[c] >= options.evidence
-            and _center_shift_rel(opencv.cameras[c]) <= options.max_center_shift_rel
+            and center_shift_rel(opencv.cameras[c]) <= options.max_center_shift_rel
         }
     return chosen
 
@@ -137,22 +137,7 @@ def _gains(
 
 def _fuller(camera: Camera) -> Camera:
     """The same lens with a second radial coefficient, if it has one."""
-    if camera.model != "SIMPLE_RADIAL":
-        return camera
-    return replace(camera, model="RADIAL", params=(*camera.params, 0.0))
-
-
-def _as_opencv(camera: Camera) -> Camera:
-    """The same RADIAL lens with two focal lengths and tangential coefficients."""
-    f, cx, cy, k1, k2 = camera.params
-    return replace(camera, model="OPENCV", params=(f, f, cx, cy, k1, k2, 0.0, 0.0))
-
-
-def _center_shift_rel(camera: Camera) -> float:
-    """Distance of the principal point from the image's middle, as a share of the longer side."""
-    x, y = camera.params[2:4]
-    offset = np.hypot(x - 0.5 * camera.width, y - 0.5 * camera.height)
-    return float(offset / max(camera.width, camera.height))
+    return as_radial(camera) if camera.model == "SIMPLE_RADIAL" else camera
 
 
 def _residuals(
