@@ -59,7 +59,7 @@ def contradicting_photos(
     Args:
         model: refined, in metres.
         localised: by place in the model; others than those that agreed with the placement are not asked.
-        spread: (k, 6, 6) of `photo_covariances`; unknown ones (NaN) add nothing.
+        spread: (k, 6, 6) of `PhotoSpread`; unknown ones (NaN) add nothing.
         fits: of the model to the existing points, as it came and refined.
     """
     limit = gates.sigmas_limit(options.sigmas, 6)

@@ -14,6 +14,7 @@ from scipy import sparse
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap_anchored import FixedPoints, with_observations
 from ingest.colmap_bridge import Model
@@ -23,6 +24,7 @@ from ingest.precision import Linearised, design_effect, linearise
 
 _LEAST_FREEDOM = 0.1
 _LEAST_OBSERVATIONS = 100  # of a camera; fewer show no pattern
+_PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +56,46 @@ class DriftOptions:
     max_points: int = 20_000
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhotoSpread:
+    """How far the photos of a model may be off, relative to the existing points.
+
+    Attributes:
+        poses: (k, 6, 6) of the left perturbation of each cam_from_local; NaN for photos that see nothing, and
+            for all where there are more than `DriftOptions.max_photos`.
+        turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
+            may be turned: the mean rotation of the photo and those that share most points with it. What comes
+            next is tied to such a piece. NaN as before.
+    """
+
+    poses: FloatArray
+    turns: FloatArray
+
+    def of(self, rows: Sequence[int]) -> "PhotoSpread":
+        """Of some of the photos."""
+        return PhotoSpread(poses=self.poses[list(rows)], turns=self.turns[list(rows)])
+
+
+def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
+    """(7, 7) to be added to a similarity's covariance to hold the directions of all pieces of a model.
+
+    A reconstruction that bends by centimetres at its far end has turned there, and what is tied to that end
+    goes on in the new direction: over many maps the turns are what counts. About the photos' middle.
+
+    Args:
+        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
+    """
+    seen = np.isfinite(spread.turns[:, 0, 0])
+    if not seen.any():
+        return np.zeros((7, 7))
+    more = np.zeros((3, 3))
+    for turn in spread.turns[seen]:
+        values, vectors = np.linalg.eigh(turn - covariance[1:4, 1:4] - more)
+        more += (vectors * np.maximum(values, 0.0)) @ vectors.T
+    about = np.vstack([np.zeros((1, 3)), np.eye(3), skew(model.centers()[seen].mean(axis=0))])
+    return np.asarray(about @ more @ about.T)
+
+
 def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
     """What must be added to a similarity's covariance to hold the positions of all photos, square metres.
 
@@ -63,7 +105,7 @@ def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray
     Args:
         model: refined, in metres.
         covariance: (7, 7) of the similarity's left perturbation, in the local frame.
-        spread: (k, 6, 6) of `photo_covariances`; NaN for photos that see nothing any more and say nothing.
+        spread: (k, 6, 6) of `PhotoSpread`; NaN for photos that see nothing any more and say nothing.
     """
     seen = np.isfinite(spread[:, 0, 0])
     if not seen.any():
@@ -75,7 +117,7 @@ def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray
 
 
 def center_covariances(model: Model, spread: FloatArray) -> FloatArray:
-    """(k, 3, 3) square metres, of the photos' centres in the local frame, from `photo_covariances`."""
+    """(k, 3, 3) square metres, of the photos' centres in the local frame, from those of their poses."""
     turns = np.array([pose.rotation for pose in model.cam_from_sfm])
     centers = np.swapaxes(turns, 1, 2) @ spread[:, 3:, 3:] @ turns
     return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)
@@ -88,17 +130,17 @@ def photo_covariances(
     kept: NDArray[np.bool_],
     lenses: Lenses,
     options: DriftOptions,
-) -> FloatArray:
-    """(k, 6, 6) of the left perturbation of each cam_from_local, relative to the existing points.
-
-    NaN for photos that see nothing, and for all where there are more than `max_photos`.
+) -> PhotoSpread:
+    """Of all photos, relative to the existing points.
 
     Args:
         model: refined, in metres. keypoints: of its photos.
         fixed: existing points, those observations of `kept` (m,).
         lenses: what is known of the model's cameras without the photos.
     """
-    spread = np.full((len(model.rows), 6, 6), np.nan)
+    spread = PhotoSpread(
+        poses=np.full((len(model.rows), 6, 6), np.nan), turns=np.full((len(model.rows), 3, 3), np.nan)
+    )
     if len(model.rows) > options.max_photos or not kept.any():
         return spread
     seen = np.union1d(model.photo_of, fixed.photo_of[kept])
@@ -126,14 +168,43 @@ def photo_covariances(
     normal[size:, size:] += np.diag(_lens_information(model, lenses, options))
     # Photos without observations leave their rows empty; the damping is far below what any photo knows.
     covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)) + 1e-9 * np.eye(columns))
-    for k in seen.tolist():
-        block = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        spread[k] = (block + block.T) / 2
+    covariance = (covariance[:size, :size] + covariance[:size, :size].T) / 2
     for c in sorted(set(range(len(model.cameras))) - {*lenses.constant, *lenses.focal_px}):
         parts = [(linear, lens[c]) for linear, lens in ((free, free_lens), (held, held_lens))]
+        together = np.zeros(size)
         for k, moves in _by_unknown_focal(model, c, parts, options).items():
-            spread[k] += np.outer(moves, moves)
+            together[6 * k : 6 * k + 6] = moves
+        covariance += np.outer(together, together)
+    for k in seen.tolist():
+        spread.poses[k] = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
+    for k, piece in _pieces(model, fixed, kept, seen).items():
+        spread.turns[k] = _turn(model, covariance, piece)
     return spread
+
+
+def _pieces(
+    model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], seen: NDArray[np.int64]
+) -> dict[int, NDArray[np.int64]]:
+    """For each photo that sees something, itself and those that share most points with it."""
+    photo = np.concatenate([model.photo_of, fixed.photo_of[kept]])
+    point = np.concatenate([model.point_of, len(model.xyz) + fixed.point_of[kept]])
+    shape = (len(model.rows), len(model.xyz) + len(fixed.xyz))
+    sees = sparse.csr_array((np.ones(len(photo)), (photo, point)), shape=shape)
+    shared = (sees @ sees.T).toarray()
+    np.fill_diagonal(shared, np.inf)
+    order = {k: np.argsort(-shared[k], kind="stable")[:_PIECE] for k in seen.tolist()}
+    return {k: rows[shared[k, rows] > 0.0] for k, rows in order.items()}
+
+
+def _turn(model: Model, covariance: FloatArray, piece: NDArray[np.int64]) -> FloatArray:
+    """(3, 3) of the mean rotation of a piece's photos, about the local axes.
+
+    Args:
+        covariance: (6 k, 6 k) of all poses.
+    """
+    mean = np.hstack([model.cam_from_sfm[k].rotation.T for k in piece.tolist()]) / len(piece)
+    at = (6 * piece[:, None] + np.arange(3)).reshape(-1)
+    return np.asarray(mean @ covariance[np.ix_(at, at)] @ mean.T)
 
 
 def _by_unknown_focal(

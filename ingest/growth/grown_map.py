@@ -131,7 +131,7 @@ def _grown(
         return grown
     return replace(
         grown,
-        feature_map=_with_covariances(grown.feature_map, settled.spread),
+        feature_map=_with_covariances(grown.feature_map, settled.spread.poses),
         left_out=settled.left_out,
     )
 

@@ -19,9 +19,11 @@ from ingest.growth.anchors import Anchors
 from ingest.growth.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.drift import (
     DriftOptions,
+    PhotoSpread,
     bending_variance_m2,
     center_covariances,
     photo_covariances,
+    turning_covariance,
 )
 from ingest.growth.links import firmness
 from ingest.growth.model_parts import only_photos, with_existing, without_photos
@@ -74,20 +76,22 @@ class Settled:
         model: of the photos that are kept, in metres, in the placement's frame; existing points that at least
             two of them see are its own.
         placement: with the gates asked here and the covariances of the refined model.
-        spread: (k, 6, 6) of `photo_covariances`, of the photos that are kept.
-        bending_m: what the photos lack beyond the similarity.
+        spread: of the photos that are kept.
+        bending_m, turning_deg: what the photos' positions and the directions of its pieces lack beyond the
+            similarity, one sigma along the worst axis.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
     model: Model
     placement: MapsPlacement
-    spread: FloatArray
+    spread: PhotoSpread
     bending_m: float
+    turning_deg: float
     left_out: Mapping[int, tuple[str, str]]
 
     def evidence(self) -> dict[str, Any]:
         """What a map's evidence of growth says of it."""
-        return {"bending_m": self.bending_m}
+        return {"bending_m": self.bending_m, "turning_deg": self.turning_deg}
 
 
 def settle(
@@ -136,10 +140,12 @@ def settle(
         held_anchors = good.take(sharp)
         fit = fit_similarity(adjusted.model, Sim3.identity(), held_anchors, adjusted.fixed_kept, placing.fit)
         inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
-        against = contradicting_photos(adjusted.model, inside, spread, (held.fit, fit), options.contradiction)
+        against = contradicting_photos(
+            adjusted.model, inside, spread.poses, (held.fit, fit), options.contradiction
+        )
         loose = {
             k: message
-            for k, message in loose_photos(adjusted.model, spread, options.max_photo_bound_m).items()
+            for k, message in loose_photos(adjusted.model, spread.poses, options.max_photo_bound_m).items()
             if k not in outside and k not in against
         }
         left_out |= {rows[k]: (CONTRADICTS, message) for k, message in against.items()}
@@ -165,13 +171,15 @@ def settle(
     gate = gates.agreeing_photos(len(asked.agreeing), placing.min_agreeing)
     if not gate.passes:  # those that agreed are among the photos that were left out
         return _refused(gate.reason, gate.message, rows, asked)
-    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance, spread)
+    turning = turning_covariance(adjusted.model, fit.covariance, spread)
+    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     kept = [k for k in range(len(rows)) if k not in outside]
     return Settled(
         model=only_photos(whole, kept),
-        placement=_widened(asked, bending_m2),
-        spread=spread[kept],
+        placement=_widened(asked, turning + np.diag([0.0] * 4 + [bending_m2] * 3)),
+        spread=spread.of(kept),
         bending_m=float(np.sqrt(bending_m2)),
+        turning_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(turning[1:4, 1:4])[-1]))),
         left_out=left_out,
     )
 
@@ -217,11 +225,11 @@ def _with_fit(
     )
 
 
-def _widened(placement: MapsPlacement, bending_m2: float) -> MapsPlacement:
-    """The placement with its covariance relative to the existing maps widened by what bending adds."""
+def _widened(placement: MapsPlacement, bending: FloatArray) -> MapsPlacement:
+    """The placement with its covariance relative to the existing maps widened by what bending adds (7, 7)."""
     assert placement.covariance is not None
     assert placement.covariance_relative is not None
-    wider = placement.covariance_relative + np.diag([0.0] * 4 + [bending_m2] * 3)
+    wider = placement.covariance_relative + bending
     on_earth = placement.covariance - placement.covariance_relative
     return replace(placement, covariance_relative=wider, covariance=wider + on_earth)
 
@@ -245,7 +253,7 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
     """Photos that may be further off than the bound (95 %) against the existing points, and how far.
 
     Args:
-        spread: of `photo_covariances`; photos that see nothing any more are loose, unless none was asked.
+        spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
     """
     if not np.isfinite(spread).any():
         return {}

@@ -12,12 +12,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
 from ingest.growth.grow_photos import grow_photos
-from ingest.growth.grown_map import grow_component
+from ingest.growth.grown_map import GrowOptions, grow_component
 from ingest.growth.localised import (
     LocaliseEachOptions,
     localise_photos,
 )
 from ingest.growth.lone_lenses import with_shared_lenses
+from ingest.growth.own_lenses import OwnLensOptions
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from reloc.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, EAST, FRAME, KEY, POINTS, WORLD, existing, prior, walk
@@ -269,6 +270,44 @@ def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
     assert camera.focal_px == pytest.approx(real.focal_px, rel=1e-3)
     assert camera.params[2:4] == pytest.approx(real.params[2:4], abs=1.0)
     assert centers_error(grown, new).max() < 0.05
+
+
+@pytest.mark.parametrize("asked", [10.0, 75.0])
+def test_a_decentred_lens_needs_less_where_the_focal_length_stays(
+    area: IndexedArea, asked: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The map's lens is right but for its decentring: a small gain, and nothing that lifts cameras."""
+    real = Camera(
+        model="OPENCV", width=1000, height=800, params=(900.0, 900.0, 501.6, 398.8, 0.01, 0.0, 1e-3, -1e-3)
+    )
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.2
+    )
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    lent = replace(new.model, cameras=(CAMERA,))
+    options = GrowOptions(own_lens=OwnLensOptions(same_focal_evidence=asked))
+    with caplog.at_level(logging.INFO, logger="ingest.growth.own_lenses"):
+        grown = grow_component(lent, new.photos, new.features_of, found, [area], identity(), options)
+    assert isinstance(grown, GrownMap), grown
+    assert "gains" in caplog.text
+    (camera,) = grown.model.cameras
+    assert camera.model == ("OPENCV" if asked == 10.0 else "SIMPLE_RADIAL")
+
+
+@pytest.mark.parametrize("asked", [10.0, 75.0])
+def test_a_focal_length_needs_more(area: IndexedArea, asked: float) -> None:
+    """A gain that the bent rim of a map gives, too, does not move the focal length by half a percent."""
+    real = Camera(model="RADIAL", width=1000, height=800, params=(904.5, 500.0, 400.0, 0.01, 0.01))
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.3
+    )
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    lent = replace(new.model, cameras=(CAMERA,))
+    options = GrowOptions(own_lens=OwnLensOptions(evidence=asked))
+    grown = grow_component(lent, new.photos, new.features_of, found, [area], identity(), options)
+    assert isinstance(grown, GrownMap), grown
+    (camera,) = grown.model.cameras
+    assert camera.model == ("RADIAL" if asked == 10.0 else "SIMPLE_RADIAL")
 
 
 def test_two_maps_that_differ_say_so(new: NewPhotos) -> None:

@@ -1,18 +1,21 @@
 """What is said of a reconstruction's bending, against independent runs with noise."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
 from ingest.growth.drift import (
     DriftOptions,
     bending_variance_m2,
     center_covariances,
     photo_covariances,
+    turning_covariance,
 )
 from ingest.growth.refine import Lenses
 from ingest.growth.settle import loose_photos
@@ -57,10 +60,16 @@ def walk(seed: int) -> tuple[NewPhotos, FloatArray, FixedPoints]:
     return new, points, fixed
 
 
-def test_centres_are_off_as_far_as_is_said() -> None:
+def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3]) -> FloatArray:
+    """(3,) mean rotation about the local axes by which poses are off."""
+    turns = [t.rotation.T @ (f @ t.inverse()).log()[:3] for f, t in zip(found, true, strict=True)]
+    return np.asarray(np.mean(turns, axis=0))
+
+
+def test_centres_and_directions_are_off_as_far_as_is_said() -> None:
     """Mean squared normalised error of three coordinates is 3; the far end is several times less sure."""
     options = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
-    lengths, sigmas = [], []
+    lengths, sigmas, turned, turns = [], [], [], []
     for seed in range(10):
         new, _, fixed = walk(seed)
         model = new.model
@@ -73,11 +82,16 @@ def test_centres_are_off_as_far_as_is_said() -> None:
         free = with_observations(model, (world >= COUNT) | (model.photo_of > 1))
         keypoints = list(new.keypoints().values())
         done = adjust_anchored(free, keypoints, fixed, [0], AnchoredOptions())
-        poses = photo_covariances(done.model, keypoints, fixed, done.fixed_kept, GIVEN, options)
-        spread = center_covariances(done.model, poses)
+        said = photo_covariances(done.model, keypoints, fixed, done.fixed_kept, GIVEN, options)
+        spread = center_covariances(done.model, said.poses)
         off = done.model.centers() - np.array([p.center for p in new.poses])
         lengths.append([float(e @ np.linalg.solve(c, e)) for e, c in zip(off, spread, strict=True)])
         sigmas.append(np.sqrt(np.linalg.eigvalsh(spread)[:, -1]))
+        turn = mean_turn(done.model.cam_from_sfm[1:], new.poses[1:])
+        turned.append(float(turn @ np.linalg.solve(said.turns[-1], turn)))
+        turns.append(np.sqrt(np.linalg.eigvalsh(said.turns)[:, -1]))
+    assert 1.5 < np.mean(turned) < 6.0, turned
+    assert np.mean(turns, axis=0)[-1] > 1.5 * np.mean(turns, axis=0)[0]
     assert 1.5 < np.mean(lengths) < 6.0, np.mean(lengths, axis=0)
     assert np.mean(sigmas, axis=0)[-1] > 3.0 * np.mean(sigmas, axis=0)[0]
 
@@ -89,7 +103,8 @@ def test_a_lens_that_may_be_off_widens_it() -> None:
     sure = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
     narrow = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, sure)
     wide = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, DriftOptions())
-    assert (np.trace(wide, axis1=1, axis2=2) > np.trace(narrow, axis1=1, axis2=2)).all()
+    for a, b in ((wide.poses, narrow.poses), (wide.turns, narrow.turns)):
+        assert (np.trace(a, axis1=1, axis2=2) > np.trace(b, axis1=1, axis2=2)).all()
 
 
 def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
@@ -98,17 +113,36 @@ def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
     arguments = (new.model, keypoints, fixed, kept, GIVEN)
-    spread = photo_covariances(*arguments, DriftOptions())
+    spread = photo_covariances(*arguments, DriftOptions()).poses
     more = bending_variance_m2(new.model, tiny, spread)
     assert more > 1e-4
     wider = tiny + np.diag([0.0] * 4 + [more] * 3)
     assert bending_variance_m2(new.model, wider, spread) < 1e-9
     assert bending_variance_m2(new.model, ample, spread) == 0.0
-    coarse = photo_covariances(*arguments, replace(DriftOptions(), least_px=5.0))
+    coarse = photo_covariances(*arguments, replace(DriftOptions(), least_px=5.0)).poses
     assert bending_variance_m2(new.model, tiny, coarse) > 2.0 * more
     # A similarity that covers the far end is widened by what the near photos lack, not at the far end.
     centers = center_covariances(new.model, spread)
     assert more == pytest.approx(np.linalg.eigvalsh(centers)[:, -1].max(), rel=0.01)
+
+
+def test_a_similaritys_covariance_turns_until_it_holds_every_piece() -> None:
+    """What is added turns about the photos' middle, holds the pieces' directions, and is nothing where they
+    are held already."""
+    new, _, fixed = walk(2)
+    keypoints = list(new.keypoints().values())
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    spread = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, DriftOptions())
+    tiny, ample = np.diag([1e-10] * 4 + [1e-8] * 3), np.eye(7)
+    more = turning_covariance(new.model, tiny, spread)
+    for turn in spread.turns:
+        assert np.linalg.eigvalsh(tiny[1:4, 1:4] + more[1:4, 1:4] - turn)[0] > -1e-12
+    assert more[1:4, 1:4].trace() > 0.9 * max(np.trace(spread.turns, axis1=1, axis2=2))
+    middle = point_jacobian(new.model.centers().mean(axis=0))
+    np.testing.assert_allclose(middle @ more @ middle.T, 0.0, atol=1e-12)
+    end = point_jacobian(new.model.centers()[-1])
+    assert (end @ more @ end.T).trace() > 1e-6
+    assert not turning_covariance(new.model, ample, spread).any()
 
 
 def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
@@ -119,7 +153,7 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     sigmas = [
         np.sqrt(np.linalg.eigvalsh(center_covariances(new.model, spread))[-1, -1])
         for spread in (
-            photo_covariances(*arguments, lenses, DriftOptions())
+            photo_covariances(*arguments, lenses, DriftOptions()).poses
             for lenses in (
                 GIVEN,
                 Lenses(constant=(), focal_px={0: CAMERA.focal_px}),
@@ -129,8 +163,9 @@ def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
     ]
     assert sigmas[0] < sigmas[1] < sigmas[2]
     none = photo_covariances(*arguments[:-1], np.zeros_like(kept), GIVEN, DriftOptions())
-    assert np.isnan(none).all()  # nothing holds it
-    assert bending_variance_m2(new.model, np.eye(7), none) == 0.0
+    assert np.isnan(none.poses).all()  # nothing holds it
+    assert bending_variance_m2(new.model, np.eye(7), none.poses) == 0.0
+    assert not turning_covariance(new.model, np.eye(7), none).any()
 
 
 @pytest.mark.parametrize(
@@ -164,5 +199,5 @@ def test_a_flat_place_from_above_does_not_tell_a_lens_that_nobody_knew(
     )
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
     spread = photo_covariances(new.model, list(new.keypoints().values()), fixed, kept, lenses, DriftOptions())
-    loose = loose_photos(new.model, spread, 0.5)
+    loose = loose_photos(new.model, spread.poses, 0.5)
     assert sorted(loose) == ([] if told else [0, 1])
