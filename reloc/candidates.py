@@ -57,7 +57,7 @@ def find_clusters(
             for i, (indexed, _) in enumerate(reach)
         ]
     votes = _vote([indexed for indexed, _ in reach], features, options)
-    share = sum(int(v.sum()) for v in votes) / max(sum(len(v) for v in votes), 1)
+    share = sum(float(v.sum()) for v in votes) / max(sum(len(v) for v in votes), 1)
     found: list[Cluster] = []
     for i, (indexed, allowed) in enumerate(reach):
         if small[i]:
@@ -67,7 +67,7 @@ def find_clusters(
             scores = np.where(allowed, _image_scores(indexed.area, votes[i], share), -np.inf)
             found.extend(_grow_clusters(indexed.area, scores, options))
     found.sort(key=lambda cluster: -cluster.score)
-    return found[: options.max_clusters]
+    return found[: options.shortlist]
 
 
 def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
@@ -84,22 +84,34 @@ def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOption
     return np.asarray(np.minimum(to_camera, to_scene) <= margin, dtype=np.bool_)
 
 
-def _vote(
-    areas: Sequence[IndexedArea], features: Features, options: CandidateOptions
-) -> list[NDArray[np.int64]]:
-    """For each area the votes (p,) of its points: a feature votes for its nearest points of all areas."""
+def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOptions) -> list[FloatArray]:
+    """For each area the votes (p,) of its points: a feature votes for its nearest point of all areas.
+
+    By as much as that point is nearer than the `vote_background`-th, in squares: what looks like everything
+    else says nothing (McCann and Lowe, Local Naive Bayes Nearest Neighbor, 2012). Points as near as the
+    nearest get the same vote: other maps' points of the same place, and look-alikes. A vote counts one on
+    average.
+    """
     asked = features.descriptors[: options.vote_features]
-    found = [indexed.index.search(asked, options.vote_neighbours) for indexed in areas]
-    distance = np.concatenate([d for d, _ in found], axis=1)
-    rank = np.argsort(np.argsort(distance, axis=1, kind="stable"), axis=1)
-    chosen = np.split(rank < options.vote_neighbours, len(areas), axis=1)
-    return [
-        np.bincount(rows[mine & (rows >= 0)], minlength=len(indexed.area.points))
-        for indexed, (_, rows), mine in zip(areas, found, chosen, strict=True)
-    ]
+    found = [indexed.index.search(asked, options.vote_background) for indexed in areas]
+    rows = np.concatenate([r for _, r in found], axis=1)
+    squared = np.concatenate([d for d, _ in found], axis=1).astype(np.float64)
+    squared[rows < 0] = np.inf
+    ranked = np.sort(squared, axis=1)[:, : options.vote_background]
+    background = np.max(ranked, axis=1, where=np.isfinite(ranked), initial=1.0)[:, None]
+    weight = np.maximum(1.0 - squared / background, 0.0)
+    weight[squared > (1.0 + options.vote_tie) ** 2 * ranked[:, :1]] = 0.0
+    weight /= max(float(weight[weight > 0.0].mean()) if (weight > 0.0).any() else 0.0, 1e-9)
+    votes: list[FloatArray] = []
+    for indexed, part in zip(areas, np.split(np.arange(rows.shape[1]), len(areas)), strict=True):
+        given = weight[:, part] > 0.0
+        chosen, weights = rows[:, part][given], weight[:, part][given]
+        counted = np.bincount(chosen, weights=weights, minlength=len(indexed.area.points))
+        votes.append(counted.astype(np.float64))
+    return votes
 
 
-def _image_scores(area: Area, votes_of_point: NDArray[np.int64], share: float) -> FloatArray:
+def _image_scores(area: Area, votes_of_point: FloatArray, share: float) -> FloatArray:
     """(i,) votes of each image above what chance gives it, in standard deviations.
 
     Args:
@@ -107,8 +119,8 @@ def _image_scores(area: Area, votes_of_point: NDArray[np.int64], share: float) -
             p points get p times this, with about that variance.
     """
     votes = np.add.reduceat(
-        np.append(votes_of_point[area.see_point], 0), np.minimum(area.image_start[:-1], len(area.see_point))
-    ).astype(np.float64)
+        np.append(votes_of_point[area.see_point], 0.0), np.minimum(area.image_start[:-1], len(area.see_point))
+    )
     seen = np.diff(area.image_start)
     votes[seen == 0] = 0.0
     return np.asarray(_above_chance(votes, share * seen), dtype=np.float64)
@@ -122,7 +134,7 @@ def _grow_clusters(area: Area, scores: FloatArray, options: CandidateOptions) ->
     """Around each image with most votes left, the images that share most points with it."""
     free = np.isfinite(scores)
     clusters: list[Cluster] = []
-    for _ in range(options.max_clusters):
+    for _ in range(options.shortlist):
         if not free.any():
             break
         seed = int(np.argmax(np.where(free, scores, -np.inf)))

@@ -12,9 +12,13 @@ class CandidateOptions:
     """Which images of the maps are tried.
 
     Attributes:
-        vote_features: the strongest query features that vote.
-        vote_neighbours: map points that each of them votes for.
+        vote_features: the strongest query features that vote for their nearest map point.
+        vote_background: their neighbour of this rank says how near a point must be to be told apart.
+        vote_tie: points farther than the nearest by this share of its distance are as near.
         max_cluster_images: images of one covisibility cluster; about what one photo can see.
+        shortlist, shortlist_features: clusters with most votes; where the first of them does not settle it,
+            so many of the best spread features are matched against each of the others, and those that match
+            best are tried. `tools/retrieval_study.py` prints what votes alone would miss.
         max_clusters: clusters that are tried, best first.
         single_cluster_points: an area with at most so many points in reach is matched as a whole, without
             voting: exhaustive matching against it costs less than voting would.
@@ -22,9 +26,12 @@ class CandidateOptions:
         prior_reach: ... plus so many times the distance from which they look at their scene.
     """
 
-    vote_features: int = 800
-    vote_neighbours: int = 3
+    vote_features: int = 3000
+    vote_background: int = 10
+    vote_tie: float = 0.02
     max_cluster_images: int = 12
+    shortlist: int = 10
+    shortlist_features: int = 200
     max_clusters: int = 3
     single_cluster_points: int = 6000
     prior_sigmas: float = 3.0

@@ -81,16 +81,30 @@ def search(
         return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
     candidates: list[Candidate] = []
     most = 0
-    for tried, cluster in enumerate(clusters, start=1):
+    while clusters:
+        cluster, *clusters = clusters
         found, count = _try_cluster(features, cluster, request, options, watch)
         most = max(most, count)
         candidates.extend(found)
-        if candidates and _settled(candidates, cluster, clusters[tried:], options):
+        if candidates and _settled(candidates, cluster, clusters, options):
             break
+        clusters = most_matched(features, clusters, options)
+        watch.split("matching")
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
     if not candidates and most < options.pose.min_matches:
         return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
     return Search(candidates=candidates, matches=most, reason=None, detail="")
+
+
+def most_matched(features: Features, clusters: list[Cluster], options: LocaliseOptions) -> list[Cluster]:
+    """Of more clusters than may still be tried, those that match best, best first."""
+    take = options.candidates.max_clusters - 1
+    if len(clusters) <= take:
+        return clusters
+    few = features.take(np.arange(min(options.candidates.shortlist_features, len(features))))
+    matches = [len(match_cluster(few, cluster, options.matching)) for cluster in clusters]
+    order = np.argsort(-np.array(matches), kind="stable")
+    return [clusters[i] for i in order[:take]]
 
 
 def _try_cluster(

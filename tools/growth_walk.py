@@ -208,7 +208,7 @@ def ask_probes(database: Database, album: Album, upto: int, edge: float) -> list
 def second_anchor(
     database: Database, album: Album, options: GrowingOptions, common: dict[str, int]
 ) -> tuple[Step, int]:
-    """Ingest the far survey, grow, measure; also in how many commits the grown maps moved."""
+    """Ingest the far survey, grow, measure; also in how many commits the maps that were there moved."""
     placed = {m.map_id: m.write_id for m in database.snapshot().maps()}
     version = database.poll_version()
     path = Path(database.url)
@@ -219,7 +219,7 @@ def second_anchor(
     commits, known = 0, placed
     for snapshot in history:
         now = {m.map_id: m.write_id for m in snapshot.maps()}
-        commits += any(now[i] != known[i] for i in now.keys() & known.keys())
+        commits += any(now[i] != known[i] for i in now.keys() & placed.keys())
         known = {**known, **now}
     last = max(f.batch for f in album.of("walk"))
     stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)

@@ -8,7 +8,8 @@ import pytest
 from featuredb.features.features import Features
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.candidates import IndexedArea, find_clusters, images_in_reach
-from reloc.options import CandidateOptions
+from reloc.options import CandidateOptions, LocaliseOptions
+from reloc.search import most_matched
 from tests.support.scenes import (
     CAMERA,
     box_points,
@@ -125,10 +126,10 @@ def test_look_alikes_get_fewer_votes_than_the_place_itself() -> None:
 
 
 def test_no_small_area_is_lost_among_many() -> None:
-    """More areas than clusters may be tried: the votes choose, whatever the order."""
+    """More areas than the shortlist holds: the votes choose, whatever the order."""
     areas = [indexed(place(i, east_m=2000.0 * i, images=4)) for i in range(6)]
     for seed in (0, 5):
-        clusters = find_clusters(areas, photo_of(seed), None, CandidateOptions())
+        clusters = find_clusters(areas, photo_of(seed), None, CandidateOptions(shortlist=3))
         assert len(clusters) == 3
         assert clusters[0].area.maps[0].map_id == f"place-{seed}"
         assert np.isfinite([c.score for c in clusters]).all()
@@ -148,7 +149,7 @@ def test_a_small_area_does_not_push_aside_the_clusters_of_a_large_one() -> None:
 
 def test_clusters_are_bounded_and_always_the_same() -> None:
     area = indexed(place(0, images=30))
-    options = replace(VOTING, max_cluster_images=6, max_clusters=4)
+    options = replace(VOTING, max_cluster_images=6, shortlist=4)
     first, again = (find_clusters([area], photo_of(0), None, options) for _ in range(2))
     assert len(first) == 4
     assert [c.score for c in first] == sorted((c.score for c in first), reverse=True)
@@ -164,3 +165,16 @@ def test_no_features_and_no_areas() -> None:
     assert find_clusters([], photo_of(0), None, CandidateOptions()) == []
     clusters = find_clusters([indexed(place(0))], nothing, None, VOTING)
     assert all(c.score <= 0 for c in clusters)
+
+
+def test_of_many_places_those_that_match_best_are_tried() -> None:
+    """Votes had the photo's own place last; a few of its features matched against each put it first."""
+    maps = [place(i, east_m=400.0 * i) for i in range(6)]
+    area = indexed(*maps)
+    options = LocaliseOptions(candidates=replace(VOTING, shortlist=6, max_clusters=3, shortlist_features=150))
+    clusters = find_clusters([area], photo_of(4), None, options.candidates)
+    last = sorted(clusters, key=lambda c: c.score)
+    chosen = most_matched(photo_of(4), last, options)
+    assert len(chosen) == 2
+    assert (area.area.image_map[chosen[0].images] == 4).all()
+    assert most_matched(photo_of(4), last[:2], options) == last[:2]
