@@ -69,6 +69,10 @@ class RegistrationError(FeatureDbError):
     """A map cannot be registered as asked: photos are missing, no scan covers it, broken picks."""
 
 
+class VideoError(FeatureDbError):
+    """A film or a folder of frames cannot be read or written: no film, broken, cut off, of changing size."""
+
+
 class ServiceError(FeatureDbError):
     """The server answered with an error; `code` is one of the wire's error codes."""
 
@@ -97,3 +101,7 @@ class CandidateNotFoundError(StoreError):
 
 class CanaryNotFoundError(StoreError):
     """The database has no such known query."""
+
+
+class TelemetryError(FeatureDbError):
+    """Telemetry cannot be read: no positions in it, unknown or contradictory format, damaged, too large."""

@@ -1,0 +1,300 @@
+"""A film in a container (mp4, mov, mkv, avi, ...), a network stream or a camera, read by libav."""
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from fractions import Fraction
+from types import MappingProxyType
+from typing import Any, cast
+
+import av
+import numpy as np
+from av.container import InputContainer
+from av.stream import Disposition
+from av.video.stream import VideoStream
+from numpy.typing import NDArray
+
+from featuredb.errors import VideoError
+from featuredb.video.decoding import Decoder, FilmClock, Tally
+from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
+from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
+from featuredb.video.pixels import PixelReader
+from featuredb.video.rotation import clockwise_from_display_matrix
+from featuredb.video.tags import camera_tags
+
+logger = logging.getLogger(__name__)
+
+# Their time line starts at 0 and their index finds key frames. Others start at any time (a transport stream's
+# own clock, a camera's uptime), and libav's search in a transport stream ends behind the frame it looks for.
+_INDEXED = frozenset({"mov", "matroska", "avi"})
+# An index goes by decoding time, which runs ahead of display by some frames: aim a little before the start.
+_SEEK_MARGINS_S = (1.0, 10.0)
+# High-speed cameras write up to 1000 frames a second; what says more gives its tick, not its rate.
+_MAX_RATE_HZ = 1000.0
+
+
+def open_container(source: Source, options: VideoOptions) -> "ContainerVideo":
+    """Open a film and decode its first frame.
+
+    Raises:
+        VideoError: it cannot be opened, holds no video that can be decoded, or is of a size or rotation that
+            is not taken.
+    """
+    opening = opening_of(source, options)
+    container = open_input(opening, options)
+    try:
+        return _opened(container, opening, options)
+    except BaseException:
+        container.close()
+        raise
+
+
+def _opened(container: InputContainer, opening: Opening, options: VideoOptions) -> "ContainerVideo":
+    stream = _largest_stream(container, opening.name)
+    _check_size(opening.name, stream.width, stream.height, options)
+    context = stream.codec_context
+    # Libav 8.1's H.265 decoder can wait for ever on a damaged frame that another of its threads decodes.
+    context.thread_type = "SLICE" if context.name == "hevc" else "AUTO"
+    context.thread_count = options.threads
+    context.options = {"max_pixels": str(coded_pixels(options))}
+    tally = Tally()
+    decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
+    pictures = decoder.pictures()
+    first = next(pictures, None)
+    if first is None:
+        broken = f"; {tally.undecodable} packets could not be decoded" if tally.undecodable else ""
+        raise VideoError(
+            f"{opening.name}: no frame of its {stream.codec_context.name} video can be decoded{broken}"
+        )
+    _check_size(opening.name, first[1].width, first[1].height, options)
+    return ContainerVideo(
+        info=_info(container, stream, first[1], opening, options),
+        container=container,
+        decoder=decoder,
+        begun=(first, pictures),
+        tally=tally,
+        expected=_expected(container, stream, first[0]),
+        options=options,
+    )
+
+
+class ContainerVideo(Video):
+    """An open container whose first frame is decoded; made by `open_container`.
+
+    Args:
+        begun: the first frame with its time, and the frames after it.
+        expected: number of packets and time of the last frame if the film is whole; None where not known.
+    """
+
+    def __init__(
+        self,
+        *,
+        info: VideoInfo,
+        container: InputContainer,
+        decoder: Decoder,
+        begun: tuple[tuple[float, av.VideoFrame], Iterator[tuple[float, av.VideoFrame]]],
+        tally: Tally,
+        expected: tuple[int | None, float | None],
+        options: VideoOptions,
+    ) -> None:
+        super().__init__(info)
+        self._container, self._decoder, self._begun = container, decoder, begun
+        self._tally, self._expected, self._options = tally, expected, options
+        turned = info.rotation_deg in (90, 270)
+        size = (info.frame_height, info.frame_width) if turned else (info.frame_width, info.frame_height)
+        self._pixels = PixelReader(width=size[0], height=size[1], clockwise_deg=info.rotation_deg)
+        picture = begun[0][1]
+        self._stored = (picture.width, picture.height, picture.rotation)
+
+    @property
+    def report(self) -> VideoReport:
+        packets, last_s = self._expected
+        return self._tally.report(packets if self._options.start_s is None else None, last_s)
+
+    def close(self) -> None:
+        self._decoder.stop()
+        self._container.close()
+
+    def _frames(self) -> Iterator[VideoFrame]:
+        for index, time_s, picture in chosen(self._from_start(), self._options):
+            yield self._frame(index, time_s, picture)
+        report = self.report
+        if not report.whole:
+            logger.warning("%s: %s", self.info.name, "; ".join(report.complaints()))
+
+    def _from_start(self) -> Iterator[tuple[float, av.VideoFrame]]:
+        """Decoded frames with their times, from at or before the asked start."""
+        self._decoder.check_open()
+        (first_s, first), following = self._begun
+        start_s = self._options.start_s
+        moved = False
+        if start_s is not None and start_s > first_s and not self.info.live and _indexed(self._container):
+            for aim_s in (*(start_s - margin for margin in _SEEK_MARGINS_S), first_s):
+                if not self._decoder.seek(max(aim_s, first_s)):
+                    continue
+                moved = True
+                pictures = self._decoder.pictures()
+                found = next(pictures, None)
+                if found is not None and (found[0] <= start_s or aim_s == first_s):
+                    yield found
+                    yield from pictures
+                    return
+        if moved:
+            raise VideoError(
+                f"{self.info.name}: its index is broken and finds no frame; read it without start_s"
+            )
+        yield first_s, first
+        yield from following
+
+    def _frame(self, index: int, time_s: float, picture: av.VideoFrame) -> VideoFrame:
+        stored = (picture.width, picture.height, picture.rotation)
+        if stored != self._stored:
+            raise VideoError(
+                f"{self.info.name}: at {time_s:.3f} s the pictures change from {_said(self._stored)} to "
+                f"{_said(stored)}; split the film there, as each part needs a camera of its own"
+            )
+        gray = _converted(self._pixels.gray, picture, self.info.name)
+        self._tally.delivered += 1
+        self._tally.damaged += picture.is_corrupt
+        name, rgb = self.info.name, self._pixels.rgb  # and not the whole film, which frames may outlive
+        return VideoFrame(
+            index=index,
+            time_s=time_s,
+            gray=gray,
+            damaged=picture.is_corrupt,
+            make_rgb=lambda: _converted(rgb, picture, name),
+        )
+
+
+def _converted(
+    convert: Callable[[av.VideoFrame], NDArray[np.uint8]], picture: av.VideoFrame, name: str
+) -> NDArray[np.uint8]:
+    try:
+        return convert(picture)
+    except av.FFmpegError as error:
+        raise VideoError(
+            f"{name}: pictures of the format {picture.format.name}, colour space {picture.colorspace}, "
+            "cannot be converted; encode the film again as yuv420p"
+        ) from error
+
+
+def _said(stored: tuple[int, int, int]) -> str:
+    return f"{stored[0]}x{stored[1]}" + (f" turned by {-stored[2] % 360}" if stored[2] else "")
+
+
+def _largest_stream(container: InputContainer, name: str) -> VideoStream:
+    """The video itself: not the cover of a sound file, nor the preview that action cameras add."""
+    streams = [s for s in container.streams.video if not s.disposition & Disposition.attached_pic]
+    if not streams:
+        kinds = sorted({stream.type for stream in container.streams})
+        found = f"only {', '.join(kinds)}" if kinds else "no stream in it; its index is broken, copy it again"
+        raise VideoError(f"{name}: expected a film, found {found}")
+    decodable = [stream for stream in streams if _context(stream) is not None]
+    if not decodable:
+        raise VideoError(f"{name}: there is no decoder for its video; encode it as H.264 or H.265")
+    return max(decodable, key=lambda stream: (stream.width * stream.height, -stream.index))
+
+
+def _context(stream: VideoStream) -> Any | None:
+    return stream.codec_context  # None without a decoder, whatever its type says
+
+
+def _check_size(name: str, width: int, height: int, options: VideoOptions) -> None:
+    """Refuse what is too large to be meant; a size of 0 is one that only the first frame tells."""
+    if max(width, height) > options.max_full_side_px or width * height > options.max_full_pixels:
+        raise VideoError(
+            f"{name}: its pictures have {width}x{height} pixels, the limit is {options.max_full_side_px} a "
+            f"side and {options.max_full_pixels / 1e6:.0f} million; make it smaller, unless it is broken"
+        )
+
+
+def _indexed(container: InputContainer) -> bool:
+    return not _INDEXED.isdisjoint(container.format.name.split(","))
+
+
+def _rate(stream: VideoStream) -> Fraction | None:
+    """Nominal frames per second."""
+    for rate in (stream.average_rate, stream.guessed_rate):
+        if rate and 0 < rate <= _MAX_RATE_HZ:
+            return rate
+    return None
+
+
+def _clock(container: InputContainer, stream: VideoStream) -> FilmClock:
+    starts_anywhere = not _indexed(container) and container.start_time is not None
+    rate = _rate(stream)
+    if not stream.time_base:
+        raise VideoError(f"{container.name}: its video has no time base; copy it into an mp4 or mkv")
+    return FilmClock(
+        time_base=stream.time_base,
+        origin_s=Fraction(container.start_time, av.time_base) if starts_anywhere else Fraction(0),
+        interval_s=float(1 / rate) if rate else None,
+        decoding_order=container.format.name == "avi",
+    )
+
+
+def _duration_s(container: InputContainer, stream: VideoStream) -> float | None:
+    """Stated length of the video stream, else of the whole container."""
+    if stream.duration and stream.duration > 0 and stream.time_base:
+        return float(stream.duration * stream.time_base)
+    if container.duration and container.duration > 0:
+        return container.duration / av.time_base
+    return None
+
+
+def _expected(
+    container: InputContainer, stream: VideoStream, first_s: float
+) -> tuple[int | None, float | None]:
+    # Only the index of an mp4 lists every frame, and only those that its edit list leaves to be shown.
+    packets = len(stream.index_entries) if "mov" in container.format.name.split(",") else None
+    duration_s, rate = _duration_s(container, stream), _rate(stream)
+    last_s = first_s + duration_s - float(1 / rate) if duration_s and rate else None
+    return packets, last_s
+
+
+def _info(
+    container: InputContainer,
+    stream: VideoStream,
+    first: av.VideoFrame,
+    opening: Opening,
+    options: VideoOptions,
+) -> VideoInfo:
+    clockwise_deg = _rotation(first, opening.name)
+    size = (first.width, first.height)
+    ratio = stream.sample_aspect_ratio
+    aspect = float(ratio) if ratio and ratio > 0 else 1.0
+    if clockwise_deg in (90, 270):
+        size, aspect = size[::-1], 1.0 / aspect
+    frame_size = fitted_size(*size, options.max_side_px)
+    texts = {**container.metadata, **stream.metadata}
+    tags = {name.lower(): value for name, value in texts.items()}
+    camera = camera_tags(tags)
+    rate = _rate(stream)
+    return VideoInfo(
+        name=opening.name,
+        width=size[0],
+        height=size[1],
+        frame_width=frame_size[0],
+        frame_height=frame_size[1],
+        rotation_deg=clockwise_deg,
+        pixel_aspect=aspect,
+        frame_rate_hz=float(rate) if rate else None,
+        duration_s=None if opening.live else _duration_s(container, stream),
+        frame_count=stream.frames if stream.frames > 0 else None,
+        codec=stream.codec_context.name,
+        container=container.format.name,
+        creation_time=camera.creation_time,
+        make=camera.make,
+        model=camera.model,
+        encoder=camera.encoder,
+        tags=MappingProxyType(tags),
+        live=opening.live,
+    )
+
+
+def _rotation(first: av.VideoFrame, name: str) -> int:
+    side_data = cast("Mapping[str, Any]", first.side_data)
+    matrix = side_data.get("DISPLAYMATRIX")
+    try:
+        return clockwise_from_display_matrix(None if matrix is None else bytes(matrix))
+    except VideoError as error:
+        raise VideoError(f"{name}: {error}") from error

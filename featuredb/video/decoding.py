@@ -1,0 +1,243 @@
+"""Packets of a film to pictures in display order with times that increase, past what is broken.
+
+A packet that cannot be decoded is counted and left out, and decoding goes on with the next. What PyAV does
+not do by itself, and is done here:
+
+- It asks libav to make up missing presentation times, and for AVI, which stores none, gets those of decoding
+  order: wrong wherever a codec reorders. There the decoding times are taken, less the decoder's delay.
+- An empty packet in the middle of a file (a repeated frame of AVI) would end decoding, as it means "flush".
+- After its container is closed, going on with a demuxer reads freed memory: `stop` ends it before.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+
+import av
+from av.container import InputContainer
+from av.video.stream import VideoStream
+
+from featuredb.errors import VideoError
+from featuredb.video.film import VideoReport
+
+# A stream in which nothing can be decoded for that long (minutes) will not come right.
+_MAX_UNDECODABLE_IN_A_ROW = 5_000
+# A broken place of the container costs one or two of these; a file full of them is not worth reading.
+_MAX_READ_ERRORS_IN_A_ROW = 20
+# One or two frames swap times in films with sloppy clocks; a clock that was set back stays behind.
+_MAX_BACKWARD_IN_A_ROW = 250
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of one reading; see `VideoReport` for what they mean."""
+
+    delivered: int = 0
+    decoded: int = 0
+    undecodable: int = 0
+    damaged: int = 0
+    out_of_order: int = 0
+    times_guessed: int = 0
+    longest_gap_s: float = 0.0
+    last_s: float | None = None
+    at_end: bool = False
+    packets: int = 0
+
+    def report(self, frame_count: int | None, end_s: float | None) -> VideoReport:
+        """The counts as a value.
+
+        Args:
+            frame_count: packets that the whole film has; None where that is not known or was not asked for.
+            end_s: when the film's last frame should end, on its clock; None likewise.
+        """
+        missing = short_by_s = 0.0
+        if self.at_end and frame_count is not None:
+            missing = max(0, frame_count - self.packets)
+        if self.at_end and end_s is not None and self.last_s is not None:
+            short_by_s = max(0.0, end_s - self.last_s)
+        return VideoReport(
+            delivered=self.delivered,
+            decoded=self.decoded,
+            undecodable=self.undecodable,
+            damaged=self.damaged,
+            out_of_order=self.out_of_order,
+            times_guessed=self.times_guessed,
+            longest_gap_s=self.longest_gap_s,
+            last_s=self.last_s,
+            at_end=self.at_end,
+            missing=int(missing),
+            short_by_s=short_by_s,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmClock:
+    """How the time stamps of a stream become seconds on the film's clock.
+
+    Attributes:
+        time_base: seconds per tick of the stream's time stamps.
+        origin_s: what the stamps say at the film's start; 0 for containers whose time line starts there.
+        interval_s: nominal time between frames, or None.
+        decoding_order: whether the container stores no presentation times (AVI). Its decoding times only
+            count its packets: frames that a broken place swallows shift those behind them.
+    """
+
+    time_base: Fraction
+    origin_s: Fraction
+    interval_s: float | None
+    decoding_order: bool
+
+    def time_s(self, picture: av.VideoFrame, delay_frames: int) -> float | None:
+        """The picture's own time, or None where it has none.
+
+        Args:
+            delay_frames: by how many frames the decoder reorders; AVI counts in frames.
+        """
+        stamp = picture.pts
+        if self.decoding_order:
+            stamp = None if picture.dts is None else picture.dts - delay_frames
+        return None if stamp is None else float(stamp * self.time_base - self.origin_s)
+
+    def stamp(self, time_s: float) -> int:
+        """Stream time stamp of a time on the film's clock."""
+        return round((Fraction(time_s) + self.origin_s) / self.time_base)
+
+
+class Decoder:
+    """Decodes one stream of an open container; to be used from one thread.
+
+    Args:
+        name: of the film, for messages.
+        tally: is counted up.
+    """
+
+    def __init__(
+        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: Tally, name: str
+    ) -> None:
+        self._container, self._stream = container, stream
+        self._clock, self._tally, self._name = clock, tally, name
+        # Gaps in a transport stream's counters mark packets that mostly decode; elsewhere the mark means that
+        # the file ends within the packet, and with several threads such a packet takes its neighbours along.
+        self._skip_marked = "mpegts" not in container.format.name.split(",")
+        self._stopped = False
+
+    def stop(self) -> None:
+        """End decoding for good; must be called before the container is closed."""
+        self._stopped = True
+
+    def check_open(self) -> None:
+        """Refuse to go on after `stop`.
+
+        Raises:
+            VideoError: it was stopped.
+        """
+        if self._stopped:
+            raise VideoError(f"{self._name} is closed; read its frames inside the `with` block")
+
+    def seek(self, time_s: float) -> bool:
+        """Go to a key frame at or before `time_s` where the container can; whether it could.
+
+        The next `pictures` start there. Where the index is wrong they may start later.
+        """
+        self.check_open()
+        try:
+            self._container.seek(self._clock.stamp(time_s), stream=self._stream)
+        except (av.FFmpegError, OverflowError):
+            return False
+        return True
+
+    def pictures(self) -> Iterator[tuple[float, av.VideoFrame]]:
+        """(time in seconds, picture) in order of time from where the container stands.
+
+        Raises:
+            VideoError: the source fails, falls silent or has nothing to decode, or its clock goes back.
+        """
+        last_s: float | None = None
+        backward = 0
+        for picture in self._decoded():
+            time_s = self._clock.time_s(picture, self._stream.codec_context.reorder_depth)
+            if time_s is None and last_s is not None and self._clock.interval_s is not None:
+                time_s = last_s + self._clock.interval_s
+                # The last frames of an AVI come when no packet is left to name their time: the next one.
+                self._tally.times_guessed += not self._clock.decoding_order
+            if time_s is None and last_s is None:
+                time_s = 0.0
+                self._tally.times_guessed += 1
+            if time_s is None or (last_s is not None and time_s <= last_s):
+                self._tally.out_of_order += 1
+                backward += 1
+                if backward > _MAX_BACKWARD_IN_A_ROW:
+                    raise VideoError(
+                        f"{self._name}: the times of {backward} frames stay at or behind {last_s:.3f} s, as "
+                        "of a clock that was set back; split the film there, or open the live source again"
+                    )
+                continue
+            backward = 0
+            if last_s is not None:
+                self._tally.longest_gap_s = max(self._tally.longest_gap_s, time_s - last_s)
+            last_s = self._tally.last_s = time_s
+            yield time_s, picture
+
+    def _decoded(self) -> Iterator[av.VideoFrame]:
+        failed = 0
+        for packet in self._packets():
+            if self._skip_marked and packet.is_corrupt:
+                self._tally.undecodable += 1
+                continue
+            try:
+                pictures = packet.decode()
+            except av.FFmpegError:
+                self._tally.undecodable += 1
+                failed += 1
+                if failed > _MAX_UNDECODABLE_IN_A_ROW:
+                    raise VideoError(
+                        f"{self._name}: none of {failed} packets in a row could be decoded; the stream is "
+                        "broken or needs a decoder that is not there"
+                    ) from None
+                continue
+            failed = 0 if pictures else failed
+            for picture in pictures:
+                self.check_open()
+                self._tally.decoded += 1
+                yield picture
+
+    def _packets(self) -> "Iterator[av.Packet[VideoStream]]":  # generic in the stubs only
+        """Packets of the stream and at its end one that flushes the decoder, past broken places."""
+        errors = 0
+        while True:
+            self.check_open()
+            demuxed = self._container.demux(self._stream)
+            while True:
+                self.check_open()
+                try:
+                    packet = next(demuxed)
+                except StopIteration:
+                    self._tally.at_end = True
+                    return
+                except av.InvalidDataError as error:
+                    errors += 1
+                    if errors > _MAX_READ_ERRORS_IN_A_ROW:
+                        raise VideoError(
+                            f"{self._name}: the container is broken after {self._said_last()}; copy it again"
+                        ) from error
+                    break
+                except (av.FFmpegError, OSError) as error:
+                    raise VideoError(
+                        f"{self._name}: reading failed after {self._said_last()}: {_reason(error)}"
+                    ) from error
+                if packet.size:
+                    errors = 0
+                    self._tally.packets += 1
+                elif packet.dts is not None:
+                    continue
+                yield packet
+
+    def _said_last(self) -> str:
+        last_s = self._tally.last_s
+        return "no frame at all" if last_s is None else f"the frame at {last_s:.3f} s"
+
+
+def _reason(error: Exception) -> str:
+    if isinstance(error, av.error.ExitError):
+        return "nothing came within the timeout; check the camera and the network, or allow more"
+    return getattr(error, "strerror", None) or str(error)

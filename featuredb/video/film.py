@@ -1,0 +1,278 @@
+"""What a film is to its readers: its facts, its frames, how it is read, and what reading it came to."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from types import MappingProxyType, TracebackType
+from typing import Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+
+_T = TypeVar("_T")
+NO_TAGS: Mapping[str, str] = MappingProxyType({})
+# Below this a film that ends before its stated length only rounds, or its sound is a little longer.
+_SHORT_END_S = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoOptions:
+    """How a film is read.
+
+    Attributes:
+        every: only each n-th frame is delivered, the first one included; all are decoded.
+        start_s, end_s: only frames with start_s <= time_s < end_s; None for the film's own start and end.
+        max_side_px: frames are made smaller so that no side is longer; None for full size.
+        threads: of the decoder. One leaves the other cores to the caller, who has more to do, and loses the
+            least of a damaged film; each further one may lose another frame behind a damage at the very end,
+            and delays a live source by a frame.
+        timeout_s: how long a URL or a device may be silent, when it is opened and between its packets.
+        fps: frames per second of a folder that has no file of times.
+        input_format: libav's name of the format, where it cannot tell itself (e.g. "v4l2").
+        input_options: libav's options of that format, e.g. {"video_size": "1280x720"}.
+        max_full_side_px, max_full_pixels: larger films are refused before anything is allocated for them.
+    """
+
+    every: int = 1
+    start_s: float | None = None
+    end_s: float | None = None
+    max_side_px: int | None = None
+    threads: int = 1
+    timeout_s: float = 10.0
+    fps: float | None = None
+    input_format: str | None = None
+    input_options: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
+    # Panoramic cameras reach 11520x5760; a frame of the most pixels takes 200 MB as 4:2:0.
+    max_full_side_px: int = 16_384
+    max_full_pixels: int = 16_384 * 8_192
+
+    def __post_init__(self) -> None:
+        for name in ("every", "threads", "max_side_px", "max_full_side_px", "max_full_pixels"):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or value < 1):
+                raise InvalidValueError(f"{name}: expected a whole number of at least 1, found {value!r}")
+        for name in ("timeout_s", "fps"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise InvalidValueError(f"{name}: expected a positive number, found {value!r}")
+        bounds = [value for value in (self.start_s, self.end_s) if value is not None]
+        if not all(math.isfinite(value) for value in bounds) or (len(bounds) == 2 and bounds[0] >= bounds[1]):
+            raise InvalidValueError(
+                f"start_s, end_s: expected start_s < end_s, both finite, found {self.start_s}, {self.end_s}"
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoInfo:
+    """What is known of a film before its frames are read.
+
+    Attributes:
+        name: the file's or folder's name, or the URL without its password; for messages.
+        width, height: pixels at full size, upright, that is after rotation.
+        frame_width, frame_height: pixels of the frames that are delivered; less where max_side_px says so.
+        rotation_deg: 0, 90, 180 or 270 degrees by which the stored pictures were turned clockwise.
+        pixel_aspect: width of a pixel over its height; other than 1 for anamorphic films, which are
+            delivered as they are stored.
+        frame_rate_hz: nominal frames per second, or None; only the frames' times are to be relied on.
+        duration_s: stated length, or None for live sources and files that do not say.
+        frame_count: number of frames that the file's index lists, or None.
+        codec: libav's name of the codec, e.g. "h264"; "pictures" for a folder.
+        container: libav's names of the container format, e.g. "matroska,webm"; "folder".
+        creation_time: when the recording was started by the camera's clock, or None. Said to be UTC, but
+            many action cameras write their local time.
+        make, model: of the camera, where a tag says so.
+        encoder: program or chip that made the stream, where a tag says so.
+        tags: all text tags of the container and the stream by lower-case name, the stream's first.
+        live: whether the source cannot be read twice or sought in: URLs, devices, pipes.
+    """
+
+    name: str
+    width: int
+    height: int
+    frame_width: int
+    frame_height: int
+    rotation_deg: int = 0
+    pixel_aspect: float = 1.0
+    frame_rate_hz: float | None = None
+    duration_s: float | None = None
+    frame_count: int | None = None
+    codec: str
+    container: str
+    creation_time: datetime | None = None
+    make: str | None = None
+    model: str | None = None
+    encoder: str | None = None
+    tags: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
+    live: bool = False
+
+    def __post_init__(self) -> None:
+        sides = (self.width, self.height, self.frame_width, self.frame_height)
+        if min(sides) < 1:
+            raise InvalidValueError(f"expected sides of at least one pixel, found {sides}")
+        if self.rotation_deg not in (0, 90, 180, 270):
+            raise InvalidValueError(f"rotation_deg: expected 0, 90, 180 or 270, found {self.rotation_deg}")
+        for name in ("pixel_aspect", "frame_rate_hz", "duration_s", "frame_count"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise InvalidValueError(f"{name}: expected a positive number or None, found {value}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class VideoFrame:
+    """One frame, upright.
+
+    Attributes:
+        index: 0 for the first frame at or after the start that was asked for, and counting all frames from
+            there that could be decoded, also those that `every` leaves out.
+        time_s: seconds on the film's own clock, from the frame's own time stamp.
+        gray: (h, w) uint8, 0 black to 255 white, read-only.
+        damaged: whether the decoder had to make up parts of the picture.
+        make_rgb: makes the colours; holds on to the decoded picture (1.5 bytes a pixel at full size).
+    """
+
+    index: int
+    time_s: float
+    gray: NDArray[np.uint8]
+    damaged: bool = False
+    make_rgb: Callable[[], NDArray[np.uint8]] = field(repr=False)
+
+    def __post_init__(self) -> None:
+        if self.gray.ndim != 2 or self.gray.dtype != np.uint8 or not self.gray.size:
+            raise InvalidValueError(
+                f"gray: expected an array (h, w) of uint8, found {self.gray.shape} of {self.gray.dtype}"
+            )
+        if self.index < 0 or not math.isfinite(self.time_s):
+            raise InvalidValueError(
+                f"expected an index from 0 and a finite time, found {self.index}, {self.time_s}"
+            )
+        self.gray.setflags(write=False)
+
+    def rgb(self) -> NDArray[np.uint8]:
+        """Colours (h, w, 3) uint8, red first; converted anew at each call, from one thread at a time.
+
+        Raises:
+            VideoError: the picture's format cannot be converted, or its file is no longer there.
+        """
+        return self.make_rgb()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VideoReport:
+    """What reading a film has come to so far.
+
+    Attributes:
+        delivered: frames that were handed out.
+        decoded: frames that were decoded, also those outside the asked stretch.
+        undecodable: packets (each a frame) that could not be decoded, or are only there in part.
+        damaged: frames that were handed out although parts of them are made up.
+        out_of_order: frames that were dropped because their time is not after that of the frame before.
+        times_guessed: frames without a time, which were given the next one at the nominal rate.
+        longest_gap_s: longest time between two decoded frames; 0 before the second one.
+        last_s: time of the last decoded frame, or None.
+        at_end: whether the end of the file, folder or stream was reached.
+        missing: frames that the file's index lists but that are not there; known at the end of whole films.
+        short_by_s: how much earlier than the stated length the last frame ends; known at the end, where
+            it is more than rounding; sound that runs on counts as length, too.
+    """
+
+    delivered: int = 0
+    decoded: int = 0
+    undecodable: int = 0
+    damaged: int = 0
+    out_of_order: int = 0
+    times_guessed: int = 0
+    longest_gap_s: float = 0.0
+    last_s: float | None = None
+    at_end: bool = False
+    missing: int = 0
+    short_by_s: float = 0.0
+
+    @property
+    def whole(self) -> bool:
+        """Whether nothing was found wrong with what was read."""
+        return not self.complaints()
+
+    def complaints(self) -> tuple[str, ...]:
+        """What is wrong with the film, in words."""
+        said = (
+            (self.undecodable, f"{self.undecodable} packets cannot be decoded"),
+            (self.damaged, f"{self.damaged} frames are damaged"),
+            (self.missing, f"{self.missing} frames of the file's index are missing: it is cut off"),
+            (
+                self.short_by_s > _SHORT_END_S,
+                f"the pictures end {self.short_by_s:.1f} s before the film's stated end",
+            ),
+            (self.out_of_order, f"{self.out_of_order} frames go back in time and were dropped"),
+            (self.times_guessed, f"{self.times_guessed} frames have no time and were given one"),
+        )
+        return tuple(text for found, text in said if found)
+
+
+def fitted_size(width: int, height: int, max_side_px: int | None) -> tuple[int, int]:
+    """Width and height of the largest picture of the same shape whose sides are at most `max_side_px`."""
+    longer = max(width, height)
+    if max_side_px is None or longer <= max_side_px:
+        return width, height
+    return max(1, round(width * max_side_px / longer)), max(1, round(height * max_side_px / longer))
+
+
+def chosen(timed: Iterable[tuple[float, _T]], options: VideoOptions) -> Iterator[tuple[int, float, _T]]:
+    """Those of (time in seconds, something), in order of time, that the options ask for, with their index."""
+    index = 0
+    for time_s, item in timed:
+        if options.start_s is not None and time_s < options.start_s:
+            continue
+        if options.end_s is not None and time_s >= options.end_s:
+            return
+        if index % options.every == 0:
+            yield index, time_s, item
+        index += 1
+
+
+class Video(ABC):
+    """An open film: its facts, its frames once from start to end, and what reading came to.
+
+    A context manager; to be used from one thread. Frames hold decoder memory for their colours until they are
+    let go; nothing else grows while a film is read.
+    """
+
+    def __init__(self, info: VideoInfo) -> None:
+        self.info = info
+        self._iterated = False
+
+    @property
+    @abstractmethod
+    def report(self) -> VideoReport:
+        """What reading has come to so far; its last word after the last frame."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let the source go; frames that were read keep their pixels."""
+
+    @abstractmethod
+    def _frames(self) -> Iterator[VideoFrame]:
+        """The frames that the options ask for."""
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        """Frames in display order, with times that increase.
+
+        Raises:
+            VideoError: the source breaks, changes its size or rotation, or was closed.
+            InvalidValueError: the film was iterated before.
+        """
+        if self._iterated:
+            raise InvalidValueError(f"{self.info.name}: a film is read once; open it again to read it again")
+        self._iterated = True
+        return self._frames()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

@@ -1,0 +1,228 @@
+"""A film as a folder of pictures, in the natural order of their names, with times from a file or a rate.
+
+Times come from one of two files in the folder:
+
+- `timestamps.csv`, with a heading and at least the columns `file` and `time_s`, a line for each picture;
+- `times.txt`, one time in seconds on each line, in the natural order of the pictures; `#` begins a comment.
+
+Pixels come as stored, as of every other picture file: EXIF orientation is not applied.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError, VideoError
+from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, probe
+from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
+
+_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
+_CSV_NAME, _TXT_NAME = "timestamps.csv", "times.txt"
+_MAX_BYTES = 1 << 30  # of one picture: an uncompressed TIFF of the most pixels has 400 MB
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+    """Sort key by which frame2 comes before frame10, whatever the case of its letters."""
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return [
+        (0, int(part), "") if part[0] in "0123456789" else (1, 0, part.casefold()) for part in parts
+    ], name
+
+
+def open_folder(folder: Path, options: VideoOptions) -> "FolderVideo":
+    """Open a folder of pictures.
+
+    Raises:
+        VideoError: no pictures or no times, times that do not belong to the pictures, a broken first picture.
+    """
+    try:
+        names = [path.name for path in folder.iterdir() if path.suffix.lower() in _SUFFIXES]
+    except OSError as error:
+        raise VideoError(f"{folder}: the folder cannot be read: {error.strerror or error}") from error
+    names = sorted((name for name in names if not name.startswith(".")), key=natural_key)
+    if not names:
+        raise VideoError(f"{folder}: expected pictures ({', '.join(sorted(_SUFFIXES))}), found none")
+    timed = _timed(folder, names, options.fps)
+    limits = DecodeLimits(
+        max_bytes=_MAX_BYTES,
+        max_pixels=options.max_full_pixels,
+        max_side_px=options.max_full_side_px,
+        min_side_px=1,
+    )
+    return FolderVideo(folder, timed, limits, options)
+
+
+class FolderVideo(Video):
+    """An open folder; made by `open_folder`.
+
+    Args:
+        timed: (time in seconds, name), in order of time.
+    """
+
+    def __init__(
+        self, folder: Path, timed: list[tuple[float, str]], limits: DecodeLimits, options: VideoOptions
+    ) -> None:
+        self._folder, self._timed, self._limits, self._options = folder, timed, limits, options
+        self._size = self._stored_size(timed[0][1])
+        self._frame_size = fitted_size(*self._size, options.max_side_px)
+        self._report = VideoReport()
+        self._closed = False
+        length_s = timed[-1][0] - timed[0][0]
+        rate = (len(timed) - 1) / length_s if length_s > 0 else options.fps
+        super().__init__(
+            VideoInfo(
+                name=folder.name or str(folder),
+                width=self._size[0],
+                height=self._size[1],
+                frame_width=self._frame_size[0],
+                frame_height=self._frame_size[1],
+                frame_rate_hz=rate,
+                duration_s=len(timed) / rate if rate else None,
+                frame_count=len(timed),
+                codec="pictures",
+                container="folder",
+            )
+        )
+
+    @property
+    def report(self) -> VideoReport:
+        return self._report
+
+    def close(self) -> None:
+        self._closed = True
+
+    def _frames(self) -> Iterator[VideoFrame]:
+        for index, time_s, name in chosen(self._timed, self._options):
+            if self._closed:
+                raise VideoError(f"{self.info.name} is closed; read its frames inside the `with` block")
+            size = self._stored_size(name)
+            if size != self._size:
+                raise VideoError(
+                    f"{self.info.name}: {name} has {size[0]}x{size[1]} pixels, but {self._timed[0][1]} has "
+                    f"{self._size[0]}x{self._size[1]}; put pictures of another size in a folder of their own"
+                )
+            yield self._frame(index, time_s, name)
+        self._report = replace(self._report, at_end=self._options.end_s is None)
+
+    def _frame(self, index: int, time_s: float, name: str) -> VideoFrame:
+        try:
+            gray = self._fitted(decode_gray(self._folder / name, self._limits))
+        except ImageError as error:
+            raise self._broken(name, error) from error
+        done, last_s = self._report, self._report.last_s
+        self._report = replace(
+            done,
+            delivered=done.delivered + 1,
+            decoded=done.decoded + 1,
+            longest_gap_s=max(done.longest_gap_s, time_s - last_s if last_s is not None else 0.0),
+            last_s=time_s,
+        )
+        return VideoFrame(index=index, time_s=time_s, gray=gray, make_rgb=lambda: self._rgb(name))
+
+    def _rgb(self, name: str) -> NDArray[np.uint8]:
+        try:
+            return self._fitted(decode_rgb(self._folder / name, self._limits))
+        except ImageError as error:
+            raise self._broken(name, error) from error
+
+    def _fitted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        if self._frame_size == self._size:
+            return pixels
+        return np.asarray(cv2.resize(pixels, self._frame_size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+    def _stored_size(self, name: str) -> tuple[int, int]:
+        try:
+            header = probe(self._folder / name, self._limits)
+        except ImageError as error:
+            raise self._broken(name, error) from error
+        return header.width, header.height
+
+    def _broken(self, name: str, error: ImageError) -> VideoError:
+        return VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}")
+
+
+def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[float, str]]:
+    """(time in seconds, name) in order of time, which must be that of the names unless a table says more."""
+    table, lines = folder / _CSV_NAME, folder / _TXT_NAME
+    if table.is_file() and lines.is_file():
+        raise VideoError(
+            f"{folder}: expected one file of times, found {_CSV_NAME} and {_TXT_NAME}; remove one"
+        )
+    if table.is_file():
+        timed = sorted(_from_table(table, names))
+    elif lines.is_file():
+        timed = _from_lines(lines, names)
+    elif fps is not None:
+        return [(index / fps, name) for index, name in enumerate(names)]
+    else:
+        raise VideoError(
+            f"{folder}: expected the times of its {len(names)} pictures, found none; put a {_CSV_NAME} "
+            f"(columns file,time_s) or a {_TXT_NAME} (a time on each line) beside them, or give a rate (fps)"
+        )
+    for (before_s, before), (time_s, name) in pairwise(timed):
+        if time_s <= before_s:
+            raise VideoError(
+                f"{folder}: expected times that increase, found {before_s:g} s for {before} and {time_s:g} s "
+                f"for {name}"
+            )
+    return timed
+
+
+def _from_table(path: Path, names: list[str]) -> list[tuple[float, str]]:
+    rows = csv.DictReader(_text(path).splitlines())
+    columns = [column.strip() for column in rows.fieldnames or ()]
+    rows.fieldnames = columns
+    if not {"file", "time_s"} <= set(columns):
+        raise VideoError(f"{path}: expected a heading with the columns file and time_s, found {columns}")
+    times: dict[str, float] = {}
+    for row in rows:
+        name = (row["file"] or "").strip()
+        if name in times:
+            raise VideoError(f"{path}: line {rows.line_num}: {name} is there twice")
+        times[name] = _seconds(path, rows.line_num, row["time_s"] or "")
+    without = [name for name in names if name not in times]
+    unknown = sorted(set(times) - set(names), key=natural_key)
+    if without or unknown:
+        raise VideoError(
+            f"{path}: expected a line for each of the {len(names)} pictures; without a time: "
+            f"{_some(without)}; not in the folder: {_some(unknown)}"
+        )
+    return [(times[name], name) for name in names]
+
+
+def _from_lines(path: Path, names: list[str]) -> list[tuple[float, str]]:
+    lines = [(number, line.partition("#")[0]) for number, line in enumerate(_text(path).splitlines(), 1)]
+    times = [_seconds(path, number, line) for number, line in lines if line.strip()]
+    if len(times) != len(names):
+        raise VideoError(f"{path}: expected {len(names)} times, one for each picture, found {len(times)}")
+    return list(zip(times, names, strict=True))
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        raise VideoError(f"{path}: the times cannot be read: {error}") from error
+
+
+def _seconds(path: Path, number: int, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise VideoError(f"{path}: line {number}: expected a time in seconds, found {text.strip()!r}")
+    return value
+
+
+def _some(names: list[str], most: int = 5) -> str:
+    said = ", ".join(names[:most]) or "none"
+    return said + (f" and {len(names) - most} more" if len(names) > most else "")

@@ -1,0 +1,209 @@
+"""Opens what libav can open, and says in plain words why something cannot be opened."""
+
+import errno
+import re
+import stat
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol, cast
+from urllib.parse import urlsplit
+
+import av
+from av.container import InputContainer
+
+from featuredb.errors import VideoError
+from featuredb.video.film import VideoOptions
+
+# A file is taken for a film by its contents. Without this list, a playlist or a script that somebody named
+# .mp4 would make libav open other files and addresses on its behalf.
+_FILE_FORMATS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts"
+_FILE_FORMATS_SAID = "mp4, mov, mkv, webm, avi or ts"
+_SCHEMES = ("rtsp", "rtsps", "http", "https", "rtmp", "rtmps", "rtp", "srt", "tcp", "udp")
+# What an address may lead on to (a playlist's segments, RTSP's streams): the network, no local files.
+_NETWORK_PROTOCOLS = ",".join((*_SCHEMES, "tls", "crypto", "httpproxy"))
+
+_BLOCK_PX = 128  # of AV1 and its like; half of it in H.265
+
+
+class Readable(Protocol):
+    """An open binary file; sought in if it can be."""
+
+    def read(self, size: int, /) -> bytes: ...
+
+
+Source = str | Path | Readable
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opening:
+    """How a source is handed to libav.
+
+    Attributes:
+        name: for messages, without password.
+        target: what `av.open` takes.
+        path: the regular file that it is, or None.
+        input_format, input_options: libav's, see VideoOptions.
+        live: whether it is read once from its start, with a timeout.
+    """
+
+    name: str
+    target: Any
+    path: Path | None
+    input_format: str | None
+    input_options: dict[str, str]
+    live: bool
+
+
+def opening_of(source: Source, options: VideoOptions) -> Opening:
+    """Where a source is and how it is opened; nothing is opened yet.
+
+    Raises:
+        VideoError: no such file, not a regular file, or an address of an unknown kind.
+    """
+    if isinstance(source, str) and re.match(r"[A-Za-z][A-Za-z0-9+.-]*://", source):
+        return _address(source, options)
+    if isinstance(source, str | Path):
+        return _file_or_device(Path(source), options)
+    seekable = getattr(source, "seekable", None)
+    return Opening(
+        name=str(getattr(source, "name", "the open file")),
+        target=source,
+        path=None,
+        input_format=options.input_format,
+        input_options={"format_whitelist": _FILE_FORMATS, **options.input_options},
+        live=not (callable(seekable) and seekable()),
+    )
+
+
+def _address(url: str, options: VideoOptions) -> Opening:
+    parts = urlsplit(url)
+    name = url if "@" not in parts.netloc else url.replace(parts.netloc, parts.netloc.rpartition("@")[2], 1)
+    if parts.scheme not in _SCHEMES:
+        raise VideoError(
+            f"{name}: expected a path, or an address of one of {', '.join(_SCHEMES)}, found {parts.scheme}://"
+        )
+    given = {"protocol_whitelist": _NETWORK_PROTOCOLS}
+    if parts.scheme in ("rtsp", "rtsps"):
+        given["rtsp_transport"] = (
+            "tcp"  # over UDP a lost datagram smears the picture until the next key frame
+        )
+    return Opening(
+        name=name,
+        target=url,
+        path=None,
+        input_format=options.input_format,
+        input_options={**given, **options.input_options},
+        live=True,
+    )
+
+
+def _file_or_device(path: Path, options: VideoOptions) -> Opening:
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise VideoError(f"{path}: the film cannot be opened: {reason}") from error
+    if not (stat.S_ISREG(mode) or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)):
+        raise VideoError(f"{path}: expected a film, a folder of pictures, a pipe or a camera's device")
+    regular = stat.S_ISREG(mode)
+    device = stat.S_ISCHR(mode)
+    given = {} if device else {"format_whitelist": _FILE_FORMATS, "protocol_whitelist": "file"}
+    return Opening(
+        name=path.name if regular else str(path),
+        # Without the scheme a name like "tcp:2.mp4" would be taken for an address.
+        target=str(path) if device else f"file:{path.absolute()}",
+        path=path if regular else None,
+        input_format=options.input_format or ("v4l2" if device else None),
+        input_options={**given, **options.input_options},
+        live=not regular,
+    )
+
+
+def coded_pixels(options: VideoOptions) -> int:
+    """Most pixels of a coded picture, which ends in whole blocks; libav allocates nothing for larger ones."""
+    return options.max_full_pixels + 2 * _BLOCK_PX * options.max_full_side_px
+
+
+def open_input(opening: Opening, options: VideoOptions) -> InputContainer:
+    """The open container.
+
+    Raises:
+        VideoError: it cannot be opened, in words that say why.
+    """
+    try:
+        container = av.open(
+            opening.target,
+            "r",
+            format=opening.input_format,
+            # For libav's own look at the first frames; the decoder is given the same.
+            options={"max_pixels": str(coded_pixels(options))},
+            container_options=opening.input_options,
+            metadata_errors="replace",  # a camera's odd bytes in a tag are no reason to refuse its film
+            # A timeout makes libav ask Python again and again, which a file is not worth.
+            timeout=options.timeout_s if opening.live else None,
+        )
+    except (av.FFmpegError, OSError, ValueError) as error:
+        raise _refusal(opening, options, error) from error
+    return cast("InputContainer", container)
+
+
+def _refusal(opening: Opening, options: VideoOptions, error: Exception) -> VideoError:
+    name = opening.name
+    # A format that is not in the list is invalid data, or an invalid argument where its suffix names it.
+    if opening.path is not None and (
+        isinstance(error, av.InvalidDataError) or getattr(error, "errno", None) == errno.EINVAL
+    ):
+        return VideoError(f"{name}: {_what_it_is(opening.path)}")
+    if isinstance(error, av.error.ExitError):
+        return VideoError(
+            f"{name}: nothing came within {options.timeout_s:g} s; check that the source is sending and can "
+            "be reached, or allow a longer timeout_s"
+        )
+    if isinstance(error, av.InvalidDataError):
+        return VideoError(
+            f"{name}: what came is not a film that can be read; expected {_FILE_FORMATS_SAID} or a camera's "
+            "stream (an mp4 or mov that cannot be sought in needs its index in front: `-movflags +faststart`)"
+        )
+    reason = getattr(error, "strerror", None) or str(error)
+    hint = "" if opening.live else "; if it opens elsewhere, copy it again, else its header is broken"
+    return VideoError(f"{name}: the film cannot be opened: {reason}{hint}")
+
+
+def _what_it_is(path: Path) -> str:
+    """Why libav finds no film in a file."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+            boxes = _box_names(file)
+    except OSError as error:
+        return f"the film cannot be read: {error.strerror or error}"
+    if not head:
+        return "the file is empty; copy it again"
+    if boxes and "moov" not in boxes:
+        return (
+            f"an mp4 or mov without its index: found the boxes {', '.join(boxes)}, no moov. The recording or "
+            "the copy broke off; copy it again, or have the index rebuilt (untrunc)"
+        )
+    if boxes:
+        return "an mp4 or mov whose index is broken; copy it again"
+    return f"expected {_FILE_FORMATS_SAID}, found a file that begins with {head!r}"
+
+
+def _box_names(file: Any, most: int = 64) -> list[str]:
+    """Names of the top-level boxes of an ISO base media file (ISO 14496-12, 4.2); empty if it is none."""
+    names: list[str] = []
+    at = 0
+    while len(names) < most:
+        file.seek(at)
+        header = file.read(16)
+        if len(header) < 8 or not re.fullmatch(rb"[A-Za-z0-9 ]{4}", header[4:8]):
+            break
+        size = struct.unpack_from(">I", header)[0]
+        if size == 1 and len(header) == 16:
+            size = struct.unpack_from(">Q", header, 8)[0]
+        names.append(header[4:8].decode("ascii").strip())
+        if size < 8:
+            break
+        at += size
+    return names if names and names[0] in ("ftyp", "moov", "mdat", "wide", "free", "skip") else []

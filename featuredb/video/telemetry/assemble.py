@@ -1,0 +1,242 @@
+"""From the raw columns of any format to a `Telemetry`: what cannot be true becomes "not known", with a line.
+
+Nothing is invented and nothing is repaired: a position out of range, at 0, 0 or without a fix is NaN. Samples
+whose time does not advance are left out. A file without any position is refused.
+"""
+
+from array import array
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import TelemetryError
+from featuredb.geo.datum import HeightDatum
+from featuredb.geometry.arrays import FloatArray
+from featuredb.video.telemetry.interpolate import wrap_degrees
+from featuredb.video.telemetry.values import Clock, Telemetry
+
+# Nine hours at 60 samples a second: longer than any battery or memory card lasts.
+MAX_SAMPLES = 2_000_000
+MAX_WARNINGS = 20
+
+# Metres of one standard deviation per axis for a dilution of precision of 1: the user equivalent range error
+# of a single-frequency receiver, the same as for photos (`featuredb.features.exif_gps`).
+RANGE_ERROR_M = 3.0
+# Radius of 68 % of a circular normal distribution, in deviations of one axis: sqrt(-2 ln 0.32).
+RADIUS_68 = 1.5096
+METRES_PER_DEGREE = 111_195.0  # of a great circle of the mean Earth
+
+_FIELDS = (
+    "times_s", "latitude_deg", "longitude_deg", "height_m", "relative_height_m", "sigma_m", "clock_s",
+    "focal_35mm", "gimbal_yaw", "gimbal_pitch", "gimbal_roll", "aircraft_yaw", "aircraft_pitch",
+    "aircraft_roll",
+)  # fmt: skip
+_NULL_ISLAND_DEG = 1e-6
+# As for photos: from below the Dead Sea's shore to above airliners; above take-off the same span downwards.
+_HEIGHT_RANGE_M = (-500.0, 20_000.0)
+_RELATIVE_HEIGHT_RANGE_M = (-9_000.0, 20_000.0)
+_SIGMA_RANGE_M = (0.005, 1000.0)
+_FOCAL_RANGE_MM = (4.0, 5000.0)  # circular fisheye to the longest zoom
+_CLOCK_RANGE_S = (315_532_800.0, 4_102_444_800.0)  # 1980, when GPS time begins, to 2100
+# A clock that advances by so much more or less than the video between two samples: a cut, or it was set anew.
+_CLOCK_JUMP_S = 2.0
+# No drone and no car: 50 m and 150 m/s between one reading of the receiver and the next.
+_LEAP_M, _LEAP_M_S = 50.0, 150.0
+
+
+class SampleTable:
+    """Columns of raw samples; a field that a row does not give is NaN."""
+
+    def __init__(self) -> None:
+        self._columns = {name: array("d") for name in _FIELDS}
+
+    def __len__(self) -> int:
+        return len(self._columns["times_s"])
+
+    def add(self, row: Mapping[str, float]) -> None:
+        """One sample: fields of `TelemetrySamples`, angles as gimbal_yaw, aircraft_pitch and so on."""
+        for name, column in self._columns.items():
+            column.append(row.get(name, float("nan")))
+
+    def extend(self, columns: Mapping[str, FloatArray], n: int) -> None:
+        """`n` samples by columns of shape (n,)."""
+        for name, column in self._columns.items():
+            given = columns.get(name)
+            filled = np.full(n, np.nan)
+            if given is not None:
+                filled[:] = given
+            column.frombytes(filled.tobytes())
+
+    def column(self, name: str) -> FloatArray:
+        """A copy of one column, (n,) float64."""
+        return np.array(self._columns[name], dtype=np.float64)
+
+
+@dataclass(slots=True, kw_only=True)
+class About:
+    """What a reader knows about its samples beside their values; see `Telemetry`."""
+
+    source: str
+    origin: str
+    height_datum: HeightDatum = "unknown"
+    clock: Clock = "none"
+    in_video_time: bool = True
+    from_first: bool = False  # times are made to count from the first sample
+    resolution_m: float = float("nan")
+    sort: bool = False  # by time, for formats that do not promise an order
+    warnings: list[str] = field(default_factory=list)
+
+
+def assemble(table: SampleTable, about: About) -> Telemetry:
+    """The telemetry of raw samples.
+
+    Raises:
+        TelemetryError: no samples, too many, or none with a position.
+    """
+    if not len(table):
+        raise TelemetryError(f"{about.origin}: no samples of telemetry in it")
+    check_count(len(table), about.origin)
+    warnings = about.warnings
+    with np.errstate(over="ignore", invalid="ignore"):
+        times = table.column("times_s")
+        if about.from_first:
+            times = _since_first(times, about.sort)
+        rows = _rows_in_time(times, about.sort, warnings)
+        columns = {name: table.column(name)[rows] for name in _FIELDS} | {"times_s": times[rows]}
+        latitude, longitude = _positions(columns["latitude_deg"], columns["longitude_deg"], warnings)
+        if not np.isfinite(latitude).any():
+            reasons = "; ".join(warnings[:3])
+            raise TelemetryError(
+                f"{about.origin} ({about.source}): {len(rows)} samples, none with a position"
+                + (f" ({reasons})" if reasons else "")
+                + "; give another log of the flight (GPX or CSV)"
+            )
+        clock = _within(columns["clock_s"], _CLOCK_RANGE_S, "clock readings", warnings)
+        _tell_jumps(columns["times_s"], latitude, longitude, clock, warnings)
+        return Telemetry(
+            times_s=columns["times_s"],
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            height_m=_within(columns["height_m"], _HEIGHT_RANGE_M, "heights", warnings),
+            relative_height_m=_within(
+                columns["relative_height_m"], _RELATIVE_HEIGHT_RANGE_M, "relative heights", warnings
+            ),
+            sigma_m=_within(columns["sigma_m"], _SIGMA_RANGE_M, "accuracies", warnings),
+            gimbal_ypr_deg=_angles(columns, "gimbal", warnings),
+            aircraft_ypr_deg=_angles(columns, "aircraft", warnings),
+            clock_s=clock,
+            focal_35mm=_within(columns["focal_35mm"], _FOCAL_RANGE_MM, "focal lengths", warnings),
+            height_datum=about.height_datum,
+            clock=about.clock if np.isfinite(clock).any() else "none",
+            in_video_time=about.in_video_time,
+            resolution_m=about.resolution_m,
+            source=about.source,
+            origin=about.origin,
+            warnings=tuple(warnings[:MAX_WARNINGS]),
+        )
+
+
+def check_count(samples: int, origin: str) -> None:
+    """Raises TelemetryError where there are more samples than MAX_SAMPLES."""
+    if samples > MAX_SAMPLES:
+        raise TelemetryError(
+            f"{origin}: more than {MAX_SAMPLES} samples, that is more than nine hours at 60 a second; "
+            "cut the file to the part that belongs to the video"
+        )
+
+
+def resolution_of_decimals(decimals: int) -> float:
+    """Metres north of one unit of the last of so many decimals of a degree; NaN for a negative number."""
+    return METRES_PER_DEGREE * 10.0 ** -min(decimals, 15) if decimals >= 0 else float("nan")
+
+
+def _since_first(times_s: FloatArray, earliest: bool) -> FloatArray:
+    """Times since the first, or the earliest, that is known; before they are compared, as it rounds."""
+    known = times_s[np.isfinite(times_s)]
+    if not known.size:
+        return times_s
+    return times_s - float(known.min() if earliest else known[0])
+
+
+def _rows_in_time(times_s: FloatArray, sort: bool, warnings: list[str]) -> NDArray[np.intp]:
+    """Rows whose time is known and later than every time before."""
+    rows = np.flatnonzero(np.isfinite(times_s))
+    if sort:
+        ordered = rows[np.argsort(times_s[rows], kind="stable")]
+        if not np.array_equal(ordered, rows):
+            warnings.append("the samples were not in the order of time and have been sorted")
+        rows = ordered
+    timed = times_s[rows]
+    before = np.concatenate([[-np.inf], np.maximum.accumulate(timed)[:-1]]) if len(rows) else timed
+    kept = rows[timed > before]
+    if len(kept) < len(times_s):
+        warnings.append(
+            f"{len(times_s) - len(kept)} of {len(times_s)} samples left out: no time, or one that is not "
+            "later than that of the sample before"
+        )
+    return kept
+
+
+def _positions(
+    latitude: FloatArray, longitude: FloatArray, warnings: list[str]
+) -> tuple[FloatArray, FloatArray]:
+    whole = np.isfinite(latitude) & np.isfinite(longitude)
+    inside = whole & (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0)
+    zero = inside & (np.abs(latitude) < _NULL_ISLAND_DEG) & (np.abs(longitude) < _NULL_ISLAND_DEG)
+    if (whole & ~inside).any():
+        warnings.append(f"{(whole & ~inside).sum()} positions out of range are not used")
+    if zero.any():
+        warnings.append(f"{zero.sum()} positions at 0, 0 are a receiver without a fix; not used")
+    good = inside & ~zero
+    return np.where(good, latitude, np.nan), np.where(good, longitude, np.nan)
+
+
+def _within(values: FloatArray, limits: tuple[float, float], what: str, warnings: list[str]) -> FloatArray:
+    good = (values >= limits[0]) & (values <= limits[1])
+    absurd = int((~good & ~np.isnan(values)).sum())
+    if absurd:
+        warnings.append(f"{absurd} {what} outside [{limits[0]:g}, {limits[1]:g}] are not used")
+    return np.where(good, values, np.nan)
+
+
+def _angles(columns: Mapping[str, FloatArray], of: str, warnings: list[str]) -> FloatArray:
+    """(n, 3) yaw, pitch, roll in [-180, 180)."""
+    parts = [
+        wrap_degrees(_within(columns[f"{of}_{axis}"], (-720.0, 720.0), f"{of} angles", warnings))
+        for axis in ("yaw", "pitch", "roll")
+    ]
+    return np.stack(parts, axis=1)
+
+
+def _tell_jumps(
+    times_s: FloatArray, latitude: FloatArray, longitude: FloatArray, clock_s: FloatArray, warnings: list[str]
+) -> None:
+    """Warns of joined or cut recordings, which show as a clock or a place that leaps."""
+    told = np.flatnonzero(np.isfinite(clock_s))
+    drift = np.diff(clock_s[told]) - np.diff(times_s[told])
+    if drift.size and np.abs(drift).max() > _CLOCK_JUMP_S:
+        worst = int(np.abs(drift).argmax())
+        warnings.append(
+            f"the clock goes {drift[worst]:+.1f} s ahead of the video at {times_s[told[worst + 1]]:.2f} s "
+            f"({(np.abs(drift) > _CLOCK_JUMP_S).sum()} such jumps): recordings joined, or the clock was set"
+        )
+    told = np.flatnonzero(np.isfinite(latitude))
+    moved = np.diff(latitude[told]) != 0.0
+    moved |= np.diff(longitude[told]) != 0.0
+    # A receiver is slower than frames: only the readings at which the place changes have a time of their own.
+    readings = told[1:][moved]
+    if len(readings) < 2:
+        return
+    north = np.diff(latitude[readings]) * METRES_PER_DEGREE
+    east = wrap_degrees(np.diff(longitude[readings])) * METRES_PER_DEGREE
+    leap = np.hypot(north, east * np.cos(np.radians(latitude[readings[1:]])))
+    speed = leap / np.diff(times_s[readings])
+    wild = (leap > _LEAP_M) & (speed > _LEAP_M_S)
+    if wild.any():
+        first = int(np.flatnonzero(wild)[0])
+        warnings.append(
+            f"the place leaps by {leap[first]:.0f} m in {np.diff(times_s[readings])[first]:.2f} s at "
+            f"{times_s[readings[first + 1]]:.2f} s ({wild.sum()} such leaps): recordings joined, wrong fixes"
+        )

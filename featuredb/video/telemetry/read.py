@@ -1,0 +1,177 @@
+"""The way in: the telemetry of one file, or the telemetry that belongs to a video."""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from featuredb.errors import TelemetryError
+from featuredb.video.telemetry.assemble import MAX_WARNINGS
+from featuredb.video.telemetry.axis_order import AxisOrder
+from featuredb.video.telemetry.csv_table import read_csv
+from featuredb.video.telemetry.gpmf import has_positions, read_gpmf
+from featuredb.video.telemetry.gpx import read_gpx
+from featuredb.video.telemetry.srt import read_srt, telemetry_of_blocks
+from featuredb.video.telemetry.srt_blocks import has_times
+from featuredb.video.telemetry.srt_fields import looks_like_telemetry
+from featuredb.video.telemetry.text import decode_text, read_bytes
+from featuredb.video.telemetry.tracks import Tracks, read_tracks
+from featuredb.video.telemetry.values import Telemetry
+
+logger = logging.getLogger(__name__)
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".lrv", ".360")
+# Beside a video, best first: subtitles keep the video's own time, the others have to be aligned by a clock.
+SIDECAR_SUFFIXES = (".srt", ".gpx", ".csv")
+_SNIFFED_BYTES = 65_536
+
+
+@dataclass(frozen=True, slots=True)
+class _Candidate:
+    name: str
+    read: Callable[[], Telemetry]
+
+
+def read_telemetry(path: Path, order: AxisOrder | None = None) -> Telemetry:
+    """The telemetry of a file: subtitles, GPX, a table, or a video with a track of it.
+
+    What it is, is told by its contents; the suffix counts where they do not tell.
+
+    Args:
+        path: the file.
+        order: which coordinate comes first in subtitles that do not name them, where the file cannot tell.
+
+    Raises:
+        TelemetryError: it cannot be read, is none of these, or holds no position.
+    """
+    kind = path.suffix.lower()
+    if kind in VIDEO_SUFFIXES:
+        tracks = read_tracks(path)
+        candidates = _embedded(tracks, path.name, order)
+        if not candidates:
+            found = "; ".join(tracks.hints + tracks.damage)
+            hint = f" ({found})" if found else ""
+            raise TelemetryError(
+                f"{path.name}: expected a GPMF track or a drone's subtitles in it, found neither{hint}; give "
+                "the drone's .SRT file or a GPX or CSV log"
+            )
+        return _first_readable(path.name, candidates, [], tracks.damage)
+    data = read_bytes(path)
+    if not data:
+        raise TelemetryError(f"{path.name}: the file is empty; was the recording interrupted?")
+    kind = _kind_of(data[:_SNIFFED_BYTES]) or kind
+    if kind == ".srt":
+        return read_srt(data, path.name, order)
+    if kind == ".gpx":
+        return read_gpx(data, path.name)
+    if kind in (".csv", ".tsv", ".txt"):
+        return read_csv(data, path.name)
+    raise TelemetryError(
+        f"{path.name}: expected subtitles (.srt), GPX, a table (.csv) or a video "
+        f"({', '.join(VIDEO_SUFFIXES)}), found a file that begins with {data[:16]!r}"
+    )
+
+
+def telemetry_of_video(path: Path, order: AxisOrder | None = None) -> Telemetry | None:
+    """The telemetry that belongs to a video, in it or beside it; None where there is none.
+
+    Looked at in this order; the first that can be read is taken, and the others are named in its warnings:
+
+    1. a GPMF track with positions: it cannot belong to another video, and has many samples a second;
+    2. a track of a drone's subtitles, for the first reason;
+    3. a file with the video's name and the suffix .srt (any case), which keeps the video's time;
+    4. the same with .gpx, then .csv: clock times, still to be aligned with the video.
+
+    Args:
+        path: the video, or a folder of its frames (for which only the files beside it count).
+        order: as for `read_telemetry`.
+
+    Raises:
+        TelemetryError: no such video, or telemetry was found and none of it can be read; says why.
+    """
+    if not path.exists():
+        raise TelemetryError(f"{path}: no such video")
+    refused: list[str] = []
+    damage: list[str] = []
+    candidates: list[_Candidate] = []
+    if not path.is_dir():
+        try:
+            tracks = read_tracks(path)
+            candidates += _embedded(tracks, path.name, order)
+            damage = tracks.damage
+            for hint in tracks.hints:
+                logger.info("%s: %s", path.name, hint)
+        except TelemetryError as error:
+            refused.append(str(error))
+    candidates += _sidecars(path, order)
+    if not candidates and not refused:
+        return None
+    return _first_readable(path.name, candidates, refused, damage)
+
+
+def _embedded(tracks: Tracks, name: str, order: AxisOrder | None) -> list[_Candidate]:
+    """Readers of the tracks that hold telemetry, best first."""
+    found = []
+    for index, packets in tracks.gpmf.items():
+        if has_positions(packets):
+            label = f"{name}, GPMF track {index}"
+            found.append(_Candidate(label, partial(read_gpmf, packets, label)))
+    for index, blocks in tracks.subtitles.items():
+        if any(looks_like_telemetry(block.text) for block in blocks):
+            label = f"{name}, subtitle track {index}"
+            found.append(_Candidate(label, partial(telemetry_of_blocks, blocks, label, order)))
+    return found
+
+
+def _sidecars(path: Path, order: AxisOrder | None) -> list[_Candidate]:
+    """Readers of the files beside a video that bear its name, best first, without people's talk."""
+    try:
+        beside = sorted(path.absolute().parent.iterdir())
+    except OSError as error:
+        raise TelemetryError(f"{path.parent}: cannot be listed ({error.strerror or error})") from error
+    stem = path.stem.casefold() if not path.is_dir() else path.name.casefold()
+    found = []
+    for suffix in SIDECAR_SUFFIXES:
+        for file in beside:
+            if file.suffix.lower() != suffix or file.stem.casefold() != stem or not file.is_file():
+                continue
+            if suffix == ".srt" and _is_dialogue(file):
+                continue
+            found.append(_Candidate(file.name, partial(read_telemetry, file, order)))
+    return found
+
+
+def _is_dialogue(file: Path) -> bool:
+    """Whether subtitles are there that are no telemetry; an unreadable file is left to its reader."""
+    try:
+        text = decode_text(read_bytes(file)[:_SNIFFED_BYTES])
+    except TelemetryError:
+        return False
+    return has_times(text) and not looks_like_telemetry(text)
+
+
+def _first_readable(
+    name: str, candidates: list[_Candidate], refused: list[str], damage: list[str]
+) -> Telemetry:
+    """The first candidate that can be read, with what else there was in its warnings."""
+    for row, candidate in enumerate(candidates):
+        try:
+            telemetry = candidate.read()
+        except TelemetryError as error:
+            refused.append(str(error))
+            continue
+        notes = [*damage, *(f"not used: {reason}" for reason in refused)]
+        notes += [f"also there, not used: {other.name}" for other in candidates[row + 1 :]]
+        return replace(telemetry, warnings=(*notes, *telemetry.warnings)[:MAX_WARNINGS])
+    raise TelemetryError(f"{name}: no telemetry can be read: " + "; ".join(refused))
+
+
+def _kind_of(start: bytes) -> str:
+    """The suffix that the first bytes of a file deserve, "" where they do not tell."""
+    text = decode_text(start)
+    if text.lstrip()[:5].lower() in ("<?xml", "<gpx ", "<gpx>"):
+        return ".gpx"
+    if has_times(text) or looks_like_telemetry(text):
+        return ".srt"
+    return ""

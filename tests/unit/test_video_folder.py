@@ -1,0 +1,135 @@
+"""Folders of pictures as films: natural order, times, and what is refused by name."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from featuredb.errors import VideoError
+from featuredb.video.film import VideoOptions
+from featuredb.video.folder import natural_key
+from featuredb.video.frames import open_video
+from tests.support.films import HEIGHT, WIDTH, overwritten, picture, read, shown
+
+
+def _folder(folder: Path, names: list[str], size: tuple[int, int] = (WIDTH, HEIGHT)) -> Path:
+    folder.mkdir(exist_ok=True)
+    for index, name in enumerate(names):
+        cv2.imwrite(str(folder / name), picture(index, *size)[:, :, ::-1])
+    return folder
+
+
+NAMES = [f"Frame{i}.png" for i in (1, 2, 9, 10, 11, 100)]
+
+
+def test_a_folder_in_natural_order_at_a_rate(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    (folder / "notes.txt").write_text("no picture")
+    (folder / ".hidden.png").write_bytes(b"no picture")
+    with open_video(str(folder), VideoOptions(fps=4.0)) as video:
+        frames = list(video)
+    assert [shown(frame.gray) for frame in frames] == list(range(6))
+    assert [frame.time_s for frame in frames] == [0.0, 0.25, 0.5, 0.75, 1.0, 1.25]
+    np.testing.assert_array_equal(frames[4].rgb(), picture(4))
+    info = video.info
+    assert (info.width, info.height, info.frame_count, info.container) == (WIDTH, HEIGHT, 6, "folder")
+    assert info.frame_rate_hz == pytest.approx(4.0)
+    assert video.report.delivered == 6
+    assert video.report.whole
+
+
+def test_natural_order() -> None:
+    names = ["b1", "a10", "A2", "a1b20", "a1b3", "a", "10", "9", "a²", "a١"]
+    assert sorted(names, key=natural_key) == ["9", "10", "a", "a1b3", "a1b20", "A2", "a10", "a²", "a١", "b1"]
+
+
+def test_times_of_a_folder(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    times = [0.5, 0.6, 1.0, 1.5, 1.6, 2.5]
+    (folder / "times.txt").write_text("# seconds\n" + "\n".join(f"{t}  # x" for t in times) + "\n\n")
+    assert [frame.time_s for frame in read(folder)] == times
+    assert [f.time_s for f in read(folder, start_s=0.6, end_s=2.0, every=2)] == [0.6, 1.5]
+    (folder / "times.txt").unlink()
+    # A table may order the pictures otherwise than their names do.
+    backward = "".join(f"{name}, {t}, x\n" for name, t in zip(NAMES, reversed(times), strict=True))
+    (folder / "timestamps.csv").write_text("\ufefffile, time_s, note\n" + backward)
+    frames = read(folder, fps=99.0)
+    assert [frame.time_s for frame in frames] == times
+    assert [shown(frame.gray) for frame in frames] == [5, 4, 3, 2, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "said"),
+    [
+        ("times.txt", "1\n2\n", "expected 6 times.*found 2"),
+        ("times.txt", "1\n2\n3\nfour\n5\n6\n", "line 4: expected a time in seconds, found 'four'"),
+        ("times.txt", "1\n2\n3\nnan\n5\n6\n", "line 4"),
+        ("times.txt", "1\n2\n3\n3\n5\n6\n", r"increase, found 3 s for Frame9\.png and 3 s for Frame10\.png"),
+        ("timestamps.csv", "name,time\n", "expected a heading with the columns file and time_s"),
+        ("timestamps.csv", "", "expected a heading"),
+        ("timestamps.csv", "file,time_s\nFrame1.png,0\nFrame1.png,1\n", "line 3: Frame1.png is there twice"),
+        ("timestamps.csv", "file,time_s\nFrame1.png\n", "line 2: expected a time"),
+        (
+            "timestamps.csv",
+            "file,time_s\nother.png,0\nFrame1.png,1\n",
+            r"without a time: Frame2\.png.*not in the folder: other\.png",
+        ),
+    ],
+)
+def test_times_that_do_not_fit_are_refused(tmp_path: Path, file: str, text: str, said: str) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    (folder / file).write_text(text)
+    with pytest.raises(VideoError, match=said):
+        open_video(folder)
+
+
+def test_folders_that_are_refused(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    with pytest.raises(VideoError, match=r"times of its 6 pictures.*or give a rate \(fps\)"):
+        open_video(folder)
+    (folder / "times.txt").write_text("1")
+    (folder / "timestamps.csv").write_text("1")
+    with pytest.raises(VideoError, match=r"timestamps\.csv and times\.txt; remove one"):
+        open_video(folder)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(VideoError, match="empty: expected pictures"):
+        open_video(tmp_path / "empty", VideoOptions(fps=1.0))
+
+
+def test_mixed_sizes_are_refused_by_name(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    cv2.imwrite(str(folder / "Frame10.png"), picture(0, 80, 60))
+    with open_video(folder, VideoOptions(fps=1.0)) as video:
+        frames = iter(video)
+        assert [next(frames).index for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(VideoError, match=r"Frame10\.png has 80x60 pixels, but Frame1\.png has 160x120"):
+            next(frames)
+
+
+def test_a_broken_picture_is_refused_by_name(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    whole = (folder / "Frame9.png").read_bytes()
+    (folder / "Frame9.png").write_bytes(whole[: len(whole) // 2])
+    with open_video(folder, VideoOptions(fps=1.0)) as video:
+        frames = iter(video)
+        next(frames)
+        next(frames)
+        with pytest.raises(VideoError, match=r"frames: the picture Frame9\.png cannot be read: .*ends after"):
+            next(frames)
+    (folder / "Frame1.png").write_bytes(overwritten(whole, 0, 8))
+    with pytest.raises(VideoError, match=r"Frame1\.png cannot be read"):
+        open_video(folder, VideoOptions(fps=1.0))
+
+
+def test_large_pictures_of_a_folder_are_made_smaller(tmp_path: Path) -> None:
+    folder = _folder(tmp_path / "frames", NAMES)
+    with open_video(folder, VideoOptions(fps=1.0, max_side_px=80)) as video:
+        frame = next(iter(video))
+    assert (video.info.frame_width, video.info.frame_height) == (80, 60)
+    np.testing.assert_array_equal(
+        frame.gray, cv2.resize(picture(0)[:, :, 0], (80, 60), interpolation=cv2.INTER_AREA)
+    )
+    assert frame.rgb().shape == (60, 80, 3)
+    with pytest.raises(VideoError, match="limit of a side is 100"):
+        open_video(folder, VideoOptions(fps=1.0, max_full_side_px=100))
