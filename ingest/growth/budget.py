@@ -9,6 +9,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
+from ingest.growth.all_directions import with_all_directions
 from ingest.growth.confirmation import ConfirmationOptions, confirm, sources_json
 from ingest.growth.gates import Gate
 from ingest.growth.map_graph import (
@@ -76,7 +77,8 @@ def with_drift(
         covariance=covariance,
         evidence={**feature_map.placement.evidence, GROWTH: growth},
     )
-    return replace(feature_map, placement=placement, status="quarantined"), drift, relative
+    placed = with_all_directions(replace(feature_map, placement=placement))
+    return replace(placed, status="quarantined"), drift, relative
 
 
 def rows_within(

@@ -15,6 +15,7 @@ from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame, in_frame, move_map
 from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
+from ingest.growth.all_directions import with_all_directions
 from ingest.growth.canaries import CanaryCheck, CanaryOptions, CanaryRun, check_known
 from ingest.growth.map_graph import (
     OWN,
@@ -188,7 +189,8 @@ def _commit(
             own = Sim3.identity()
         else:
             covariance = covariance_in_frame(solution.covariance[map_id], frame, maps[map_id].frame)
-            moved[map_id] = move_map(snapshot.load_map(map_id), own, covariance=covariance)
+            there = move_map(snapshot.load_map(map_id), own, covariance=covariance)
+            moved[map_id] = there if maps[map_id].is_anchor else with_all_directions(there)
         corrections[map_id] = own
     places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
     contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}
