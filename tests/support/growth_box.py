@@ -3,9 +3,11 @@
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
-from tests.support.new_photos import FINGERPRINT
+from ingest.growth.values import GrownMap
+from tests.support.new_photos import FINGERPRINT, NewPhotos
 from tests.support.scenes import (
     EASTING,
     EPSG,
@@ -58,3 +60,10 @@ def prior(pose: Rigid3, offset: tuple[float, float] = (0.0, 0.0), sigma_m: float
         sigma_horizontal_m=sigma_m,
         sigma_vertical_m=20.0,
     )
+
+
+def centers_error(grown: GrownMap, new: NewPhotos) -> FloatArray:
+    """(k,) metres from the true centres, of the photos of a grown map."""
+    truth = np.array([new.poses[int(r)].center for r in grown.model.rows])
+    to_frame = grown.feature_map.frame.enu_from(FRAME)
+    return np.linalg.norm(grown.model.centers() - to_frame.act(truth), axis=1)

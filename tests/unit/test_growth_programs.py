@@ -97,16 +97,14 @@ def steps(ratio: float = 0.5, stopped: int = 0, reach: float = 700.0, drift: flo
 
 def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
     world = WalkOptions()
-    good = steps()
+    good = steps(stopped=9)
     assert all(holding(growth_walk.judge(good, good[0], 1, 0.5, world)).values())
-    near = steps(reach=300.0)
+    near = steps(reach=300.0, stopped=9)
     assert not holding(growth_walk.judge(near, good[0], 1, 0.5, world))["coverage follows"]
-    assert holding(growth_walk.judge(steps(reach=300.0, stopped=9), good[0], 1, 0.5, world))[
-        "coverage follows"
-    ]
+    assert not holding(growth_walk.judge(steps(stopped=0), good[0], 1, 0.5, world))["budget"]
     far = steps(ratio=1.2)
     assert not holding(growth_walk.judge(far, good[0], 1, 0.5, world))["true error inside the bound"]
-    over = steps(drift=0.6)
+    over = steps(drift=0.6, stopped=9)
     assert not holding(growth_walk.judge(over, good[0], 1, 0.5, world))["budget"]
     assert not holding(growth_walk.judge(good, good[0], 2, 0.5, world))["second anchor"]
     off = replace(good[0], probes=(replace(good[0].probes[0], error_m=0.31, normalised=20.0),))

@@ -1,0 +1,130 @@
+"""Lenses of photos that grow: lent by maps, shared, and told better by the existing points."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.camera import Camera
+from ingest.growth.grown_map import GrowOptions, grow_component
+from ingest.growth.localised import LocaliseEachOptions, localise_photos
+from ingest.growth.lone_lenses import with_shared_lenses
+from ingest.growth.own_lenses import OwnLensOptions
+from ingest.growth.values import GrownMap
+from reloc.candidates import IndexedArea
+from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, centers_error, existing, walk
+from tests.support.new_photos import NewPhotos, identity, moved, take_photos
+from tests.support.scenes import CAMERA, indexed
+
+
+@pytest.fixture(scope="module")
+def area() -> IndexedArea:
+    return indexed(existing())
+
+
+@pytest.fixture(scope="module")
+def new() -> NewPhotos:
+    return take_photos(np.random.default_rng(3), POINTS, DESCRIPTORS, walk(), camera_key=KEY)
+
+
+def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
+    """Structure from motion of a few photos found a focal length 12 % too short; the map knows the camera."""
+    poses = walk(4)
+    new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, poses, camera_key=KEY)
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    wrong = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(790.0, 500.0, 400.0, 0.03))
+    bent = replace(new.model, cameras=(wrong,))
+    grown = grow_component(bent, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert grown.model.cameras[0] == CAMERA
+    assert centers_error(grown, new).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    "real",
+    [
+        Camera(model="RADIAL", width=1000, height=800, params=(906.0, 500.0, 400.0, 0.03, 0.03)),
+        Camera(
+            model="OPENCV",
+            width=1000,
+            height=800,
+            params=(906.0, 906.5, 504.0, 397.0, 0.03, 0.03, 3e-3, -3e-3),
+        ),
+    ],
+    ids=["radial", "opencv"],
+)
+def test_existing_points_tell_a_lens_better_than_the_map_that_lent_it(
+    area: IndexedArea, real: Camera, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The map's lens is 0.7 % off and lacks what the photos show; every later photo would repeat it."""
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.15
+    )
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    assert {p.camera for p in found.values()} == {CAMERA}
+    lent = replace(new.model, cameras=(CAMERA,))
+    with caplog.at_level(logging.INFO, logger="ingest.growth.own_lenses"):
+        grown = grow_component(lent, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert "times the penalty over SIMPLE_RADIAL" in caplog.text
+    (camera,) = grown.model.cameras
+    assert camera.model == real.model
+    assert camera.focal_px == pytest.approx(real.focal_px, rel=1e-3)
+    assert camera.params[2:4] == pytest.approx(real.params[2:4], abs=1.0)
+    assert centers_error(grown, new).max() < 0.05
+
+
+@pytest.mark.parametrize("asked", [10.0, 75.0])
+def test_a_decentred_lens_needs_less_where_the_focal_length_stays(
+    area: IndexedArea, asked: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The map's lens is right but for its decentring: a small gain, and nothing that lifts cameras."""
+    real = Camera(
+        model="OPENCV", width=1000, height=800, params=(900.0, 900.0, 501.6, 398.8, 0.01, 0.0, 1e-3, -1e-3)
+    )
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.2
+    )
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    lent = replace(new.model, cameras=(CAMERA,))
+    options = GrowOptions(own_lens=OwnLensOptions(same_focal_evidence=asked))
+    with caplog.at_level(logging.INFO, logger="ingest.growth.own_lenses"):
+        grown = grow_component(lent, new.photos, new.features_of, found, [area], identity(), options)
+    assert isinstance(grown, GrownMap), grown
+    assert "gains" in caplog.text
+    (camera,) = grown.model.cameras
+    assert camera.model == ("OPENCV" if asked == 10.0 else "SIMPLE_RADIAL")
+
+
+@pytest.mark.parametrize("asked", [10.0, 75.0])
+def test_a_focal_length_needs_more(area: IndexedArea, asked: float) -> None:
+    """A gain that the bent rim of a map gives, too, does not move the focal length by half a percent."""
+    real = Camera(model="RADIAL", width=1000, height=800, params=(904.5, 500.0, 400.0, 0.01, 0.01))
+    new = take_photos(
+        np.random.default_rng(9), POINTS, DESCRIPTORS, walk(4), camera_key=KEY, camera=real, noise_px=0.3
+    )
+    found, _ = localise_photos(new.photos, range(4), new.features_of, [area])
+    lent = replace(new.model, cameras=(CAMERA,))
+    options = GrowOptions(own_lens=OwnLensOptions(evidence=asked))
+    grown = grow_component(lent, new.photos, new.features_of, found, [area], identity(), options)
+    assert isinstance(grown, GrownMap), grown
+    (camera,) = grown.model.cameras
+    assert camera.model == ("RADIAL" if asked == 10.0 else "SIMPLE_RADIAL")
+
+
+def test_lone_photos_of_one_camera_have_one_lens(new: NewPhotos, area: IndexedArea) -> None:
+    """One of them came with a focal length a quarter too long and stands as much farther away."""
+    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    long = CAMERA.with_focal(1.25 * CAMERA.focal_px)
+    pose = found[1].cam_from_local
+    back = pose.center + 0.25 * (pose.center - np.median(found[1].points, axis=0))
+    off = replace(found[1], camera=long, cam_from_local=moved(pose, back - pose.center))
+    given = {**found, 1: off}
+    options = LocaliseEachOptions()
+    one = with_shared_lenses(given, dict.fromkeys(range(3), "unnamed"), options)
+    assert {p.camera for p in one.values()} == {CAMERA}
+    assert np.linalg.norm(one[1].cam_from_local.center - new.poses[1].center) < 0.1
+    assert one[0] is found[0]
+    apart = with_shared_lenses(given, {0: "a", 1: "b", 2: "a"}, options)
+    assert apart[1] is off
