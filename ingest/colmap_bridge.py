@@ -192,12 +192,15 @@ def _write_photo(database: Any, image_id: int, photo: SfmPhoto) -> None:
 
 def run_incremental(
     database: Path, images: Path, output: Path, settings: Mapping[str, Any], on_image: Callable[[], None]
-) -> None:
+) -> frozenset[int]:
     """COLMAP's incremental mapping; models land in numbered folders of `output`.
 
     Args:
         settings: of pycolmap.IncrementalPipelineOptions, nested by dots ("mapper.filter_max_reproj_error").
         on_image: called after each registered photo.
+
+    Returns:
+        Rows of the photos that are registered in models of at least the settings' size.
     """
     options = pycolmap.IncrementalPipelineOptions()
     for name, value in settings.items():
@@ -207,9 +210,11 @@ def run_incremental(
             target = getattr(target, parent)
         setattr(target, last, value)
     with quiet():
-        pycolmap.incremental_mapping(
+        models = pycolmap.incremental_mapping(
             str(database), str(images), str(output), options, next_image_callback=on_image
         )
+    large = [m.reg_image_ids() for m in models.values() if m.num_reg_images() >= options.min_model_size]
+    return frozenset(image_id - 1 for ids in large for image_id in ids)
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 """Stage: structure from motion of matched photos; each connected component becomes a model."""
 
 import hashlib
+import logging
+import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -14,7 +16,10 @@ from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap_bridge import Model, SfmPhoto, run_incremental, write_database
 from ingest.extract import read_keypoints
 from ingest.matching import read_two_view
+from ingest.view_graph_focals import calibrate_focals, start_from
 from ingest.workspace import atomic_folder
+
+logger = logging.getLogger(__name__)
 
 PriorUse = Literal["none", "bundle"]
 
@@ -31,6 +36,8 @@ class SfmOptions:
         min_model_photos: smaller models are dropped; three photos are the least that a placement by
             positions needs.
         min_inliers: verified matches of a pair that mapping may use.
+        focal_from_view_graph: where photos stay outside, start once more with focal lengths from the pairs
+            for cameras that do not tell theirs, and keep what registers more.
         filter_max_error_px: observations with a larger reprojection error are dropped, at
             `error_reference_side_px`, growing with the image.
         error_reference_side_px: keypoints are located on images of about this size.
@@ -43,6 +50,7 @@ class SfmOptions:
     camera_model: str = "SIMPLE_RADIAL"
     position_priors: PriorUse = "none"
     refine_focal: bool = True
+    focal_from_view_graph: bool = True
     min_model_photos: int = 3
     min_inliers: int = 20
     filter_max_error_px: float = 4.0
@@ -141,10 +149,36 @@ def reconstruct(task: SfmTask, folder: Path) -> None:
         options = task.options
         database = Path(scratch) / "colmap.db"
         photos = task.write_database(database)
-        run_incremental(
-            database, Path(scratch), output, mapping_settings(options, task.side_px), lambda: None
-        )
+        _map(task, database, Path(scratch), output)
         adjust_models(output, database, task.known(photos), loss_scale_px(task), adjust_options(options))
+
+
+def _map(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:
+    """Incremental mapping; once more with other focal lengths where these may be why photos stay outside."""
+    options = task.options
+    settings = mapping_settings(options, task.side_px)
+    registered = len(run_incremental(database, scratch, output, settings, lambda: None))
+    if not options.focal_from_view_graph or registered == len(task.views):
+        return
+    focals = calibrate_focals(database, scratch, seed=options.seed)
+    if not focals:
+        return
+    start_from(database, focals)
+    again = scratch / "again"
+    again.mkdir()
+    more = len(run_incremental(database, scratch, again, settings, lambda: None))
+    logger.info(
+        "%s: %d registered, %d with focal lengths from the pairs of %d cameras",
+        task,
+        registered,
+        more,
+        len(focals),
+    )
+    if more > registered:
+        for folder in output.iterdir():
+            shutil.rmtree(folder)
+        for folder in again.iterdir():
+            shutil.move(folder, output)
 
 
 def loss_scale_px(task: SfmTask) -> float:

@@ -9,7 +9,8 @@
    localised by the maps that exist, reconstructed among themselves, placed and refined by growth. What
    cannot be placed waits, is tried with the next portion, and once more at the end.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
-   metre is a hundredth of the extent of the camera centres (diagonal of their box).
+   metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
+   which is in metres, is left out.
 
 Prints one line a photo with -v, and one line a set. Exit code 0 if all photos of the reference are
 registered and the median difference is at most 0.3 m, else 1. Grown maps are committed as active here: who
@@ -35,8 +36,10 @@ from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.extract import PhotoFeatures, load_features
 from ingest.fingerprint import digest
-from ingest.growth.grow_photos import Grown, grow_photos
+from ingest.growth.grow_photos import Grown, GrowPhotosOptions, grow_photos
+from ingest.growth.grown_map import GrowOptions
 from ingest.growth.localised import localise_photos
+from ingest.growth.settle import SettleOptions
 from ingest.growth.values import GrownMap
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
@@ -52,6 +55,7 @@ _LIMIT_M = 0.3
 _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
+_WITHOUT_BUDGET = GrowPhotosOptions(grow=GrowOptions(settle=SettleOptions(max_photo_bound_m=np.inf)))
 
 
 @dataclass(slots=True, kw_only=True)
@@ -62,6 +66,7 @@ class State:
         photos: all of the set. waiting: rows that are in no map yet.
         centers: of registered photos in the first map's frame, metres, by name.
         frame: of the first map.
+        growing: without a drift budget where the first map's metre is made up.
     """
 
     photos: list[Photo]
@@ -72,6 +77,7 @@ class State:
     waiting: list[int] = field(default_factory=list)
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
+    growing: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
 
     def features_of(self, row: int) -> PhotoFeatures:
         """Features of a photo, from the cache of the ingest."""
@@ -138,6 +144,8 @@ def _first_map(state: State, what: str) -> None:
             break
         first = component.feature_map or _made_up(state, component)
         if first is not None:
+            if component.feature_map is None:
+                state.growing = _WITHOUT_BUDGET
             _commit(state, first)
             print(f"  {what}: first map of {len(first.images)} photos, placed by {first.placement.method}")
             return
@@ -190,7 +198,16 @@ def _grow(state: State) -> Grown:
     if localised:
         known = [r for r, photo in enumerate(state.photos) if photo.name in state.centers]
     witnesses, _ = localise_photos(state.photos, known, state.features_of, areas)
-    return grow_photos(models, state.photos, state.features_of, localised, areas, _identity, known=witnesses)
+    return grow_photos(
+        models,
+        state.photos,
+        state.features_of,
+        localised,
+        areas,
+        _identity,
+        options=state.growing,
+        known=witnesses,
+    )
 
 
 def _commit(state: State, feature_map: FeatureMap) -> None:

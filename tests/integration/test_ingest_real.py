@@ -7,8 +7,12 @@ import pytest
 
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
+from ingest.executor import InProcessExecutor
 from ingest.pipeline import IngestOptions, ingest_photos
-from ingest.scan import ScanOptions
+from ingest.reconstruction import MapMakingOptions, reconstruct_photos
+from ingest.scan import ScanOptions, require_usable, scan_folder
+from ingest.sfm import SfmOptions
+from ingest.workspace import Workspace
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
@@ -41,3 +45,19 @@ def test_brighton_without_four_photos(shared_data: Path, tmp_path: Path) -> None
     again = ingest_photos(database, folder, options)
     assert [m.status for m in again.maps] == ["already_there"]
     assert [s.reused == s.total for s in again.stages if s.total] == [True] * 4
+
+
+def test_strangers_photos_without_exif(shared_data: Path, tmp_path: Path) -> None:
+    """Seven of ten photos, half of them by long lenses: the usual focal length makes no reconstruction."""
+    folder = shared_data / "sacre_coeur" / "mapping"
+    if not folder.is_dir():
+        pytest.skip(f"not there: {folder}")
+    photos = list(require_usable(scan_folder(folder, ScanOptions()), folder, least=2))[:7]
+    found = []
+    for again in (False, True):
+        options = MapMakingOptions(sfm=SfmOptions(focal_from_view_graph=again))
+        workspace = Workspace(root=tmp_path, job_id=str(again))
+        done = reconstruct_photos(photos, workspace, options, InProcessExecutor())
+        found.append(max((len(model.rows) for model in done.reconstruction.models()), default=0))
+    assert found[0] < 3
+    assert found[1] >= 5
