@@ -26,6 +26,7 @@ from ingest.growth.grown_map import grow_component
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.localised import LocaliseEachOptions, localise_photos
 from ingest.growth.map_graph import growth_of, placed_maps
+from ingest.growth.not_found import NotFound, NotFoundRows
 from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
 from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
 from ingest.growth.submodel import keep_photos
@@ -111,8 +112,7 @@ class _Run:
     replacements: list[Replacement] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
-    lost: set[int] = field(default_factory=set)  # not localised in the last round
-    fresh: set[str] = field(default_factory=set)  # promoted in the last round
+    lost: NotFoundRows
     rounds: int = 0
 
 
@@ -137,13 +137,12 @@ def grow(
     """
     options = (options or GrowthOptions()).with_budget()
     started, clock = datetime.now(UTC), time.perf_counter()
-    run, localiser = _Run(), None
+    run, localiser = _Run(lost=NotFoundRows(new.photos, new.features_of, work, options.localise)), None
     for _ in range(options.max_rounds):
         run.rounds += 1
         replaced = replace_descendants(database, work, options.replacing, budget_m=options.drift_budget_m)
         if replaced is not None:
             run.replacements.append(replaced)
-            run.lost.clear()  # moved maps may hold what they did not
         localiser = Localiser.open(database, previous=localiser)
         localised = _round(database, new, localiser, run, options)
         if not _promote(database, new, localiser, localised, run, options, work):
@@ -167,12 +166,8 @@ def _round(
 ) -> dict[int, LocalisedPhoto]:
     """Localise what is not in a map yet, place reconstructions and lone photos, commit what passes."""
     open_rows = [row for row in range(len(new.photos)) if row not in run.map_of]
-    worth = _worth_localising(new, open_rows, localiser, run, options)
-    localised, reasons = localise_photos(
-        new.photos, worth, new.features_of, localiser.areas, options.localise
-    )
-    run.lost = {row for row in open_rows if row not in localised}
-    run.why.update({row: _split(reason) for row, reason in reasons.items()})
+    localised = _localise(database, new, open_rows, localiser, run, options)
+    run.why.update({row: _split(run.lost.known[row].reason) for row in open_rows if row not in localised})
     run.refused.clear()
     for model in new.models():
         part = keep_photos(model, [int(r) for r in model.rows if int(r) not in run.map_of])
@@ -191,17 +186,38 @@ def _round(
     return localised
 
 
-def _worth_localising(
-    new: GrowthPhotos, rows: Sequence[int], localiser: Localiser, run: _Run, options: GrowthOptions
-) -> list[int]:
-    """All rows at first; later those that were found before, or are found in what was promoted since."""
+def _localise(
+    database: Database,
+    new: GrowthPhotos,
+    rows: Sequence[int],
+    localiser: Localiser,
+    run: _Run,
+    options: GrowthOptions,
+) -> dict[int, LocalisedPhoto]:
+    """What the active maps show; photos that they did not show before are looked for in new maps only."""
     served = {m.map_id for indexed in localiser.areas for m in indexed.area.maps}
-    fresh = tuple(sorted(served & run.fresh))
-    if not run.lost or not fresh:
-        return list(rows)
-    asked = [row for row in rows if row in run.lost]
-    seen, _ = localise_photos(new.photos, asked, new.features_of, localiser.areas_of(fresh), options.localise)
-    return [row for row in rows if row not in run.lost or row in seen]
+    write_ids = {m.write_id: m.map_id for m in database.snapshot().maps() if m.map_id in served}
+    worth: list[int] = []
+    again: dict[frozenset[str], list[int]] = {}
+    for row in rows:
+        before = run.lost.known.get(row)
+        if before is None or not before.maps <= write_ids.keys():
+            worth.append(row)
+        else:
+            again.setdefault(frozenset(write_ids.keys() - before.maps), []).append(row)
+    for fresh, asked in again.items():
+        if fresh:
+            areas = localiser.areas_of(tuple(sorted(write_ids[w] for w in fresh)))
+            seen, _ = localise_photos(new.photos, asked, new.features_of, areas, options.localise)
+            worth.extend(seen)
+    localised, reasons = localise_photos(
+        new.photos, sorted(worth), new.features_of, localiser.areas, options.localise
+    )
+    for row in rows:
+        if row not in localised:
+            reason = reasons.get(row) or run.lost.known[row].reason
+            run.lost.note(row, NotFound(maps=frozenset(write_ids), reason=reason))
+    return localised
 
 
 def _try_model(
@@ -301,8 +317,7 @@ def _promote(
                 reason=outcome.reason,
                 gates={**entry.gates, **{g.name: g.as_json() for g in outcome.gates}},
             )
-    run.fresh = {outcome.map_id for outcome in outcomes if outcome.promoted}
-    return bool(run.fresh)
+    return any(outcome.promoted for outcome in outcomes)
 
 
 def _note_refusal(refused: Refused, new: GrowthPhotos, run: _Run) -> None:

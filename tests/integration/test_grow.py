@@ -5,26 +5,43 @@ import shutil
 import threading
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import ingest.growing as growing_module
+import ingest.growth.localised as localised_module
 from featuredb.cli.main import main
 from featuredb.errors import StoreError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.features.features import Features
 from featuredb.store import Database
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import contribute, list_candidates
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.confirmation import ConfirmationOptions
 from ingest.growth.growth_report import GrowthReport
+from ingest.photo import Photo
+from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 from reloc.result import LocaliseRequest
 from tests.support.hill_photos import CAMERA, FRAME
-from tests.support.hill_walk import NOW, WEST_M, Shot, anchored_database, error_m, give, growing, step_of
+from tests.support.hill_walk import (
+    NOW,
+    WEST_M,
+    Shot,
+    add_survey,
+    anchored_database,
+    error_m,
+    give,
+    growing,
+    step_of,
+    survey,
+)
 
 _EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
+_AWAY_M = WEST_M + 90.0  # and there nothing of it
 
 
 @pytest.fixture(scope="module")
@@ -206,6 +223,37 @@ def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(
     later = grow_candidates(database, growing(give_up_days=30), now=NOW + timedelta(days=31))
     assert {p.reason_code for p in later.photos} == {"GAVE_UP"}
     assert "waiting" not in _states(database).values()
+
+
+def test_a_photo_is_not_looked_for_twice_in_the_same_maps(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looked: list[tuple[str, int]] = []
+    honest = localised_module.localise_photo
+
+    def counted(photo: Photo, row: int, features: Features, areas: list[IndexedArea], *rest: Any) -> Any:
+        looked.append((Path(photo.name).stem, sum(len(a.area.maps) for a in areas)))
+        return honest(photo, row, features, areas, *rest)
+
+    monkeypatch.setattr(localised_module, "localise_photo", counted)
+    away = step_of(_AWAY_M, owners=("anna",), each=1)[0]
+    noise = np.random.default_rng(3).integers(0, 255, (480, 640), dtype=np.uint8)
+    nowhere = Shot(data=_jpeg(noise), cam_from_local=away.cam_from_local, owner="eve")
+    ids = give(database, [away, nowhere])
+    first = grow_candidates(database, growing())
+    assert sorted(looked) == sorted((i, 1) for i in ids)
+    looked.clear()
+    again = grow_candidates(database, growing())
+    assert looked == []
+    assert [(p.name, p.reason_code, p.reason) for p in again.photos] == [
+        (p.name, p.reason_code, p.reason) for p in first.photos
+    ]
+    # A new map: both are looked for in it alone; what is found there, in all maps.
+    survey(tmp_path / "away", _AWAY_M, 1)
+    add_survey(database, tmp_path / "away")
+    later = grow_candidates(database, growing())
+    assert sorted(looked) == sorted([(ids[0], 1), (ids[1], 1), (ids[0], 2)])
+    assert {p.name: p.reason_code for p in later.photos}[ids[0]] == "ALONE"
 
 
 def _jpeg(picture: np.ndarray) -> bytes:
