@@ -18,7 +18,7 @@ import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_angle
+from featuredb.geometry.rotation import rotation_angle, so3_log
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.album_files import TABLE_FILES, AlbumFact, read_facts
 from featuredb.simworld.truth import Truth, read_truth
@@ -71,7 +71,7 @@ class Registered:
     Attributes:
         fact: what it is. map_id, status, generation: of its map.
         offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
-        angle_deg: between the orientations.
+        angle_deg: between the orientations. turn_rad: (3,) the rotation between them, about east, north, up.
         drift_m: 95 % bound that its map claims against its anchors; None for anchors.
         bound_m: 95 % bound that its map claims on Earth, the anchors' own uncertainty included.
     """
@@ -84,6 +84,7 @@ class Registered:
     angle_deg: float
     drift_m: float | None
     bound_m: float
+    turn_rad: FloatArray | None = None
 
     @property
     def error_m(self) -> float:
@@ -202,22 +203,24 @@ def _candidate_names(folder: Path) -> dict[str, str]:
     }
 
 
-def registered(database: Database, album: Album) -> list[Registered]:
+def registered(database: Database, album: Album, version: int | None = None) -> list[Registered]:
     """All photos of the album in living maps, anchors included, with their errors."""
     found: list[Registered] = []
-    for summary in database.snapshot().maps():
-        feature_map = _load(database, summary.map_id)
+    snapshot = database.snapshot(version)
+    for summary in snapshot.maps():
+        feature_map = snapshot.load_map(summary.map_id)
         here = album.truth.frame.enu_from(feature_map.frame)
         bound_m = drift_m(feature_map.placement.covariance, places_of(feature_map))
         for image in feature_map.images:
             fact = _fact_of(album, feature_map, image.name)
             true = album.truth.images.get(fact.name)
-            offset, angle = None, float("nan")
+            offset, angle, turn = None, float("nan"), None
             if true is not None:
                 center = here.act(image.cam_from_local.center[None])[0]
                 offset = center - true.cam_from_local.center
                 turned = image.cam_from_local.rotation @ here.rotation.T
                 angle = float(np.degrees(rotation_angle(turned @ true.cam_from_local.rotation.T)))
+                turn = so3_log(turned.T @ true.cam_from_local.rotation)
             found.append(
                 Registered(
                     fact=fact,
@@ -228,13 +231,10 @@ def registered(database: Database, album: Album) -> list[Registered]:
                     angle_deg=angle,
                     drift_m=summary.drift_m,
                     bound_m=bound_m,
+                    turn_rad=turn,
                 )
             )
     return found
-
-
-def _load(database: Database, map_id: str) -> FeatureMap:
-    return database.snapshot().load_map(map_id)
 
 
 def _fact_of(album: Album, feature_map: FeatureMap, name: str) -> AlbumFact:

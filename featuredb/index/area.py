@@ -76,14 +76,18 @@ class Area:
         return np.flatnonzero(seen).astype(np.int32)
 
     def camera_for_key(self, camera_key: str) -> Camera | None:
-        """Intrinsics of a map camera with this EXIF key; of the one that took most images if several."""
-        found: list[tuple[int, Camera]] = []
+        """Intrinsics that the maps have for this EXIF key; of the one that took most images if several.
+
+        Maps lend each other lenses, so that images of all of them count. A model of more parameters comes
+        first: it was only taken where the images asked for it.
+        """
+        taken: Counter[Camera] = Counter()
         for feature_map in self.maps:
-            taken = Counter(image.camera_id for image in feature_map.images)
+            images = Counter(image.camera_id for image in feature_map.images)
             for c, key in enumerate(feature_map.camera_keys[: len(feature_map.cameras)]):
                 if key and key == camera_key:
-                    found.append((taken[c], feature_map.cameras[c]))
-        return max(found, key=lambda item: item[0])[1] if found else None
+                    taken[feature_map.cameras[c]] += images[c]
+        return max(taken, key=lambda camera: (len(camera.params), taken[camera]), default=None)
 
 
 def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> Area:

@@ -57,6 +57,8 @@ def with_drift(
     )
     covariance = feature_map.placement.covariance
     relative = np.asarray(growth["covariance_relative"], dtype=np.float64).reshape(7, 7)
+    shared = np.reshape(growth.get("shared_turn") or np.zeros(21), (7, 3))
+    edges = [replace(edge, shared=shared) for edge in edges]
     solution = solve_with_new(maps, feature_map.map_id, edges, feature_map.frame)
     if solution.reason is None and feature_map.map_id in solution.covariance:
         covariance = solution.covariance[feature_map.map_id]

@@ -66,14 +66,19 @@ class PhotoSpread:
         turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
             may be turned: the mean rotation of the photo and those that share most points with it. What comes
             next is tied to such a piece. NaN as before.
+        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring, which other maps have as well.
     """
 
     poses: FloatArray
     turns: FloatArray
+    lens_turns: FloatArray
 
     def of(self, rows: Sequence[int]) -> "PhotoSpread":
         """Of some of the photos."""
-        return PhotoSpread(poses=self.poses[list(rows)], turns=self.turns[list(rows)])
+        chosen = list(rows)
+        return PhotoSpread(
+            poses=self.poses[chosen], turns=self.turns[chosen], lens_turns=self.lens_turns[chosen]
+        )
 
 
 def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
@@ -92,8 +97,28 @@ def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread
     for turn in spread.turns[seen]:
         values, vectors = np.linalg.eigh(turn - covariance[1:4, 1:4] - more)
         more += (vectors * np.maximum(values, 0.0)) @ vectors.T
-    about = np.vstack([np.zeros((1, 3)), np.eye(3), skew(model.centers()[seen].mean(axis=0))])
+    about = _about(model.centers()[seen].mean(axis=0))
     return np.asarray(about @ more @ about.T)
+
+
+def shared_turn(model: Model, spread: PhotoSpread) -> FloatArray:
+    """(7, 3) by what a model's end turns, about each local axis, for one sigma of its lenses; zeros for none.
+
+    Columns of a similarity's left perturbation, about the photos' middle. Maps share lenses, so that they
+    turn to the same side, map by map: along a chain such turns add up, where independent ones would not.
+    """
+    seen = np.isfinite(spread.lens_turns[:, 0, 0])
+    if not seen.any():
+        return np.zeros((7, 3))
+    turns = spread.lens_turns[seen]
+    values, vectors = np.linalg.eigh(turns[np.argmax(np.trace(turns, axis1=1, axis2=2))])
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.asarray(_about(model.centers()[seen].mean(axis=0)) @ root)
+
+
+def _about(middle: FloatArray) -> FloatArray:
+    """(7, 3) left perturbations of rotations about a place."""
+    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
 
 
 def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
@@ -138,8 +163,11 @@ def photo_covariances(
         fixed: existing points, those observations of `kept` (m,).
         lenses: what is known of the model's cameras without the photos.
     """
+    count = len(model.rows)
     spread = PhotoSpread(
-        poses=np.full((len(model.rows), 6, 6), np.nan), turns=np.full((len(model.rows), 3, 3), np.nan)
+        poses=np.full((count, 6, 6), np.nan),
+        turns=np.full((count, 3, 3), np.nan),
+        lens_turns=np.full((count, 3, 3), np.nan),
     )
     if len(model.rows) > options.max_photos or not kept.any():
         return spread
@@ -167,18 +195,22 @@ def photo_covariances(
     normal -= _eliminated(poses_free, by_point, free, sigma)
     normal[size:, size:] += np.diag(_lens_information(model, lenses, options))
     # Photos without observations leave their rows empty; the damping is far below what any photo knows.
-    covariance = np.linalg.inv(normal + 1e-9 * np.diag(np.diag(normal)) + 1e-9 * np.eye(columns))
+    normal += 1e-9 * np.diag(np.diag(normal)) + 1e-9 * np.eye(columns)
+    covariance = np.linalg.inv(normal)
     covariance = (covariance[:size, :size] + covariance[:size, :size].T) / 2
+    by_lenses = covariance - np.linalg.inv(normal[:size, :size])  # gone if lenses are true
     for c in sorted(set(range(len(model.cameras))) - {*lenses.constant, *lenses.focal_px}):
         parts = [(linear, lens[c]) for linear, lens in ((free, free_lens), (held, held_lens))]
         together = np.zeros(size)
         for k, moves in _by_unknown_focal(model, c, parts, options).items():
             together[6 * k : 6 * k + 6] = moves
         covariance += np.outer(together, together)
+        by_lenses += np.outer(together, together)
     for k in seen.tolist():
         spread.poses[k] = covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
     for k, piece in _pieces(model, fixed, kept, seen).items():
         spread.turns[k] = _turn(model, covariance, piece)
+        spread.lens_turns[k] = _turn(model, by_lenses, piece)
     return spread
 
 

@@ -107,7 +107,7 @@ def _grown(
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, mine, photos, keypoints, options.settle.refine)
+    model, lenses = adopt_lenses(model, mine, photos, near, keypoints, options.settle.refine)
     mine, anchors, held = _placed(model, mine, keypoints, photos, near, frame, options)
     better = _better_lenses(model, anchors, held, keypoints, lenses, options)
     if better:

@@ -9,7 +9,7 @@ other is placed anew the digest differs, and the edge has to be measured again.
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -41,6 +41,7 @@ class StoredEdge:
         other_from_map: carries what this map says to where the other says it; this map's local frame.
         covariance: (7, 7) of its left perturbation.
         shared_points, photos: that it rests on.
+        shared: (7, 3) the part of the covariance that overlaps have in common (`drift.shared_turn`).
     """
 
     map_id: str
@@ -49,6 +50,7 @@ class StoredEdge:
     covariance: FloatArray
     shared_points: int
     photos: int
+    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -58,6 +60,7 @@ class StoredEdge:
             "covariance": [float(v) for v in self.covariance.ravel()],
             "shared_points": self.shared_points,
             "photos": self.photos,
+            "shared": [float(v) for v in self.shared.ravel()],
         }
 
     @classmethod
@@ -69,6 +72,7 @@ class StoredEdge:
             covariance=np.asarray(value["covariance"], dtype=np.float64).reshape(7, 7),
             shared_points=int(value.get("shared_points", 0)),
             photos=int(value.get("photos", 0)),
+            shared=np.reshape(np.asarray(value.get("shared") or np.zeros(21), dtype=np.float64), (7, 3)),
         )
 
 
@@ -205,6 +209,7 @@ def in_graph(map_id: str, edge: StoredEdge, own: LocalFrame, frame: LocalFrame) 
         b=edge.map_id,
         b_from_a=in_frame(edge.other_from_map, own, frame),
         covariance=covariance_in_frame(edge.covariance, own, frame),
+        shared=Sim3.from_rigid3(frame.enu_from(own)).adjoint() @ edge.shared,
     )
 
 

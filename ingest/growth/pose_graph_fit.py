@@ -1,6 +1,6 @@
 """The least squares behind a pose graph over maps: solution, marginal covariances, tests of measurements."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -42,14 +42,18 @@ class GraphEdge:
         a, b: map ids.
         b_from_a: carries what map a says to where map b says it; graph's frame.
         covariance: (7, 7) of its left perturbation.
+        shared: (7, 3) the part of it that all edges have in common: what they are off for one sigma of three
+            errors that no edge has alone.
     """
 
     a: str
     b: str
     b_from_a: Sim3
     covariance: FloatArray
+    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "shared", frozen_array("GraphEdge.shared", self.shared, (7, 3)))
         object.__setattr__(self, "covariance", frozen_array("GraphEdge.covariance", self.covariance, (7, 7)))
 
     def __str__(self) -> str:
@@ -103,8 +107,9 @@ class Fit:
         return [self._test(first + k, (i,)) for k, i in enumerate(anchors)]
 
     def marginals(self) -> dict[str, FloatArray]:
-        """Covariance (7, 7) of each map's correction."""
-        return {node.map_id: self._blocks[i, i] for i, node in enumerate(self._nodes)}
+        """Covariance (7, 7) of each map's correction, with what edges have in common."""
+        common = self._in_common(self._jacobian)
+        return {node.map_id: self._blocks[i, i] + common[i] for i, node in enumerate(self._nodes)}
 
     def relative_marginals(self) -> dict[str, FloatArray]:
         """The same if the anchors were where they are without error; zero for themselves."""
@@ -113,10 +118,32 @@ class Fit:
         if not free:
             return found
         columns = (7 * np.array(free)[:, None] + np.arange(7)).ravel()
-        blocks = _inverse_blocks(self._jacobian[:, columns], [(k, k) for k in range(len(free))])
+        jacobian = self._jacobian[:, columns]
+        blocks = _inverse_blocks(jacobian, [(k, k) for k in range(len(free))])
+        common = self._in_common(jacobian)
         for k, i in enumerate(free):
-            found[self._nodes[i].map_id] = blocks[k, k]
+            found[self._nodes[i].map_id] = blocks[k, k] + common[k]
         return found
+
+    def _in_common(self, jacobian: csr_array) -> FloatArray:
+        """(n, 7, 7) what comes on top where edges err together: along a chain their errors add up.
+
+        The independent sum holds the same errors once each; what that has beyond is not taken away.
+        """
+        count = jacobian.shape[1] // 7
+        together, apart = np.zeros((count, 7, 3)), np.zeros((count, 7, 7))
+        errors_of = {k: _whitening(e.covariance) @ e.shared for k, e in enumerate(self.edges)}
+        shared = {k: errors for k, errors in errors_of.items() if errors.any()}
+        if not shared:
+            return apart
+        solve = _solver(jacobian)
+        by_row = csc_array(jacobian.T)
+        for k, errors in shared.items():
+            moved = solve(by_row[:, 7 * k : 7 * k + 7] @ errors).reshape(count, 7, 3)
+            together += moved
+            apart += moved @ np.swapaxes(moved, 1, 2)
+        values, vectors = np.linalg.eigh(together @ np.swapaxes(together, 1, 2) - apart)
+        return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
 
     def _test(self, k: int, nodes: tuple[int, ...]) -> tuple[float, int]:
         """The fall of chi-square without the k-th measurement of these nodes, and its redundancy."""
@@ -139,23 +166,29 @@ def _inverse_blocks(
     jacobian: csr_array, wanted: Sequence[tuple[int, int]]
 ) -> dict[tuple[int, int], FloatArray]:
     """Blocks (7, 7) of the inverse normal matrix."""
-    normal = csc_array(jacobian.T @ jacobian)
-    scale = 1.0 / np.sqrt(normal.diagonal())
-    turned = coo_array(normal)
-    turned.data = turned.data * scale[turned.row] * scale[turned.col]
-    solver = splu(csc_array(turned))
+    solve, size = _solver(jacobian), jacobian.shape[1]
     columns: dict[int, FloatArray] = {}
     blocks: dict[tuple[int, int], FloatArray] = {}
     for i, j in sorted(set(wanted), key=lambda pair: pair[1]):
         if j not in columns:
             columns.clear()
-            unit = np.zeros((len(scale), 7))
+            unit = np.zeros((size, 7))
             unit[7 * j : 7 * j + 7] = np.eye(7)
-            columns[j] = scale[:, None] * solver.solve(unit) * scale[7 * j : 7 * j + 7]
+            columns[j] = solve(unit)
         blocks[i, j] = columns[j][7 * i : 7 * i + 7]
         if i == j:
             blocks[i, j] = 0.5 * (blocks[i, j] + blocks[i, j].T)
     return blocks
+
+
+def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:
+    """What solves the normal equations for columns of right-hand sides."""
+    normal = csc_array(jacobian.T @ jacobian)
+    scale = 1.0 / np.sqrt(normal.diagonal())
+    turned = coo_array(normal)
+    turned.data = turned.data * scale[turned.row] * scale[turned.col]
+    solver = splu(csc_array(turned))
+    return lambda right: np.asarray(scale[:, None] * solver.solve(scale[:, None] * right))
 
 
 class _Problem:

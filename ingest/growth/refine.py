@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
+from featuredb.index.area import Area
 from ingest.colmap_anchored import (
     Anchored,
     AnchoredOptions,
@@ -58,6 +59,7 @@ def adopt_lenses(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     photos: Sequence[Photo],
+    areas: Sequence[Area],
     keypoints: Sequence[FloatArray],
     options: RefineOptions,
 ) -> tuple[Model, Lenses]:
@@ -65,6 +67,7 @@ def adopt_lenses(
 
     Args:
         photos: all, rows as in the model.
+        areas: where it may lie; they lend lenses to cameras none of whose photos is localised, too.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
     """
     focal_px = exif_focals(model, photos)
@@ -72,7 +75,9 @@ def adopt_lenses(
     adopted: list[int] = []
     for c in range(len(cameras)):
         mine = np.flatnonzero(model.camera_of == c)
-        lens = _lens_of_maps([localised[r] for r in model.rows[mine].tolist() if r in localised])
+        rows = model.rows[mine].tolist()
+        lens = _lens_of_maps([localised[r] for r in rows if r in localised])
+        lens = lens or _lens_for_key({photos[r].camera_key for r in rows}, areas)
         if lens is None or len(mine) >= options.own_lens_photos:
             continue
         if (lens.width, lens.height) == (cameras[c].width, cameras[c].height):
@@ -111,6 +116,15 @@ def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
         if photo.result.pose is not None and photo.result.pose.camera_source == "map":
             lent[photo.camera] = lent.get(photo.camera, 0) + 1
     return max(lent, key=lambda camera: lent[camera]) if lent else None
+
+
+def _lens_for_key(keys: set[str], areas: Sequence[Area]) -> Camera | None:
+    """The lens that the areas have for a camera's EXIF key, the first area's first."""
+    if len(keys) != 1:
+        return None
+    key = keys.pop()
+    found = (area.camera_for_key(key) for area in areas) if key else iter(())
+    return next((camera for camera in found if camera is not None), None)
 
 
 def refine_with_maps(

@@ -275,6 +275,7 @@ def _carried(
         place=places[edge.map_id],
         other_from_map=other @ edge.other_from_map @ corrections[map_id].inverse(),
         covariance=_symmetric(adjoint @ edge.covariance @ adjoint.T),
+        shared=adjoint @ edge.shared,
     )
 
 

@@ -23,6 +23,7 @@ from ingest.growth.drift import (
     bending_variance_m2,
     center_covariances,
     photo_covariances,
+    shared_turn,
     turning_covariance,
 )
 from ingest.growth.links import firmness
@@ -79,6 +80,7 @@ class Settled:
         spread: of the photos that are kept.
         bending_m, turning_deg: what the photos' positions and the directions of its pieces lack beyond the
             similarity, one sigma along the worst axis.
+        shared_turn: (7, 3) of `drift.shared_turn`.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
@@ -87,11 +89,16 @@ class Settled:
     spread: PhotoSpread
     bending_m: float
     turning_deg: float
+    shared_turn: FloatArray
     left_out: Mapping[int, tuple[str, str]]
 
     def evidence(self) -> dict[str, Any]:
         """What a map's evidence of growth says of it."""
-        return {"bending_m": self.bending_m, "turning_deg": self.turning_deg}
+        return {
+            "bending_m": self.bending_m,
+            "turning_deg": self.turning_deg,
+            "shared_turn": self.shared_turn.ravel().tolist(),
+        }
 
 
 def settle(
@@ -180,6 +187,7 @@ def settle(
         spread=spread.of(kept),
         bending_m=float(np.sqrt(bending_m2)),
         turning_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(turning[1:4, 1:4])[-1]))),
+        shared_turn=shared_turn(adjusted.model, spread),
         left_out=left_out,
     )
 

@@ -41,6 +41,19 @@ def test_a_small_model_takes_the_maps_lens(area: IndexedArea) -> None:
     assert centers_error(grown, new).max() < 0.05
 
 
+def test_a_camera_none_of_whose_photos_is_localised_takes_the_maps_lens(area: IndexedArea) -> None:
+    """They hang on photos of another camera; the map knows theirs by its EXIF key all the same."""
+    new = take_photos(np.random.default_rng(9), POINTS, DESCRIPTORS, walk(6), camera_key=KEY)
+    found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
+    assert len(found) == 3
+    wrong = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(880.0, 500.0, 400.0, 0.02))
+    two = replace(new.model, cameras=(CAMERA, wrong), camera_of=np.array([0, 0, 0, 1, 1, 1]))
+    grown = grow_component(two, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert set(grown.model.cameras) == {CAMERA}
+    assert centers_error(grown, new).max() < 0.05
+
+
 @pytest.mark.parametrize(
     "real",
     [

@@ -142,6 +142,25 @@ def test_the_camera_of_a_key_comes_from_the_largest_map() -> None:
     assert build_area([a_map(0, camera_keys=("",))]).camera_for_key("") is None
 
 
+def test_images_of_all_maps_with_one_lens_count_together_and_fuller_models_come_first() -> None:
+    lenses = [
+        Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(900.0 + k, 500, 400, 0.0))
+        for k in range(2)
+    ]
+    maps = [
+        replace(
+            a_map(k, images=images, map_id=str(k), camera_keys=("DJI",)),
+            cameras=(lenses[lens],),
+        )
+        for k, (images, lens) in enumerate([(3, 0), (5, 1), (4, 0)])
+    ]
+    assert build_area(maps).camera_for_key("DJI") == lenses[0]
+    assert build_area(maps[:2]).camera_for_key("DJI") == lenses[1]
+    fuller = Camera(model="RADIAL", width=1000, height=800, params=(905.0, 500, 400, 0.01, 0.0))
+    maps.append(replace(a_map(3, images=2, map_id="3", camera_keys=("DJI",)), cameras=(fuller,)))
+    assert build_area(maps).camera_for_key("DJI") == fuller
+
+
 def test_the_digest_follows_the_content() -> None:
     feature_map = a_map()
     o = feature_map.observations

@@ -15,6 +15,7 @@ from ingest.growth.drift import (
     bending_variance_m2,
     center_covariances,
     photo_covariances,
+    shared_turn,
     turning_covariance,
 )
 from ingest.growth.refine import Lenses
@@ -143,6 +144,28 @@ def test_a_similaritys_covariance_turns_until_it_holds_every_piece() -> None:
     end = point_jacobian(new.model.centers()[-1])
     assert (end @ more @ end.T).trace() > 1e-6
     assert not turning_covariance(new.model, ample, spread).any()
+
+
+def test_what_lenses_turn_is_told_apart_from_what_pixels_do() -> None:
+    """Where lenses are true nothing is shared; where not, it is what they add to the pieces' directions."""
+    new, _, fixed = walk(2)
+    keypoints = list(new.keypoints().values())
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    sure = replace(DriftOptions(), adopted_focal_rel=1e-9, adopted_distortion=1e-9)
+    narrow = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, sure)
+    wide = photo_covariances(new.model, keypoints, fixed, kept, GIVEN, DriftOptions())
+    np.testing.assert_allclose(wide.lens_turns, wide.turns - narrow.turns, atol=1e-3 * wide.turns.max())
+    assert np.abs(shared_turn(new.model, narrow)).max() < 1e-3 * np.abs(shared_turn(new.model, wide)).max()
+    turn = shared_turn(new.model, wide)
+    most = np.trace(wide.lens_turns, axis1=1, axis2=2).max()
+    assert (turn @ turn.T)[1:4, 1:4].trace() == pytest.approx(most, rel=1e-6)
+    middle = point_jacobian(new.model.centers().mean(axis=0))
+    np.testing.assert_allclose(middle @ turn, 0.0, atol=1e-12)
+    # A lens that nobody knew turns more than one that is lent.
+    own = photo_covariances(new.model, keypoints, fixed, kept, FREE, DriftOptions())
+    assert np.trace(own.lens_turns, axis1=1, axis2=2).max() > most
+    none = photo_covariances(new.model, keypoints, fixed, np.zeros_like(kept), GIVEN, DriftOptions())
+    assert not shared_turn(new.model, none).any()
 
 
 def test_an_exif_focal_length_narrows_a_lens_of_its_own() -> None:
