@@ -9,7 +9,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from ingest.photo import Photo
 from ingest.photo_cameras import shared_key
-from ingest.reconstruction import Component, MapMakingOptions, Reconstructed, Stage
+from ingest.placed_models import Component
+from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
 from ingest.report import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
 
 

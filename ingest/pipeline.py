@@ -21,14 +21,8 @@ from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.photo import Photo
 from ingest.photo_table import is_table, read_table
-from ingest.reconstruction import (
-    Component,
-    MapMakingOptions,
-    Reconstructed,
-    Stage,
-    place_models,
-    reconstruct_photos,
-)
+from ingest.placed_models import Component, place_models
+from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, reconstruct_photos
 from ingest.register.control.model import Survey
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome
 from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder, scan_table

@@ -1,4 +1,4 @@
-"""From usable photos to placed feature maps: extract, pair, match, reconstruct, place, build.
+"""From usable photos to reconstructions: extract, pair, match, cluster, reconstruct.
 
 Each step leaves its result in the work folder, under a key of what it was made of; a step that finds
 its result there does nothing. What is in memory at a time does not grow with the photos but for tables of
@@ -7,9 +7,9 @@ a few hundred bytes each: features and models are read when they are needed.
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -18,22 +18,19 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
-from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
-from ingest.colmap_bridge import Model
 from ingest.duplicates import copies_of
 from ingest.executor import Executor, Lost, Progress, no_progress
-from ingest.extract import FeatureFiles, PhotoFeatures, extract_photos, features_key, read_keypoints
+from ingest.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.fingerprint import options_fingerprint
-from ingest.map_builder import MapIdentity, MapOptions, build_map
+from ingest.map_builder import MapOptions
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
 from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions, more_pairs
 from ingest.photo import Photo
 from ingest.photo_cameras import CameraSharing, photo_cameras
-from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
-from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.gps import GpsOptions
 from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm import SfmOptions, SfmView
 from ingest.stage_clock import StageClock
@@ -70,29 +67,6 @@ class MapMakingOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Component:
-    """One connected component of the photos and what became of it.
-
-    Attributes:
-        model: the reconstruction.
-        photos: its registered photos, in the order of model.rows.
-        with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
-        placement: accepted or refused with a reason.
-        feature_map: None where there is none, for `reason_code` and `reason`.
-        control: of the placement by control points, where there are some.
-    """
-
-    model: Model
-    photos: tuple[Photo, ...]
-    with_gps: tuple[int, ...]
-    placement: GpsPlacement
-    feature_map: FeatureMap | None
-    reason_code: str = ""
-    reason: str = ""
-    control: ControlledPlacement | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Reconstructed:
     """What came of the photos.
 
@@ -100,7 +74,6 @@ class Reconstructed:
         usable: photos whose features are there; all rows below are theirs.
         features: of each of them, read when asked for.
         reconstruction: models on disk.
-        components: placed models, largest cluster first; empty until they are placed.
         unreadable: photos by name whose pixels could not be read, with the reason.
         lost: photos by name whose tasks ended every worker that ran them, with the reason.
         lost_matches: tasks of matching that did so; their pairs count as not overlapping.
@@ -115,7 +88,6 @@ class Reconstructed:
     usable: tuple[Photo, ...] = ()
     features: FeatureFiles = field(default_factory=lambda: FeatureFiles(()))
     reconstruction: Reconstruction = field(default_factory=Reconstruction)
-    components: tuple[Component, ...] = ()
     unreadable: dict[str, str] = field(default_factory=dict)
     lost: dict[str, str] = field(default_factory=dict)
     lost_matches: tuple[Lost, ...] = ()
@@ -125,21 +97,6 @@ class Reconstructed:
     inliers: dict[Pair, int] = field(default_factory=dict)
     matches_per_photo: dict[str, int] = field(default_factory=dict)
     stopped_after: Stage | None = None
-
-
-def make_maps(
-    photos: Sequence[Photo],
-    workspace: Workspace,
-    options: MapMakingOptions,
-    executor: Executor,
-    *,
-    identity: Callable[[int], MapIdentity],
-    progress: Progress = no_progress,
-    survey: Survey | None = None,
-) -> Reconstructed:
-    """Reconstruct and place photos; all maps at once in memory. See `reconstruct_photos`, `place_models`."""
-    done = reconstruct_photos(photos, workspace, options, executor, progress=progress)
-    return replace(done, components=tuple(place_models(done, options, identity=identity, survey=survey)))
 
 
 def reconstruct_photos(
@@ -213,24 +170,6 @@ def reconstruct_photos(
     return replace(done, reconstruction=made, lost=lost, stopped_after=stopped)
 
 
-def place_models(
-    done: Reconstructed,
-    options: MapMakingOptions,
-    *,
-    identity: Callable[[int], MapIdentity],
-    survey: Survey | None = None,
-) -> Iterator[Component]:
-    """Place every model and build its map; one at a time, so that the caller can commit and forget it.
-
-    Args:
-        identity: of the map of the component with that number.
-        survey: control points, which then place the maps instead of GPS.
-    """
-    for number, model in enumerate(done.reconstruction.models()):
-        features = done.features.of(model.rows)
-        yield _component(model, done.usable, features, identity(number), options, survey)
-
-
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
     """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
     gps = np.array(
@@ -280,7 +219,7 @@ def _reconstruct(
     ]
     for cluster in clusters:  # a frame for each: they may lie in different towns
         chosen = [photos[row] for row in cluster.rows]
-        positions, sigmas = _priors(chosen, local_frame_of(chosen))
+        positions, sigmas = gps_priors(chosen, local_frame_of(chosen))
         for row, position, sigma in zip(cluster.rows, positions.tolist(), sigmas.tolist(), strict=True):
             if np.isfinite(sigma).all() and not photos[row].gps_is_hint:
                 views[row] = replace(views[row], prior_position=tuple(position), prior_sigma_m=tuple(sigma))
@@ -297,7 +236,7 @@ def _reconstruct(
     )
 
 
-def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
+def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
     """Positions (n, 3) in the frame and sigmas (n, 3), NaN for photos without GPS or height."""
     positions = np.full((len(photos), 3), np.nan)
     sigmas = np.full((len(photos), 3), np.nan)
@@ -309,102 +248,6 @@ def _priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArr
             assert gps is not None
             sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
     return positions, sigmas
-
-
-def _component(
-    model: Model,
-    photos: Sequence[Photo],
-    features: Sequence[PhotoFeatures],
-    identity: MapIdentity,
-    options: MapMakingOptions,
-    survey: Survey | None,
-) -> Component:
-    """Place one model and build its map where the placement is accepted.
-
-    Positions that nobody answers for place a quarantined map: it answers nothing and places nothing until
-    something better confirms it.
-
-    Args:
-        photos: all usable ones.
-        features: of the model's.
-    """
-    chosen = [photos[r] for r in model.rows]
-    frame = local_frame_of(chosen)  # its own: components may lie in different towns
-    positions, sigmas = _priors(chosen, frame)
-    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
-    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
-    component = Component(
-        model=model,
-        photos=tuple(chosen),
-        with_gps=tuple(int(i) for i in with_gps),
-        placement=placed,
-        feature_map=None,
-        reason_code=placed.reason or "",
-        reason=placed.message,
-    )
-    if survey is not None:
-        return _by_control(component, frame, features, identity, options, survey)
-    if (
-        placed.reason is not None
-        or frame is None
-        or placed.local_from_sfm is None
-        or placed.covariance is None
-    ):
-        return component
-    placement = Placement(
-        method="gps",
-        local_from_sfm=placed.local_from_sfm,
-        covariance=placed.covariance,
-        residual_rms_m=placed.residual_rms_m,
-        evidence=_evidence(placed, [chosen[i] for i in with_gps]),
-    )
-    hints = [chosen[i].gps_is_hint for i, inner in zip(with_gps, placed.inliers, strict=True) if inner]
-    feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
-    if feature_map is None:
-        return replace(
-            component,
-            reason_code="NO_POINTS",
-            reason="no point is placed well enough: the photos' rays are parallel",
-        )
-    if any(hints):
-        feature_map = replace(feature_map, status="quarantined")
-    return replace(component, feature_map=feature_map, reason="")
-
-
-def _by_control(
-    component: Component,
-    frame: LocalFrame | None,
-    features: Sequence[PhotoFeatures],
-    identity: MapIdentity,
-    options: MapMakingOptions,
-    survey: Survey,
-) -> Component:
-    """The component placed by control points; GPS, where it was accepted, says what they leave open."""
-    control = place_by_survey(component.model, component.photos, features, frame, component.placement, survey)
-    component = replace(component, control=control)
-    placed = control.placement
-    if placed.reason is not None or control.map_placement is None:
-        return replace(component, reason_code=placed.reason or "", reason=placed.message)
-    datum = control.height_datum(options.maps.height_datum)
-    feature_map = build_map(
-        control.model,
-        control.map_placement,
-        control.frame,
-        component.photos,
-        features,
-        identity,
-        replace(options.maps, height_datum=datum),
-    )
-    return replace(component, model=control.model, feature_map=feature_map, reason_code="", reason="")
-
-
-def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
-    residuals = {
-        photo.name: [round(float(v), 4) for v in row]
-        for photo, row in zip(photos, placed.residuals_m, strict=True)
-    }
-    outliers = [photo.name for photo, inner in zip(photos, placed.inliers, strict=True) if not inner]
-    return placed.figures | {"residuals_enu_m": residuals, "outlier_photos": outliers}
 
 
 def _matches_per_photo(photos: Sequence[Photo], inliers: Mapping[Pair, int]) -> dict[str, int]:

@@ -43,7 +43,8 @@ from ingest.growth.settle import SettleOptions
 from ingest.growth.values import GrownMap
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
-from ingest.reconstruction import Component, MapMakingOptions, make_maps
+from ingest.placed_models import Component, make_maps
+from ingest.reconstruction import MapMakingOptions
 from ingest.register.gps import similarity_closed_form
 from ingest.scan import ScanOptions, require_usable, scan_folder
 from ingest.workspace import Workspace
@@ -227,7 +228,7 @@ def _reconstruct(
     job = Workspace(root=work, job_id=digest(making.fingerprint, *(p.sha256 for p in chosen))[:24])
     identity: Callable[[int], MapIdentity] = lambda number: _identity([*rows, number])  # noqa: E731
     done = make_maps(chosen, job, making, InProcessExecutor(), identity=identity)
-    return sorted(done.components, key=lambda c: -len(c.photos))
+    return sorted(done, key=lambda c: -len(c.photos))
 
 
 def _identity(rows: Sequence[int]) -> MapIdentity:

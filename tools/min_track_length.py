@@ -27,7 +27,8 @@ from featuredb.maps.feature_map import FeatureMap, MapObservations
 from ingest.executor import PoolExecutor
 from ingest.map_builder import MapIdentity, MapOptions
 from ingest.photo import Photo
-from ingest.reconstruction import MapMakingOptions, make_maps
+from ingest.placed_models import make_maps
+from ingest.reconstruction import MapMakingOptions
 from ingest.scan import ScanOptions, scan_folder
 from ingest.workspace import Workspace
 from reloc.candidates import IndexedArea
@@ -86,9 +87,9 @@ def _largest(photos: Sequence[Photo], work: Path, workers: int) -> FeatureMap:
                 map_id=f"{job}-{number}", name=job, source="photos", licence="", provenance={}
             ),
         )
-    maps = [c.feature_map for c in made.components if c.feature_map is not None]
+    maps = [c.feature_map for c in made if c.feature_map is not None]
     if not maps:
-        raise SystemExit(f"no map of {len(photos)} photos: {[c.reason for c in made.components]}")
+        raise SystemExit(f"no map of {len(photos)} photos: {[c.reason for c in made]}")
     return maps[0]
 
 

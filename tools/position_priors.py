@@ -22,7 +22,8 @@ from ingest.executor import PoolExecutor
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapIdentity
 from ingest.photo import Photo
-from ingest.reconstruction import MapMakingOptions, make_maps
+from ingest.placed_models import make_maps
+from ingest.reconstruction import MapMakingOptions
 from ingest.scan import ScanOptions, scan_folder
 from ingest.sfm import SfmOptions
 from ingest.workspace import Workspace
@@ -94,9 +95,9 @@ def _map(photos: list[Photo], sfm: SfmOptions, work: Path, workers: int) -> Feat
                 map_id=str(number), name="", source="photos", licence="", provenance={}
             ),
         )
-    maps = [c.feature_map for c in made.components if c.feature_map is not None]
+    maps = [c.feature_map for c in made if c.feature_map is not None]
     if not maps:
-        raise SystemExit(f"no map: {[c.reason for c in made.components]}")
+        raise SystemExit(f"no map: {[c.reason for c in made]}")
     return maps[0]
 
 

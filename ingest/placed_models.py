@@ -1,0 +1,177 @@
+"""From reconstructions to placed feature maps: by GPS or control points, one map at a time."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.maps.feature_map import FeatureMap, Placement
+from ingest.colmap_bridge import Model
+from ingest.executor import Executor, Progress, no_progress
+from ingest.extract import PhotoFeatures
+from ingest.map_builder import MapIdentity, build_map
+from ingest.photo import Photo
+from ingest.reconstruction import (
+    MapMakingOptions,
+    Reconstructed,
+    gps_priors,
+    local_frame_of,
+    reconstruct_photos,
+)
+from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
+from ingest.register.gps import GpsPlacement, place_by_gps
+from ingest.workspace import Workspace
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Component:
+    """One connected component of the photos and what became of it.
+
+    Attributes:
+        model: the reconstruction.
+        photos: its registered photos, in the order of model.rows.
+        with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
+        placement: accepted or refused with a reason.
+        feature_map: None where there is none, for `reason_code` and `reason`.
+        control: of the placement by control points, where there are some.
+    """
+
+    model: Model
+    photos: tuple[Photo, ...]
+    with_gps: tuple[int, ...]
+    placement: GpsPlacement
+    feature_map: FeatureMap | None
+    reason_code: str = ""
+    reason: str = ""
+    control: ControlledPlacement | None = None
+
+
+def make_maps(
+    photos: Sequence[Photo],
+    workspace: Workspace,
+    options: MapMakingOptions,
+    executor: Executor,
+    *,
+    identity: Callable[[int], MapIdentity],
+    progress: Progress = no_progress,
+    survey: Survey | None = None,
+) -> tuple[Component, ...]:
+    """Reconstruct and place photos; all maps at once in memory. See `reconstruct_photos`, `place_models`."""
+    done = reconstruct_photos(photos, workspace, options, executor, progress=progress)
+    return tuple(place_models(done, options, identity=identity, survey=survey))
+
+
+def place_models(
+    done: Reconstructed,
+    options: MapMakingOptions,
+    *,
+    identity: Callable[[int], MapIdentity],
+    survey: Survey | None = None,
+) -> Iterator[Component]:
+    """Place every model and build its map; one at a time, so that the caller can commit and forget it.
+
+    Args:
+        identity: of the map of the component with that number.
+        survey: control points, which then place the maps instead of GPS.
+    """
+    for number, model in enumerate(done.reconstruction.models()):
+        features = done.features.of(model.rows)
+        yield _component(model, done.usable, features, identity(number), options, survey)
+
+
+def _component(
+    model: Model,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapMakingOptions,
+    survey: Survey | None,
+) -> Component:
+    """Place one model and build its map where the placement is accepted.
+
+    Positions that nobody answers for place a quarantined map: it answers nothing and places nothing until
+    something better confirms it.
+
+    Args:
+        photos: all usable ones.
+        features: of the model's.
+    """
+    chosen = [photos[r] for r in model.rows]
+    frame = local_frame_of(chosen)  # its own: components may lie in different towns
+    positions, sigmas = gps_priors(chosen, frame)
+    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
+    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
+    component = Component(
+        model=model,
+        photos=tuple(chosen),
+        with_gps=tuple(int(i) for i in with_gps),
+        placement=placed,
+        feature_map=None,
+        reason_code=placed.reason or "",
+        reason=placed.message,
+    )
+    if survey is not None:
+        return _by_control(component, frame, features, identity, options, survey)
+    if (
+        placed.reason is not None
+        or frame is None
+        or placed.local_from_sfm is None
+        or placed.covariance is None
+    ):
+        return component
+    placement = Placement(
+        method="gps",
+        local_from_sfm=placed.local_from_sfm,
+        covariance=placed.covariance,
+        residual_rms_m=placed.residual_rms_m,
+        evidence=_evidence(placed, [chosen[i] for i in with_gps]),
+    )
+    hints = [chosen[i].gps_is_hint for i, inner in zip(with_gps, placed.inliers, strict=True) if inner]
+    feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
+    if feature_map is None:
+        return replace(
+            component,
+            reason_code="NO_POINTS",
+            reason="no point is placed well enough: the photos' rays are parallel",
+        )
+    if any(hints):
+        feature_map = replace(feature_map, status="quarantined")
+    return replace(component, feature_map=feature_map, reason="")
+
+
+def _by_control(
+    component: Component,
+    frame: LocalFrame | None,
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapMakingOptions,
+    survey: Survey,
+) -> Component:
+    """The component placed by control points; GPS, where it was accepted, says what they leave open."""
+    control = place_by_survey(component.model, component.photos, features, frame, component.placement, survey)
+    component = replace(component, control=control)
+    placed = control.placement
+    if placed.reason is not None or control.map_placement is None:
+        return replace(component, reason_code=placed.reason or "", reason=placed.message)
+    datum = control.height_datum(options.maps.height_datum)
+    feature_map = build_map(
+        control.model,
+        control.map_placement,
+        control.frame,
+        component.photos,
+        features,
+        identity,
+        replace(options.maps, height_datum=datum),
+    )
+    return replace(component, model=control.model, feature_map=feature_map, reason_code="", reason="")
+
+
+def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
+    residuals = {
+        photo.name: [round(float(v), 4) for v in row]
+        for photo, row in zip(photos, placed.residuals_m, strict=True)
+    }
+    outliers = [photo.name for photo, inner in zip(photos, placed.inliers, strict=True) if not inner]
+    return placed.figures | {"residuals_enu_m": residuals, "outlier_photos": outliers}
