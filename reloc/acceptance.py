@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import GeoPrior
 from reloc.result import Evidence, Reason
 
 # The fit that tools/acceptance_study.py prints.
@@ -23,6 +24,14 @@ class AcceptanceOptions:
         min_coverage: smallest share of a 10x10 grid over the image that holds inliers.
         min_agreement: smallest share of the parts of the image where the map should be seen that holds
             inliers; a picture of the place inside another picture agrees in its own part only.
+        min_spread: smallest `spread` of a photo whose prior does not say where it was taken. A look-alike
+            that fills a part of a photo gives many inliers there and none beside it. Photos of a simulated
+            walk beyond the maps' reach, 116 and 601 m off, had 0.56 and 0.50 with 223 and 81 inliers; right
+            ones there and in a town of look-alikes 0.62 and more, nearly all above 0.75
+            (`tools/retrieval_study.py --each`), on `brighton` and `lewis` 0.66 and more. It costs right
+            photos half of which is covered by something else: 0.46 to 0.80; they need a prior.
+        prior_tells_m: largest standard deviation of a prior that tells look-alikes apart; that the pose
+            agrees with it is asked of every prior.
         rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
         settled_log_nfa: with that much evidence for a pose, places with far fewer votes are not tried.
     """
@@ -31,6 +40,8 @@ class AcceptanceOptions:
     min_log_nfa: float = 20.0
     min_coverage: float = 0.05
     min_agreement: float = 0.2
+    min_spread: float = 0.6
+    prior_tells_m: float = 50.0
     rival_share: float = 0.6
     settled_log_nfa: float = 48.0
 
@@ -78,6 +89,26 @@ def agreement(
     return float(np.isin(cells, _cells(inliers, width, height)).mean())
 
 
+def spread(inliers: NDArray[np.floating], expected: NDArray[np.floating], width: int, height: int) -> float:
+    """Parts of the image that inliers reach, over those that as many reach if they lie like the map's points.
+
+    Few inliers cannot reach all parts where the map should be seen, however right the pose; many that crowd
+    in some of them say that the others show something else. About 1 for right poses; 0 where no inlier lies
+    where the map should be seen.
+
+    Args:
+        inliers: (k, 2) pixels. expected: (v, 2) pixels of all map points that the pose makes visible.
+    """
+    cells = _expected_cells(expected, width, height)
+    inside = np.isin(_cells(inliers, width, height), cells)
+    if not inside.any():
+        return 0.0
+    numbers = _cells(expected, width, height)
+    share = np.bincount(numbers, minlength=100)[cells] / np.isin(numbers, cells).sum()
+    reached = len(np.unique(_cells(inliers, width, height)[inside]))
+    return float(reached / (1.0 - (1.0 - share) ** inside.sum()).sum())
+
+
 def expected_cells(expected: NDArray[np.floating], width: int, height: int) -> int:
     """How many cells `agreement` asks."""
     return len(_expected_cells(expected, width, height))
@@ -111,8 +142,19 @@ def _log_choose(n: int, k: int) -> float:
     return float(gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1))
 
 
-def verdict(evidence: Evidence, rival_inliers: int, options: AcceptanceOptions) -> tuple[Reason, str] | None:
-    """None if the pose is believed, else the reason and a sentence with the figures."""
+def prior_tells(prior: GeoPrior | None, options: AcceptanceOptions) -> bool:
+    """Whether a prior is good enough to tell a place from its look-alikes."""
+    return prior is not None and prior.sigma_horizontal_m <= options.prior_tells_m
+
+
+def verdict(
+    evidence: Evidence, rival_inliers: int, options: AcceptanceOptions, *, told_by_prior: bool = False
+) -> tuple[Reason, str] | None:
+    """None if the pose is believed, else the reason and a sentence with the figures.
+
+    Args:
+        told_by_prior: see `prior_tells`.
+    """
     if evidence.inliers < options.min_inliers:
         return "TOO_FEW_INLIERS", f"{evidence.inliers} independent inliers, {options.min_inliers} needed"
     if evidence.log_nfa < options.min_log_nfa:
@@ -132,6 +174,13 @@ def verdict(evidence: Evidence, rival_inliers: int, options: AcceptanceOptions) 
             "TOO_FEW_INLIERS",
             f"inliers lie in {100 * evidence.agreement:.0f} % of the parts of the photo where the map should "
             f"be seen, {100 * options.min_agreement:.0f} % needed: it may show a picture of the place",
+        )
+    if evidence.spread < options.min_spread and not told_by_prior:
+        return (
+            "AMBIGUOUS",
+            f"{evidence.inliers} inliers crowd in some parts of the photo where the map should be seen: they "
+            f"reach {100 * evidence.spread:.0f} % of those that as many should reach, "
+            f"{100 * options.min_spread:.0f} % needed without a position; it may show a look-alike",
         )
     if rival_inliers >= options.rival_share * evidence.inliers:
         return (

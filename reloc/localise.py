@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
-from reloc.acceptance import confidence, verdict
+from reloc.acceptance import confidence, prior_tells, verdict
 from reloc.answer import make_answer
 from reloc.candidates import IndexedArea
 from reloc.options import LocaliseOptions
@@ -139,7 +139,12 @@ def _decide(
         return refuse("TOO_FEW_INLIERS", f"no pose agrees with the {found.matches} matches")
     best = found.candidates[0]
     rival = runner_up(best, found.candidates[1:])
-    refusal = verdict(best.evidence, rival.inliers if rival else 0, options.acceptance)
+    refusal = verdict(
+        best.evidence,
+        rival.inliers if rival else 0,
+        options.acceptance,
+        told_by_prior=prior_tells(request.prior, options.acceptance),
+    )
     if refusal is not None:
         return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
     pixels, points = pairs(features, best.area, best.matches)

@@ -144,6 +144,7 @@ class Evidence:
         coverage: share of a 10x10 grid over the image that holds inliers.
         visible_share: guided inliers over map points that should be visible.
         agreement: of the parts of the image where the map should be seen, the share that holds inliers.
+        spread: the same over the share that as many inliers would reach if they lay like the map's points.
     """
 
     inliers: int
@@ -151,6 +152,7 @@ class Evidence:
     coverage: float
     visible_share: float
     agreement: float
+    spread: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

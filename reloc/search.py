@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa
+from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa, spread
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import (
     EXPECTED_DEG,
@@ -138,7 +138,8 @@ def _settled(
     images got their votes for seeing the same place, which the pose's own cluster holds already.
     """
     best = max(candidates, key=lambda c: c.evidence.log_nfa)
-    sure = best.evidence.log_nfa > options.acceptance.settled_log_nfa
+    lines = options.acceptance
+    sure = best.evidence.log_nfa > lines.settled_log_nfa and best.evidence.spread >= lines.min_spread
     return sure and all(other.score < 0.5 * cluster.score or _around(best, other) for other in rest)
 
 
@@ -290,6 +291,7 @@ def _with_evidence(
         coverage=coverage(inlier_pixels, width, height),
         visible_share=len(own) / max(len(visible), 1),
         agreement=agreement(inlier_pixels, expected_pixels, width, height),
+        spread=spread(inlier_pixels, expected_pixels, width, height),
     )
     return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
 

@@ -45,14 +45,15 @@ mpl.use("Agg")  # no display is needed
 
 # Everything that is found comes back: six inliers are the fewest that leave the pose some redundancy.
 NO_LINES = AcceptanceOptions(
-    min_inliers=6, min_log_nfa=-1e9, min_coverage=0.0, min_agreement=0.0, rival_share=np.inf
+    min_inliers=6, min_log_nfa=-1e9, min_coverage=0.0, min_agreement=0.0, min_spread=0.0, rival_share=np.inf
 )
-MEASURES = ("inliers", "log_nfa", "coverage", "agreement", "visible_share")
+MEASURES = ("inliers", "log_nfa", "coverage", "agreement", "spread", "visible_share")
 _LINES = {
     "inliers": "min_inliers",
     "log_nfa": "min_log_nfa",
     "coverage": "min_coverage",
     "agreement": "min_agreement",
+    "spread": "min_spread",
 }
 _RIGHT_PLACE_M = 5.0  # what the evaluations call a wrong answer lies further off
 _SUFFIXES = (".jpg", ".jpeg", ".png")
@@ -105,6 +106,7 @@ class Row:
     log_nfa: float
     coverage: float
     agreement: float
+    spread: float
     visible_share: float
     rival_inliers: int
 
@@ -202,7 +204,7 @@ def _row(
 ) -> Row:
     result = localiser.localise(gray, request)
     evidence = result.evidence or Evidence(
-        inliers=0, log_nfa=0.0, coverage=0.0, visible_share=0.0, agreement=0.0
+        inliers=0, log_nfa=0.0, coverage=0.0, visible_share=0.0, agreement=0.0, spread=0.0
     )
     rival = result.runner_up.inliers if result.runner_up else 0
     refusal = verdict(evidence, rival, AcceptanceOptions())

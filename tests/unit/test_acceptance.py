@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from featuredb.maps.feature_map import GeoPrior
 from reloc.acceptance import (
     AcceptanceOptions,
     Evidence,
@@ -18,11 +19,13 @@ from reloc.acceptance import (
     coverage,
     independent_inliers,
     log_nfa,
+    prior_tells,
+    spread,
     verdict,
 )
 
 OPTIONS = AcceptanceOptions()
-GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, visible_share=0.5, agreement=0.8)
+GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, visible_share=0.5, agreement=0.8, spread=0.9)
 
 
 @settings(deadline=None, max_examples=60)
@@ -95,6 +98,47 @@ def test_agreement_asks_where_the_map_should_be_seen() -> None:
     assert agreement(patch, np.repeat(patch[:1], 2, axis=0), 100, 100) == 0.0
 
 
+def test_spread_asks_how_far_so_many_inliers_should_reach() -> None:
+    rng = np.random.default_rng(0)
+    expected = rng.uniform(0, 100, (2000, 2))
+    # Any number of inliers that lie like the map's points: about 1; agreement grows with the number.
+    for count in (15, 40, 200, 1000):
+        found = [spread(rng.permutation(expected)[:count], expected, 100, 100) for _ in range(20)]
+        assert np.mean(found) == pytest.approx(1.0, abs=0.05)
+        assert min(found) > 0.75
+    # The same numbers in the left 40 %: few reach most of what they can, many do not.
+    left = expected[expected[:, 0] < 40]
+    shares = [
+        np.mean([spread(rng.permutation(left)[:count], expected, 100, 100) for _ in range(20)])
+        for count in (15, 40, 200, 700)
+    ]
+    assert shares[0] > 0.75
+    assert shares == sorted(shares, reverse=True)
+    assert shares[2] < OPTIONS.min_spread
+    assert shares[3] == pytest.approx(0.4, abs=0.03)
+    # Where the map has most of its points, most inliers should lie: that is no crowd.
+    uneven = np.concatenate([rng.uniform(0, 100, (400, 2)), rng.uniform(0, 20, (4000, 2))])
+    assert spread(rng.permutation(uneven)[:300], uneven, 100, 100) > 0.85
+    assert spread(np.zeros((0, 2)), expected, 100, 100) == 0.0
+    assert spread(expected[:20], expected[:2], 100, 100) == 0.0
+
+
+def test_a_prior_that_tells_places_apart_makes_up_for_spread() -> None:
+    crowded = replace(GOOD, spread=0.3)
+    assert verdict(crowded, 0, OPTIONS) is not None
+    assert verdict(crowded, 0, OPTIONS, told_by_prior=True) is None
+    for sigma_m, tells in ((OPTIONS.prior_tells_m, True), (OPTIONS.prior_tells_m + 1.0, False)):
+        prior = GeoPrior(
+            latitude_deg=48.0,
+            longitude_deg=9.0,
+            height_m=None,
+            sigma_horizontal_m=sigma_m,
+            sigma_vertical_m=20.0,
+        )
+        assert prior_tells(prior, OPTIONS) == tells
+    assert not prior_tells(None, OPTIONS)
+
+
 def test_inliers_on_top_of_each_other_count_once() -> None:
     rng = np.random.default_rng(0)
     pixels = np.stack(np.meshgrid(np.arange(10), np.arange(10)), -1).reshape(-1, 2) * 10.0 + 1.0
@@ -122,6 +166,8 @@ def test_inliers_on_top_of_each_other_count_once() -> None:
         (replace(GOOD, agreement=OPTIONS.min_agreement), 0, None, ""),
         (replace(GOOD, agreement=OPTIONS.min_agreement - 0.01), 0, "TOO_FEW_INLIERS", "picture of the place"),
         (replace(GOOD, coverage=OPTIONS.min_coverage - 0.01), 0, "TOO_FEW_INLIERS", "cover 4 %"),
+        (replace(GOOD, spread=OPTIONS.min_spread), 0, None, ""),
+        (replace(GOOD, spread=OPTIONS.min_spread - 0.01), 0, "AMBIGUOUS", "59 % of those that as many"),
         (GOOD, 23, None, ""),
         (GOOD, 24, "AMBIGUOUS", "24 inliers, this one 40"),
     ],
