@@ -1,11 +1,9 @@
 """A grown map's covariance on Earth as answers carry it: of one size in all directions.
 
-How far a chain of maps may have drifted, the pose graph says well; in which direction, it does not. It takes
-each map's part for independent of the others', and finds height and tilt the weakest. What bends a chain is
-also what all its maps share, their lenses above all, and that is a bend to one side: azimuths of a simulated
-walk turned by 0.1 mrad with every map, 2.5 mrad in the end where 0.5 were claimed, while the bound of each
-map, that of its worst direction, held. With that bound in all directions answers along the walk have the mean
-squared normalised error that theory wants (`docs/growth.md`).
+How far a chain of maps may have drifted, the pose graph says well; in which direction, it does not. It finds
+height and tilt the weakest, and takes what lenses turn for equal about all axes that they turn; a chain may
+bend to one side by more than it says for that side, while the bound of each map, that of its worst direction,
+holds (`tools/drift_axes.py` prints both along a simulated walk; docs/growth.md).
 """
 
 from dataclasses import replace
