@@ -27,9 +27,8 @@ class AcceptanceOptions:
         min_spread: smallest `spread` of a photo whose prior does not say where it was taken. A look-alike
             that fills a part of a photo gives many inliers there and none beside it. Photos of a simulated
             walk beyond the maps' reach, 116 and 601 m off, had 0.56 and 0.50 with 223 and 81 inliers; right
-            ones there and in a town of look-alikes 0.62 and more, nearly all above 0.75
-            (`tools/retrieval_study.py --each`), on `brighton` and `lewis` 0.66 and more. It costs right
-            photos half of which is covered by something else: 0.46 to 0.80; they need a prior.
+            ones there 0.77 and more, in a town of look-alikes 0.62 and more (`tools/retrieval_study.py
+            --each`). It costs right photos half of which is covered by something else; they need a prior.
         prior_tells_m: largest standard deviation of a prior that tells look-alikes apart; that the pose
             agrees with it is asked of every prior.
         rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.

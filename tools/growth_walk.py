@@ -17,7 +17,7 @@ interrupted goes on.
 Exit code 0 if: coverage follows for at least 600 m (the default budget ends before); the true drift of every
 map stays inside its bound at every step; growth stopped by itself and no active map exceeds the budget; after
 the second anchor every probe that is answered is within 0.3 m, and the maps that were there moved in one
-commit.
+commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
 """
 
 import argparse
@@ -41,6 +41,7 @@ from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire import LocaliseWireRequest
 from tools.growth_common import (
+    WRONG_M,
     Album,
     Registered,
     Verdict,
@@ -237,6 +238,8 @@ def judge(
     over = max((s.drift_m for s in steps), default=0.0)
     asked = [p for p in steps[-1].probes if p.normalised is not None] if steps else []
     inside = sum((p.normalised or 0.0) <= _INSIDE for p in asked)
+    mean = float(np.mean([p.normalised or 0.0 for p in asked])) if asked else float("nan")
+    answers = [p.error_m for s in (*steps, end) for p in s.probes if p.error_m is not None]
     errors = [p.error_m for p in end.probes if p.error_m is not None]
     wanted = min(_WALK_M, world.end_m - world.start_m - 150.0)
     why = "not stopped" if stopped is None else f"stopped for the budget at step {stopped.step + 1}"
@@ -253,8 +256,14 @@ def judge(
         ),
         Verdict(
             name="probes inside their 95 %",
-            text=f"{inside} of {len(asked)} along the whole way",
+            text=f"{inside} of {len(asked)} along the whole way; mean squared normalised error {mean:.1f}",
             holds=bool(asked) and inside >= _PROBE_SHARE * len(asked),
+        ),
+        Verdict(
+            name="no wrong answer",
+            text=f"{sum(e > WRONG_M for e in answers)} of {len(answers)} answers at any step more than "
+            f"{WRONG_M} m off, worst {max(answers, default=float('nan')):.2f} m",
+            holds=bool(answers) and max(answers) <= WRONG_M,
         ),
         Verdict(
             name="budget",

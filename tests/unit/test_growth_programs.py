@@ -110,6 +110,9 @@ def test_a_walk_holds_and_each_of_its_lines_can_fail() -> None:
     off = replace(good[0], probes=(replace(good[0].probes[0], error_m=0.31, normalised=20.0),))
     assert not holding(growth_walk.judge(good, off, 1, 0.5, world))["second anchor"]
     assert not holding(growth_walk.judge([off], good[0], 1, 0.5, world))["probes inside their 95 %"]
+    # One wrong answer at one early step, among any number of right ones.
+    astray = replace(good[0], probes=(replace(good[0].probes[0], error_m=2.1), *good[0].probes))
+    assert not holding(growth_walk.judge([astray, *good], good[0], 1, 0.5, world))["no wrong answer"]
 
 
 def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
