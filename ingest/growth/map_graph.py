@@ -41,7 +41,7 @@ class StoredEdge:
         other_from_map: carries what this map says to where the other says it; this map's local frame.
         covariance: (7, 7) of its left perturbation.
         shared_points, photos: that it rests on.
-        shared: (7, 3) the part of the covariance that overlaps have in common (`drift.shared_turn`).
+        shared: (7, 3) the part of the covariance that overlaps have in common (`photo_spread.shared_turn`).
     """
 
     map_id: str

@@ -17,18 +17,17 @@ from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.contradictions import ContradictionOptions, contradicting_photos
-from ingest.growth.drift import (
-    DriftOptions,
-    PhotoSpread,
-    bending_variance_m2,
-    center_covariances,
-    photo_covariances,
-    shared_turn,
-    turning_covariance,
-)
+from ingest.growth.drift import DriftOptions, photo_covariances
 from ingest.growth.links import firmness
 from ingest.growth.model_parts import only_photos, with_existing, without_photos
 from ingest.growth.parents import edges_of
+from ingest.growth.photo_spread import (
+    PhotoSpread,
+    bending_variance_m2,
+    center_covariances,
+    shared_turn,
+    turning_covariance,
+)
 from ingest.growth.placement import Held, PlacementOptions
 from ingest.growth.refine import Lenses, RefineOptions, refine_with_maps
 from ingest.growth.similarity_fit import Fit, fit_similarity
@@ -80,7 +79,7 @@ class Settled:
         spread: of the photos that are kept.
         bending_m, turning_deg: what the photos' positions and the directions of its pieces lack beyond the
             similarity, one sigma along the worst axis.
-        shared_turn: (7, 3) of `drift.shared_turn`.
+        shared_turn: (7, 3) of `photo_spread.shared_turn`.
         left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 

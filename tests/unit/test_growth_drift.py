@@ -10,11 +10,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, with_observations
-from ingest.growth.drift import (
-    DriftOptions,
+from ingest.growth.drift import DriftOptions, photo_covariances
+from ingest.growth.photo_spread import (
     bending_variance_m2,
     center_covariances,
-    photo_covariances,
     shared_turn,
     turning_covariance,
 )
