@@ -9,6 +9,9 @@ and all of them are ingested by `featuredb ingest photos` in a process of its ow
 Prints seconds and processor seconds per photo, images per hour, registered photos and the peak of the memory
 of all processes together (proportional shares, sampled twice a second). Writes scale.json. Exit code 0 if the
 wall time per photo at the large size is at most 1.3 times that at the small one, and the peak is under 6 GiB.
+
+A run that is killed goes on where it was, as the ingest does. The times of its parts add up; what was done
+twice counts twice.
 """
 
 import argparse
@@ -30,6 +33,26 @@ from tools.growth_common import Album, Verdict, conclude, made, say, table
 
 _RATIO, _PEAK_GIB = 1.3, 6.0
 _SAMPLE_S = 0.5
+_TICKS = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(slots=True, kw_only=True)
+class Spent:
+    """What the parts of one ingest have taken, in seconds and bytes; on disk while it runs."""
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak: int = 0
+    parts: int = 0
+
+    @classmethod
+    def read(cls, file: Path) -> "Spent":
+        return cls(**json.loads(file.read_text(encoding="utf-8"))) if file.exists() else cls()
+
+    def write(self, file: Path) -> None:
+        part = file.with_suffix(".part")
+        part.write_text(json.dumps(asdict(self)) + "\n", encoding="utf-8")
+        part.replace(file)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +65,7 @@ class Ingest:
     peak_gib: float
     registered: int
     maps: int
+    parts: int = 1
 
     @property
     def wall_per_photo_s(self) -> float:
@@ -123,29 +147,30 @@ def ingested(
     log = out / f"{name}.json"
     if log.exists():
         return Ingest(**json.loads(log.read_text(encoding="utf-8")))
-    photos, database = out / f"photos-{name}", out / name
-    link(album.folder, photos, (f.name for f in facts))
-    shutil.rmtree(database, ignore_errors=True)
+    photos, database, so_far = out / f"photos-{name}", out / name, out / f"{name}-so-far.json"
+    spent = Spent.read(so_far)
+    if not spent.parts:
+        link(album.folder, photos, (f.name for f in facts))
+        shutil.rmtree(database, ignore_errors=True)
+    spent.parts += 1
     command = [
         *(sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)),
         *("--workers", str(args.workers), "--quiet", *extra, *args.ingest_option),
     ]
-    start, before = time.monotonic(), os.times()
     said = out / f"{name}.txt"  # a line for each photo that is in no map
     with said.open("wb") as file, subprocess.Popen(command, stdout=file) as process:
-        peak = _peak_of(process)
-    wall, after = time.monotonic() - start, os.times()
+        watch(process, spent, so_far)
     if process.returncode != 0:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}; see {said}")
-    cpu = after.children_user + after.children_system - before.children_user - before.children_system
     maps = Database.open(database).snapshot().maps()
     run = Ingest(
         photos=len(facts),
-        wall_s=wall,
-        cpu_s=cpu,
-        peak_gib=peak / 2**30,
+        wall_s=spent.wall_s,
+        cpu_s=spent.cpu_s,
+        peak_gib=spent.peak / 2**30,
         registered=sum(m.images for m in maps),
         maps=len(maps),
+        parts=spent.parts,
     )
     log.write_text(json.dumps(asdict(run)) + "\n", encoding="utf-8")
     say(f"{name}: {run}")
@@ -163,13 +188,32 @@ def link(source: Path, target: Path, names: Iterable[str]) -> None:
             shutil.copyfile(source / name, target / name)
 
 
-def _peak_of(process: "subprocess.Popen[bytes]") -> int:
-    """Largest sum of the proportional memory (bytes) of a process and its descendants, until it ends."""
-    peak = 0
+def watch(process: "subprocess.Popen[bytes]", spent: Spent, file: Path) -> None:
+    """Add what a process and its descendants take until it ends, and keep the sum in `file` meanwhile."""
+    before, start, ours = (spent.wall_s, spent.cpu_s), time.monotonic(), os.times()
     while process.poll() is None:
-        peak = max(peak, sum(_memory(pid) for pid in _family(process.pid)))
+        family = _family(process.pid)
+        spent.peak = max(spent.peak, sum(_memory(pid) for pid in family))
+        spent.wall_s = before[0] + time.monotonic() - start
+        # The time of a worker that is just ending is nobody's for a moment.
+        spent.cpu_s = max(spent.cpu_s, before[1] + sum(_processor_s(pid) for pid in family))
+        spent.write(file)
         time.sleep(_SAMPLE_S)
-    return peak
+    spent.wall_s = before[0] + time.monotonic() - start
+    now = os.times()
+    spent.cpu_s = (
+        before[1] + now.children_user + now.children_system - ours.children_user - ours.children_system
+    )
+    spent.write(file)
+
+
+def _processor_s(pid: int) -> float:
+    """Seconds of a process and of its children that have ended."""
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return sum(map(int, words[11:15])) / _TICKS
 
 
 def _family(pid: int) -> list[int]:

@@ -1,5 +1,7 @@
 """Verdicts of the programs that measure growth: each line holds, and fails where it should."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,7 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.walk_world import WalkOptions
-from tools import growth_community, growth_poison, growth_walk
+from tools import growth_community, growth_poison, growth_scale, growth_walk
 from tools.growth_common import Album, Registered, Verdict
 from tools.growth_poison import Outcome
 from tools.growth_walk import Probe, Step, worst_map
@@ -135,3 +137,20 @@ def test_poison_that_gets_in_fails() -> None:
         assert not holding(growth_poison.judge([clean], 0.01, bad))["retire"]
     held = replace(clean, forced=1, restored=False)
     assert not holding(growth_poison.judge([held], 0.01, good))["retire"]
+
+
+def test_the_parts_of_an_ingest_that_was_killed_add_up(tmp_path: Path) -> None:
+    file = tmp_path / "so-far.json"
+    work = [sys.executable, "-c", "sum(range(3_000_000)); import time; time.sleep(0.2)"]
+    seen = []
+    for _ in range(2):
+        spent = growth_scale.Spent.read(file)
+        spent.parts += 1
+        with subprocess.Popen(work) as process:
+            growth_scale.watch(process, spent, file)
+        seen.append(growth_scale.Spent.read(file))
+    first, both = seen
+    assert (first.parts, both.parts) == (1, 2)
+    assert both.wall_s > first.wall_s > 0.2
+    assert both.cpu_s > first.cpu_s > 0.0
+    assert both.peak >= first.peak > 0
