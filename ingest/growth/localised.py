@@ -17,7 +17,7 @@ from featuredb.index.codebook import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.acceptance import agreement
-from reloc.candidates import IndexedArea
+from reloc.candidates import IndexedArea, images_in_reach
 from reloc.localise import Localised, localise_features
 from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
 from reloc.options import LocaliseOptions
@@ -128,7 +128,11 @@ def localise_photo(
     )
     outcome = localise_features(few, request, usable, settings)
     by_prior = photo.gps is not None and outcome.best is not None
-    if outcome.best is None and photo.gps is not None and options.retry_without_geotag:
+    if (
+        outcome.best is None
+        and options.retry_without_geotag
+        and _geotag_matters(photo, outcome, usable, settings)
+    ):
         again = localise_features(few, replace(request, prior=None), usable, settings)
         outcome = again if again.best is not None else outcome
     if outcome.best is None:
@@ -142,6 +146,21 @@ def localise_photo(
                 f"map should show there, {options.least_agreement_against_geotag:.0%} needed"
             )
     return found
+
+
+def _geotag_matters(
+    photo: Photo, outcome: Localised, areas: Sequence[IndexedArea], options: LocaliseOptions
+) -> bool:
+    """Whether a photo that was not found may be found without its geotag.
+
+    Where all images were in reach of it, the search would be the same; only a pose that was found and
+    contradicted the geotag may stand without it.
+    """
+    if photo.gps is None:
+        return False
+    if outcome.result.reason == "CONTRADICTS_PRIOR":
+        return True
+    return not all(images_in_reach(a.area, photo.gps, options.candidates).all() for a in areas)
 
 
 def share_shown(photo: LocalisedPhoto, area: Area) -> float:

@@ -1,10 +1,13 @@
 """New photos, each localised by the existing maps by itself: poses, threads, geotags, lenses, witnesses."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+import ingest.growth.localised as localised_module
+from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
 from ingest.growth.confirmation import ConfirmationOptions
@@ -20,11 +23,14 @@ from ingest.growth.values import LocalisedPhoto
 from ingest.growth.witnesses import NewPhotos as WitnessPhotos
 from ingest.growth.witnesses import hear_witnesses
 from reloc.candidates import IndexedArea
+from reloc.localise import Localised
+from reloc.result import LocaliseRequest
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import (
     CAMERA,
     indexed,
+    random_descriptors,
 )
 
 
@@ -115,6 +121,29 @@ def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
     away = found_by(prior(pose, (150.0, 0.0)))
     assert isinstance(away, str)
     assert away.startswith("CONTRADICTS_GEOTAG")
+
+
+def test_a_geotag_that_leaves_everything_in_reach_is_not_tried_without(
+    area: IndexedArea, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Strange features find nothing; without the geotag the search is another one only if it led past."""
+    asked: list[GeoPrior | None] = []
+    honest = localised_module.localise_features
+
+    def counted(features: Features, request: LocaliseRequest, *rest: Any) -> Localised:
+        asked.append(request.prior)
+        return honest(features, request, *rest)
+
+    monkeypatch.setattr(localised_module, "localise_features", counted)
+    pose = walk(1)[0]
+    strange = random_descriptors(np.random.default_rng(8), len(POINTS))
+    for offset, tries in (((2.0, 1.0), 1), ((5000.0, 0.0), 2)):
+        gps = prior(pose, offset)
+        new = take_photos(np.random.default_rng(5), POINTS, strange, [pose], camera_key=KEY, gps=[gps])
+        asked.clear()
+        found = localise_photo(new.photos[0], 0, new.features_of(0).features, [area], LocaliseEachOptions())
+        assert isinstance(found, str), found
+        assert asked == [gps, None][:tries]
 
 
 def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:
