@@ -16,7 +16,7 @@ from featuredb.index.area import Area
 from featuredb.index.codebook import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
-from reloc.acceptance import agreement
+from reloc.acceptance import AcceptanceOptions, agreement
 from reloc.candidates import IndexedArea, images_in_reach
 from reloc.localise import Localised, localise_features
 from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
@@ -33,7 +33,9 @@ class LocaliseEachOptions:
     """How new photos are localised.
 
     Attributes:
-        localise: as for queries; the extractor named there is not used, features exist.
+        localise: as for queries, but for the gate of `spread`: where a query stands alone, photos that
+            are taken into a map must agree with others in any case (a tenth of ten strangers' photos of
+            a church was lost to it). The extractor named there is not used, features exist.
         max_features: so many of a photo's features, strongest and best spread first, look for the pose; a
             query has 3,000. All of them take part in the guided matching that follows.
         retry_without_geotag: a photo that its geotag does not lead to a map is tried without it: a tenth
@@ -48,7 +50,9 @@ class LocaliseEachOptions:
             take half the time. Results are the same.
     """
 
-    localise: LocaliseOptions = field(default_factory=LocaliseOptions)
+    localise: LocaliseOptions = field(
+        default_factory=lambda: LocaliseOptions(acceptance=AcceptanceOptions(min_spread=0.0))
+    )
     max_features: int = 4000
     retry_without_geotag: bool = True
     least_agreement_against_geotag: float = 0.7
