@@ -24,6 +24,7 @@ from ingest.growth.witnesses import NewPhotos as WitnessPhotos
 from ingest.growth.witnesses import hear_witnesses
 from reloc.candidates import IndexedArea
 from reloc.localise import Localised
+from reloc.options import LocaliseOptions
 from reloc.result import LocaliseRequest
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import NewPhotos, take_photos
@@ -121,6 +122,20 @@ def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
     away = found_by(prior(pose, (150.0, 0.0)))
     assert isinstance(away, str)
     assert away.startswith("CONTRADICTS_GEOTAG")
+
+
+def test_a_photo_half_covered_is_refused_as_a_query_and_heard_by_growth(area: IndexedArea) -> None:
+    """A query stands alone; what growth takes must agree with other photos in any case."""
+    new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [walk(1)[0]], camera_key=KEY)
+    features = new.features_of(0).features
+    shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
+    heard = localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
+    assert isinstance(heard, LocalisedPhoto), heard
+    assert np.linalg.norm(heard.cam_from_local.center - new.poses[0].center) < 0.2
+    strict = LocaliseEachOptions(localise=LocaliseOptions())
+    refused = localise_photo(new.photos[0], 0, shown, [area], strict)
+    assert isinstance(refused, str)
+    assert refused.startswith("AMBIGUOUS"), refused
 
 
 def test_a_geotag_that_leaves_everything_in_reach_is_not_tried_without(
