@@ -16,6 +16,7 @@ from featuredb.simworld.texture import Image8
 
 _SUPERSAMPLE = 2  # rays per pixel and direction; with one, thin things flicker and edges are jagged
 _CAR_SPACING_M = 70.0  # moving cars along a lane, on average
+_CAR_M_S = 9.0
 _MOVING_ID = 30_000
 
 
@@ -40,14 +41,21 @@ def render_depth(scene: Scene, camera: Camera, cam_from_local: Rigid3) -> Render
     return render(scene.faces, scene.ellipsoids, camera, cam_from_local)
 
 
-def moving_cars(scene: Scene, moment: int) -> Faces:
-    """Cars on the lanes at a moment, in the local frame."""
+def moving_cars(scene: Scene, moment: int, time_s: float = 0.0) -> Faces:
+    """Cars on the lanes at a moment, in the local frame.
+
+    Args:
+        time_s: after that moment; they drive on, and come in again where their street begins.
+    """
     rng = np.random.default_rng((scene.seed, moment, 6))
     places, yaws = [], []
     for s in scene.plan.streets:
         for lane, heading in ((-0.25 * s.width, 0.0), (0.25 * s.width, 180.0)):
             for _ in range(rng.poisson((s.end - s.start) / _CAR_SPACING_M)):
                 a = float(rng.uniform(s.start + 4, s.end - 4))
+                if time_s:
+                    ahead = _CAR_M_S * time_s * (1.0 if heading == 0.0 else -1.0)
+                    a = s.start + 4 + (a - s.start - 4 + ahead) % (s.end - s.start - 8)
                 x, y = (a, s.at + lane) if s.along == "x" else (s.at - lane, a)
                 over_water = scene.plan.river[0] - 3 < y < scene.plan.river[1] + 3
                 places.append((x, y, 0.03 if over_water else float(scene.plan.height(y))))
