@@ -43,10 +43,20 @@ class Cluster:
 
 
 def find_clusters(
-    areas: Sequence[IndexedArea], features: Features, prior: GeoPrior | None, options: CandidateOptions
+    areas: Sequence[IndexedArea],
+    features: Features,
+    prior: GeoPrior | None,
+    options: CandidateOptions,
+    beyond: GeoPrior | None = None,
 ) -> list[Cluster]:
-    """Clusters to try, best first; empty where the prior lies outside all maps or nothing got votes."""
+    """Clusters to try, best first; empty where the prior lies outside all maps or nothing got votes.
+
+    Args:
+        beyond: images that may see what a camera within this prior sees are left out: they were tried.
+    """
     reach = [(indexed, images_in_reach(indexed.area, prior, options)) for indexed in areas]
+    if beyond is not None:
+        reach = [(a, allowed & ~images_in_reach(a.area, beyond, options)) for a, allowed in reach]
     reach = [(indexed, allowed) for indexed, allowed in reach if allowed.any()]
     images = [np.flatnonzero(allowed) for _, allowed in reach]
     points = [indexed.area.points_of_images(rows) for (indexed, _), rows in zip(reach, images, strict=True)]

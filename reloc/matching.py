@@ -38,31 +38,60 @@ class Matches:
         return len(self.feature)
 
 
-def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
-    """Best point of each feature, if the second-best place is clearly worse; each map by itself.
+class ClusterMatcher:
+    """Matches of a photo's features with a cluster of map images: the first of the features, then more.
 
-    Within one map every place has one point, so the ratio test asks whether a feature is unique there.
-    Another map of the same place has the same point again; it must not compete.
+    The neighbours of a feature are looked for once, however often more features are asked for.
     """
-    area = cluster.area
-    parts = []
-    for map_row in np.unique(area.point_map[cluster.points]):
-        points = cluster.points[area.point_map[cluster.points] == map_row]
-        parts.append(_match_points(features, area, points.astype(np.int64), options))
-    return _concatenate(parts)
+
+    def __init__(self, features: Features, cluster: Cluster, options: MatchOptions) -> None:
+        self.cluster = cluster
+        self._features, self._options = features, options
+        area = cluster.area
+        of_map = area.point_map[cluster.points]
+        self._maps = [
+            _MapNeighbours(features, area, cluster.points[of_map == row].astype(np.int64))
+            for row in np.unique(of_map)
+        ]
+
+    def matches(self, count: int) -> Matches:
+        """Best point of each of the first `count` features, if the second-best place is clearly worse.
+
+        Each map by itself: within one map every place has one point, so the ratio test asks whether a feature
+        is unique there. Another map of the same place has the same point again; it must not compete.
+        """
+        xy = self._features.xy[:count]
+        return _concatenate([m.matches(xy, self.cluster.area, self._options) for m in self._maps])
 
 
-def _match_points(
-    features: Features, area: Area, points: NDArray[np.int64], options: MatchOptions
-) -> Matches:
-    squared, row = nearest(features.descriptors, area.descriptors[points], 3)
-    distance = np.sqrt(np.maximum(squared, 0.0))
-    position = area.points[points[np.maximum(row, 0)]]
-    same_m = options.same_place * area.view_distance[points[np.maximum(row[:, 0], 0)]].mean(axis=1)
-    second_is_same = np.linalg.norm(position[:, 1] - position[:, 0], axis=1) < same_m
-    rival = np.where(second_is_same, distance[:, 2], distance[:, 1])
-    good = np.flatnonzero((row[:, 0] >= 0) & (distance[:, 0] < options.ratio * rival))
-    return _one_to_one(features.xy, good, points[row[good, 0]], distance[good, 0])
+def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
+    """Matches of all features with a cluster, see `ClusterMatcher.matches`."""
+    return ClusterMatcher(features, cluster, options).matches(len(features))
+
+
+class _MapNeighbours:
+    """The nearest points of one map, for as many features as were asked for so far."""
+
+    def __init__(self, features: Features, area: Area, points: NDArray[np.int64]) -> None:
+        self._features, self._points = features, points
+        self._descriptors = area.descriptors[points]
+        self._squared, self._row = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)
+
+    def matches(self, xy: NDArray[np.float32], area: Area, options: MatchOptions) -> Matches:
+        count, points = len(xy), self._points
+        if count > len(self._row):
+            more = self._features.descriptors[len(self._row) : count]
+            squared, row = nearest(more, self._descriptors, 3)
+            self._squared = np.concatenate([self._squared, squared])
+            self._row = np.concatenate([self._row, row])
+        row = self._row[:count]
+        distance = np.sqrt(np.maximum(self._squared[:count], 0.0))
+        position = area.points[points[np.maximum(row, 0)]]
+        same_m = options.same_place * area.view_distance[points[np.maximum(row[:, 0], 0)]].mean(axis=1)
+        second_is_same = np.linalg.norm(position[:, 1] - position[:, 0], axis=1) < same_m
+        rival = np.where(second_is_same, distance[:, 2], distance[:, 1])
+        good = np.flatnonzero((row[:, 0] >= 0) & (distance[:, 0] < options.ratio * rival))
+        return _one_to_one(xy, good, points[row[good, 0]], distance[good, 0])
 
 
 def guided_matches(

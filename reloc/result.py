@@ -42,6 +42,7 @@ class LocaliseRequest:
             key lends its calibrated intrinsics.
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
         prior: where the photo may have been taken; None: anywhere in the database.
+        beyond: a prior that was tried in vain; what it reaches is not tried again.
         map_ids: only these maps; None: all active ones.
         want_inliers: the answer carries pixels and UTM points of its inliers.
     """
@@ -50,6 +51,7 @@ class LocaliseRequest:
     camera_key: str | None = None
     exif_focal_px: float | None = None
     prior: GeoPrior | None = None
+    beyond: GeoPrior | None = None
     map_ids: tuple[str, ...] | None = None
     want_inliers: bool = False
 

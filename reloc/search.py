@@ -17,9 +17,9 @@ from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
+    ClusterMatcher,
     Matches,
     guided_matches,
-    match_cluster,
     visible_points,
 )
 from reloc.options import LocaliseOptions
@@ -75,20 +75,21 @@ def search(
         return _nothing(
             "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
         )
-    clusters = find_clusters(areas, features, request.prior, options.candidates)
+    clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
     watch.split("candidates")
     if not clusters:
         return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
+    tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
     candidates: list[Candidate] = []
     most = 0
-    while clusters:
-        cluster, *clusters = clusters
-        found, count = _try_cluster(features, cluster, request, options, watch)
+    while tries:
+        matcher, *tries = tries
+        found, count = _try_cluster(features, matcher, request, options, watch)
         most = max(most, count)
         candidates.extend(found)
-        if candidates and _settled(candidates, cluster, clusters, options):
+        if candidates and _settled(candidates, matcher.cluster, [t.cluster for t in tries], options):
             break
-        clusters = most_matched(features, clusters, options)
+        tries = most_matched(tries, options)
         watch.split("matching")
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
     if not candidates and most < options.pose.min_matches:
@@ -96,20 +97,19 @@ def search(
     return Search(candidates=candidates, matches=most, reason=None, detail="")
 
 
-def most_matched(features: Features, clusters: list[Cluster], options: LocaliseOptions) -> list[Cluster]:
+def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[ClusterMatcher]:
     """Of more clusters than may still be tried, those that match best, best first."""
     take = options.candidates.max_clusters - 1
-    if len(clusters) <= take:
-        return clusters
-    few = features.take(np.arange(min(options.candidates.shortlist_features, len(features))))
-    matches = [len(match_cluster(few, cluster, options.matching)) for cluster in clusters]
+    if len(tries) <= take:
+        return tries
+    matches = [len(matcher.matches(options.candidates.shortlist_features)) for matcher in tries]
     order = np.argsort(-np.array(matches), kind="stable")
-    return [clusters[i] for i in order[:take]]
+    return [tries[i] for i in order[:take]]
 
 
 def _try_cluster(
     features: Features,
-    cluster: Cluster,
+    matcher: ClusterMatcher,
     request: LocaliseRequest,
     options: LocaliseOptions,
     watch: Stopwatch,
@@ -121,9 +121,9 @@ def _try_cluster(
     """
     first = options.matching.first_features
     for count in (first, len(features)) if first < len(features) else (len(features),):
-        matches = match_cluster(features.take(np.arange(count)), cluster, options.matching)
+        matches = matcher.matches(count)
         watch.split("matching")
-        found = _poses(features, cluster, matches, request, options, watch)
+        found = _poses(features, matcher.cluster, matches, request, options, watch)
         if any(c.evidence.log_nfa > options.acceptance.settled_log_nfa for c in found):
             break
     return found, len(matches)

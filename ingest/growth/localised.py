@@ -17,7 +17,7 @@ from featuredb.index.codebook import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.acceptance import AcceptanceOptions, agreement
-from reloc.candidates import IndexedArea, images_in_reach
+from reloc.candidates import IndexedArea
 from reloc.localise import Localised, localise_features
 from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
 from reloc.options import LocaliseOptions
@@ -132,12 +132,8 @@ def localise_photo(
     )
     outcome = localise_features(few, request, usable, settings)
     by_prior = photo.gps is not None and outcome.best is not None
-    if (
-        outcome.best is None
-        and options.retry_without_geotag
-        and _geotag_matters(photo, outcome, usable, settings)
-    ):
-        again = localise_features(few, replace(request, prior=None), usable, settings)
+    if outcome.best is None and photo.gps is not None and options.retry_without_geotag:
+        again = _elsewhere(few, request, outcome, usable, settings)
         outcome = again if again.best is not None else outcome
     if outcome.best is None:
         return f"{outcome.result.reason}: {outcome.result.detail}"
@@ -152,19 +148,22 @@ def localise_photo(
     return found
 
 
-def _geotag_matters(
-    photo: Photo, outcome: Localised, areas: Sequence[IndexedArea], options: LocaliseOptions
-) -> bool:
-    """Whether a photo that was not found may be found without its geotag.
+def _elsewhere(
+    features: Features,
+    request: LocaliseRequest,
+    first: Localised,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions,
+) -> Localised:
+    """A photo that was not found within its geotag's reach, looked for beyond it.
 
-    Where all images were in reach of it, the search would be the same; only a pose that was found and
-    contradicted the geotag may stand without it.
+    Where something was found there that cannot be believed (a pose that contradicts the geotag, two poses),
+    all places compete once more; and what was found in vain near the geotag stays a rival.
     """
-    if photo.gps is None:
-        return False
-    if outcome.result.reason == "CONTRADICTS_PRIOR":
-        return True
-    return not all(images_in_reach(a.area, photo.gps, options.candidates).all() for a in areas)
+    tried = None if first.result.reason in ("CONTRADICTS_PRIOR", "AMBIGUOUS") else request.prior
+    found = localise_features(features, replace(request, prior=None, beyond=tried), areas, options)
+    rival = options.acceptance.rival_share * found.result.inliers
+    return first if tried is not None and first.result.inliers >= rival else found
 
 
 def share_shown(photo: LocalisedPhoto, area: Area) -> float:

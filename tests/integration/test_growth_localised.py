@@ -138,27 +138,30 @@ def test_a_photo_half_covered_is_refused_as_a_query_and_heard_by_growth(area: In
     assert refused.startswith("AMBIGUOUS"), refused
 
 
-def test_a_geotag_that_leaves_everything_in_reach_is_not_tried_without(
-    area: IndexedArea, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Strange features find nothing; without the geotag the search is another one only if it led past."""
-    asked: list[GeoPrior | None] = []
+def test_what_a_geotag_reaches_is_searched_once(area: IndexedArea, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strange features find nothing near their geotag, and are looked for beyond its reach only."""
+    asked: list[tuple[LocaliseRequest, Localised]] = []
     honest = localised_module.localise_features
 
-    def counted(features: Features, request: LocaliseRequest, *rest: Any) -> Localised:
-        asked.append(request.prior)
-        return honest(features, request, *rest)
+    def told(features: Features, request: LocaliseRequest, *rest: Any) -> Localised:
+        asked.append((request, honest(features, request, *rest)))
+        return asked[-1][1]
 
-    monkeypatch.setattr(localised_module, "localise_features", counted)
+    monkeypatch.setattr(localised_module, "localise_features", told)
     pose = walk(1)[0]
     strange = random_descriptors(np.random.default_rng(8), len(POINTS))
-    for offset, tries in (((2.0, 1.0), 1), ((5000.0, 0.0), 2)):
+    for offset, first, second in (
+        ((2.0, 1.0), "TOO_FEW", "NO_COVERAGE"),
+        ((5000.0, 0.0), "NO_COVERAGE", "TOO_FEW"),
+    ):
         gps = prior(pose, offset)
         new = take_photos(np.random.default_rng(5), POINTS, strange, [pose], camera_key=KEY, gps=[gps])
         asked.clear()
         found = localise_photo(new.photos[0], 0, new.features_of(0).features, [area], LocaliseEachOptions())
         assert isinstance(found, str), found
-        assert asked == [gps, None][:tries]
+        assert [(r.prior, r.beyond) for r, _ in asked] == [(gps, None), (None, gps)]
+        for (_, outcome), reason in zip(asked, (first, second), strict=True):
+            assert str(outcome.result.reason).startswith(reason)
 
 
 def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:

@@ -8,6 +8,7 @@ import pytest
 from featuredb.features.features import Features
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from reloc.candidates import IndexedArea, find_clusters, images_in_reach
+from reloc.matching import ClusterMatcher
 from reloc.options import CandidateOptions, LocaliseOptions
 from reloc.search import most_matched
 from tests.support.scenes import (
@@ -98,6 +99,11 @@ def test_a_prior_keeps_only_the_images_near_it() -> None:
     assert (area.area.image_map[cluster.images] == 1).all()
     assert (area.area.point_map[cluster.points] == 1).all()
     assert len(cluster.images) == 8
+    # Beyond a prior that was tried in vain is all the rest.
+    (other,) = find_clusters([area], photo_of(0), None, CandidateOptions(), prior_at(area, 1200.0, 10.0))
+    assert (area.area.image_map[other.images] == 0).all()
+    wide = replace(prior_at(area, 600.0, 10.0), sigma_horizontal_m=900.0)
+    assert find_clusters([area], photo_of(0), None, CandidateOptions(), wide) == []
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -174,7 +180,8 @@ def test_of_many_places_those_that_match_best_are_tried() -> None:
     options = LocaliseOptions(candidates=replace(VOTING, shortlist=6, max_clusters=3, shortlist_features=150))
     clusters = find_clusters([area], photo_of(4), None, options.candidates)
     last = sorted(clusters, key=lambda c: c.score)
-    chosen = most_matched(photo_of(4), last, options)
+    tries = [ClusterMatcher(photo_of(4), cluster, options.matching) for cluster in last]
+    chosen = most_matched(tries, options)
     assert len(chosen) == 2
-    assert (area.area.image_map[chosen[0].images] == 4).all()
-    assert most_matched(photo_of(4), last[:2], options) == last[:2]
+    assert (area.area.image_map[chosen[0].cluster.images] == 4).all()
+    assert most_matched(tries[:2], options) == tries[:2]

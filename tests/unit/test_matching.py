@@ -5,10 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import reloc.matching as matching_module
 from featuredb.features.features import Features
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.candidates import Cluster, IndexedArea
-from reloc.matching import EXPECTED_DEG, POSSIBLE_DEG, guided_matches, match_cluster, visible_points
+from reloc.matching import (
+    EXPECTED_DEG,
+    POSSIBLE_DEG,
+    ClusterMatcher,
+    guided_matches,
+    match_cluster,
+    visible_points,
+)
 from reloc.options import MatchOptions
 from tests.support.scenes import (
     CAMERA,
@@ -106,6 +114,30 @@ def test_one_to_one_in_features_points_and_places() -> None:
     matches = match_cluster(many, whole(one_map()), OPTIONS)
     assert len(np.unique(matches.point)) == len(matches) == len(features)
     assert len(np.unique(many.xy[matches.feature].round(1), axis=0)) == len(matches)
+
+
+def test_more_features_are_matched_as_if_they_had_come_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two maps of one place; the neighbours of a feature are looked for once in each."""
+    first, second = (scene_map(points=POINTS, descriptors=DESCRIPTORS, poses=ring(6), map_id=m) for m in "ab")
+    features, _ = photo()
+    cluster = whole(indexed(first, second))
+    asked: list[int] = []
+    honest = matching_module.nearest
+
+    def counted(query: np.ndarray, base: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(len(query))
+        return honest(query, base, k)
+
+    monkeypatch.setattr(matching_module, "nearest", counted)
+    matcher = ClusterMatcher(features, cluster, OPTIONS)
+    for count in (20, 90, 50, len(features), len(features) + 10):
+        at_once = match_cluster(features.take(np.arange(min(count, len(features)))), cluster, OPTIONS)
+        asked.clear()
+        matches = matcher.matches(count)
+        for name in ("feature", "point", "distance"):
+            np.testing.assert_array_equal(getattr(matches, name), getattr(at_once, name))
+        expected = {20: [20, 20], 90: [70, 70], len(features): [len(features) - 90] * 2}.get(count, [])
+        assert asked == expected
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
