@@ -20,6 +20,7 @@ from featuredb.store.candidates import mark_used
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
+from ingest.growth.apart import AT_SEVERAL_PLACES, taken_apart
 from ingest.growth.budget import drift_gate, rows_within, with_drift
 from ingest.growth.grow_photos import GrowPhotosOptions, grow_photos
 from ingest.growth.grown_map import grow_component
@@ -50,11 +51,16 @@ class GrowthOptions:
         drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
             a survey's points are usually wanted for. Photos beyond it wait for an anchor.
         max_rounds: a bound on one run; each round needs a promotion.
+        joint_links: a reconstruction whose photos are at several places is taken apart where its photos share
+            less than the first of these of their points, its parts at the second, and so on. 194 photos
+            of a simulated town that look-alikes had joined from five places fell apart at 0.10 into parts
+            of one place each, but for ten photos; at 0.25 (`SettleOptions.min_link`) right ones do, too.
         localise, grow, promotion, replacing: of the steps.
     """
 
     drift_budget_m: float = 0.5
     max_rounds: int = 10
+    joint_links: tuple[float, ...] = (0.10, 0.15, 0.25)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     grow: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
     promotion: PromotionOptions = field(default_factory=PromotionOptions)
@@ -228,8 +234,16 @@ def _try_model(
     areas: Sequence[IndexedArea],
     run: _Run,
     options: GrowthOptions,
+    links: Sequence[float] | None = None,
 ) -> None:
-    """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not."""
+    """Place one reconstruction; where it reaches beyond the drift budget, the part of it that does not.
+
+    Where its photos are at several places, its parts: look-alikes join what does not belong together.
+
+    Args:
+        links: at which it may be taken apart, weakest first.
+    """
+    links = options.joint_links if links is None else links
     part: Model | None = model
     for _ in range(3):  # the part that is left may lie otherwise, and be cut again
         assert part is not None
@@ -238,7 +252,20 @@ def _try_model(
             part, new.photos, new.features_of, localised, areas, _identity_of(new)(rows), options.grow.grow
         )
         if isinstance(outcome, Refused):
-            _note_refusal(outcome, new, run)
+            pieces = taken_apart(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
+            if pieces is None:
+                _note_refusal(outcome, new, run)
+                return
+            level, parts = pieces
+            _LOG.info(
+                "%d photos are at several places: %s; apart at links of %g", len(rows), outcome.message, level
+            )
+            for piece in parts:
+                if any(int(r) in localised for r in piece.rows):
+                    rest = [link for link in links if link > level]
+                    _try_model(database, piece, new, localised, areas, run, options, rest)
+                else:
+                    _note_refusal(replace(outcome, rows=tuple(int(r) for r in piece.rows)), new, run)
             return
         within = _take(database, outcome, new, run, options)
         if within is None:

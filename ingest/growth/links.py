@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import Model
@@ -41,6 +42,14 @@ def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> 
             firm[other] = reach[other]
             heapq.heappush(queue, (-float(reach[other]), other))
     return firm
+
+
+def firm_parts(model: Model, least_share: float) -> list[list[int]]:
+    """Rows of the photos that hang together by links of at least `least_share`, largest part first."""
+    links = sparse.csr_array((_links(model) >= least_share).astype(np.int8))
+    count, label = connected_components(links, directed=False)
+    parts = [model.rows[label == part].tolist() for part in range(count)]
+    return sorted(parts, key=lambda rows: (-len(rows), rows))
 
 
 def _links(model: Model) -> FloatArray:

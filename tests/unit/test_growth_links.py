@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from ingest.growth.links import firmness
+from ingest.colmap_bridge import Model
+from ingest.growth.apart import taken_apart
+from ingest.growth.links import firm_parts, firmness
 from tests.support.posed_models import model_of
 
 
@@ -25,3 +27,37 @@ def test_photos_without_a_chain_hang_on_nothing() -> None:
     model = model_of(range(100), range(200, 300))
     assert firmness(model, [0])[1] == 0.0
     assert (firmness(model, []) == 0.0).all()
+
+
+def two_places() -> Model:
+    """Photos 0 to 2 share half of their points, so do 3 to 6; 12 of a hundred tie 2 to 3."""
+    return model_of(
+        *(range(50 * k, 50 * k + 100) for k in range(2)),
+        [*range(100, 188), *range(1000, 1012)],
+        [*range(1000, 1012), *range(1012, 1100)],
+        *(range(1050 + 50 * k, 1150 + 50 * k) for k in range(3)),
+    )
+
+
+def test_parts_are_tied_by_less_than_their_photos_are() -> None:
+    model = two_places()
+    assert firm_parts(model, 0.10) == [[0, 1, 2, 3, 4, 5, 6]]
+    assert firm_parts(model, 0.15) == [[3, 4, 5, 6], [0, 1, 2]]
+    assert firm_parts(model, 0.60) == [[k] for k in range(7)]
+
+
+def test_a_reconstruction_of_two_places_is_taken_apart_at_its_weakest_joint() -> None:
+    model = two_places()
+    found = taken_apart(model, (0.10, 0.15, 0.25))
+    assert found is not None
+    level, parts = found
+    assert level == 0.15
+    assert [part.rows.tolist() for part in parts] == [[3, 4, 5, 6], [0, 1, 2]]
+    # Points that only the joint had two views of are gone.
+    assert len(parts[1].xyz) == 100
+    # One place is left as it is, and so are links that nobody names.
+    assert taken_apart(parts[0], (0.10, 0.15, 0.25)) is None
+    assert taken_apart(model, ()) is None
+    # Photos that hang on nothing are in no part.
+    level, parts = taken_apart(model, (0.60,)) or (0.0, [model])
+    assert (level, parts) == (0.60, [])
