@@ -1,0 +1,102 @@
+"""A reconstruction that look-alikes have joined from two places becomes two maps."""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.geometry.sim3 import Sim3
+from featuredb.store import Database
+from ingest.colmap_bridge import Model
+from ingest.growth.grow import GrowthOptions, GrowthPhotos, grow
+from ingest.growth.growth_report import GrowthReport
+from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, walk
+from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
+from tests.support.scenes import looking_at
+
+_JOINT = 25  # points of one facade that the joint rests on; photos see several hundred
+_APART_M = 60.0  # that the reconstruction has the two groups from where they are to each other
+
+
+def _north() -> list:
+    """Cameras on the other side, which see other faces of the box from a little further off."""
+    return [
+        looking_at(np.array([-12.0 + 6.0 * k, 50.0, 32.0]), np.array([6.0 * k - 8.0, 0.0, 3.0]))
+        for k in range(5)
+    ]
+
+
+def _joined(first: Model, second: Model) -> Model:
+    """Both as one, tied by points that the last photo of the first and the first of the second see."""
+    count = len(first.rows)
+    tied = first.point_of[first.photo_of == count - 1][:_JOINT]
+    spare = np.flatnonzero(second.photo_of == 0)[:_JOINT]  # keypoints that see the joint's points instead
+    left = np.setdiff1d(np.arange(len(second.point_of)), spare)
+    point_of = np.concatenate([first.point_of, second.point_of[left] + len(first.xyz), tied])
+    photo_of = np.concatenate([first.photo_of, second.photo_of[left] + count, np.full(_JOINT, count)])
+    keypoint_of = np.concatenate([first.keypoint_of, second.keypoint_of[left], second.keypoint_of[spare]])
+    order = np.lexsort((photo_of, point_of))
+    return Model(
+        cameras=first.cameras,
+        rows=np.arange(count + len(second.rows)),
+        camera_of=np.zeros(count + len(second.rows), dtype=np.int64),
+        cam_from_sfm=(*first.cam_from_sfm, *second.cam_from_sfm),
+        xyz=np.concatenate([first.xyz, second.xyz]),
+        point_of=point_of[order],
+        photo_of=photo_of[order],
+        keypoint_of=keypoint_of[order],
+    )
+
+
+@pytest.fixture(scope="module")
+def groups() -> tuple[NewPhotos, NewPhotos]:
+    shift = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([_APART_M, 0.0, 0.0]))
+    rng = np.random.default_rng(11)
+    south = take_photos(rng, POINTS, DESCRIPTORS, walk(5), camera_key=KEY)
+    north = take_photos(
+        rng, POINTS, DESCRIPTORS, _north(), camera_key=KEY, sfm_from_local=SFM_FROM_LOCAL @ shift
+    )
+    return south, north
+
+
+def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOptions) -> GrowthReport:
+    south, north = groups
+    photos = [
+        *(replace(p, owner="anna") for p in south.photos),
+        *(
+            replace(p, owner="ben", name=f"north-{p.name}", sha256=f"{k + 9000:064x}")
+            for k, p in enumerate(north.photos)
+        ),
+    ]
+    features = [*south.features, *north.features]
+    database = Database.create(folder / "db")
+    database.commit_map(existing())
+    model = _joined(south.model, north.model)
+    new = GrowthPhotos(photos=photos, features_of=features.__getitem__, models=lambda: [model])
+    return grow(database, new, folder / "work", options)
+
+
+@pytest.mark.parametrize("links", [GrowthOptions().joint_links, ()], ids=["apart", "whole"])
+def test_both_places_become_maps(
+    groups: tuple[NewPhotos, NewPhotos],
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    links: tuple[float, ...],
+) -> None:
+    """As a whole it is refused; then the photos that are localised by themselves form a group."""
+    with caplog.at_level(logging.INFO, "ingest.growth"):
+        report = _grown(groups, tmp_path, replace(GrowthOptions(), joint_links=links))
+    names = [set(m.photos) for m in report.maps if m.map_id]
+    apart = [r.message for r in caplog.records if "at several places" in r.message]
+    if not links:
+        assert not apart
+        assert [len(photos) for photos in names] == [10]
+        return
+    assert len(apart) == 1
+    assert apart[0].startswith("10 photos are at several places: ")
+    assert apart[0].endswith("apart at links of 0.1")
+    north = {f"north-new-{k}.jpg" for k in range(5)}
+    south = {f"new-{k}.jpg" for k in range(5)}
+    assert sorted(names, key=min) == sorted((south, north), key=min)
