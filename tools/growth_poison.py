@@ -64,6 +64,7 @@ from tools.growth_common import (
 
 _OFF_M, _OFF_SHARE = 1.0, 0.02
 _MOVE_M = 3.0
+_ALL = "all together"
 _CANARY_M, _CANARY_DEG = 0.5, 1.0
 
 
@@ -105,8 +106,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     clean = max(off_shares(base, album, world).values(), default=0.0)
     say(f"honest maps: at most {clean:.2%} of the points {_OFF_M} m off the true surface")
     outcomes = []
-    for poison in [*(args.poison or POISONS), *([] if args.poison else ["all together"])]:
-        kinds = POISONS if poison == "all together" else (poison,)
+    for poison in args.poison or (*POISONS, _ALL):
+        kinds = POISONS if poison == _ALL else (poison,)
         outcomes.append(try_poison(args.out, base, album, world, options, poison, kinds))
         say(str(outcomes[-1]))
     fabricated = force_and_retire(
@@ -330,7 +331,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--size", choices=("short", "full"), default="full")
     parser.add_argument("--seed", type=int, default=4)
     parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
-    parser.add_argument("--poison", action="append", choices=POISONS, help="only these kinds")
+    parser.add_argument("--poison", action="append", choices=(*POISONS, _ALL), help="only these kinds")
     parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
     parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
     parser.add_argument("--workers", type=int, default=2)
