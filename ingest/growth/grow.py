@@ -7,7 +7,7 @@ Every step is a commit of its own and can be repeated: a run that was killed is 
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,6 +34,7 @@ from ingest.growth.submodel import keep_photos
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.growth.witnesses import NewPhotos
 from ingest.map_builder import MapIdentity
+from ingest.pairs import Pair
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
@@ -89,12 +90,14 @@ class GrowthPhotos:
         features_of: of a row.
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
+        overlaps: pairs of rows whose matches were verified; None: not known.
     """
 
     photos: Sequence[Photo]
     features_of: FeaturesOf
     models: Callable[[], Iterable[Model]]
     candidate_ids: Mapping[int, str] = field(default_factory=dict)
+    overlaps: Collection[Pair] | None = None
 
 
 def no_photos() -> GrowthPhotos:
@@ -329,6 +332,7 @@ def _promote(
         features_of=new.features_of,
         localised=localised,
         heard=run.heard,
+        overlaps=new.overlaps,
     )
     outcomes = promote_confirmed(
         database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m, work=work

@@ -1,6 +1,6 @@
 """Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +14,7 @@ from ingest.growth.confirmation import ConfirmationOptions, Source, Witness, ind
 from ingest.growth.localised import LocaliseEachOptions, in_frame, localise_each
 from ingest.growth.overlaps import localise_image
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
+from ingest.pairs import Pair
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
 
@@ -47,6 +48,8 @@ class NewPhotos:
         localised: those that the active maps localise, by row.
         heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
             map is examined again whenever another one changes, and its own photos are the same.
+        overlaps: pairs of `photos` that show the same, as their matches say; None: not known. Of a map that
+            is made of `photos`, those are asked that overlap with one of its own.
     """
 
     photos: Sequence[Photo]
@@ -54,6 +57,18 @@ class NewPhotos:
     features_of: FeaturesOf
     localised: dict[int, LocalisedPhoto]
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
+    overlaps: Collection[Pair] | None = None
+
+    def that_may_see(self, feature_map: FeatureMap) -> list[int]:
+        """Rows of those that may be asked about a map."""
+        if self.overlaps is None:
+            return list(self.rows)
+        names = {image.sha256 for image in feature_map.images}
+        own = {row for row, photo in enumerate(self.photos) if photo.sha256 in names}
+        if len(own) < len(names):  # whose matches with these photos nobody has looked at
+            return list(self.rows)
+        beside = {j for i, j in self.overlaps if i in own} | {i for i, j in self.overlaps if j in own}
+        return [row for row in self.rows if row in beside]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +136,7 @@ def _hear_new(
     witnesses: list[Witness],
     against: list[str],
 ) -> None:
-    sources = {row: source_of_photo(new.photos[row]) for row in new.rows}
+    sources = {row: source_of_photo(new.photos[row]) for row in new.that_may_see(feature_map)}
     asked = [
         row
         for row, source in sources.items()

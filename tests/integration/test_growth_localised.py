@@ -1,6 +1,6 @@
 """New photos, each localised by the existing maps by itself: poses, threads, geotags, lenses, witnesses."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 import ingest.growth.localised as localised_module
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
-from featuredb.maps.feature_map import GeoPrior
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
 from ingest.growth.confirmation import ConfirmationOptions
 from ingest.growth.contradictions import pose_by_focal
 from ingest.growth.localised import (
@@ -90,6 +90,36 @@ def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
     assert not hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w1").witnesses
     # Written anew, the map may show something else.
     assert hear_witnesses(here, [], asked, ConfirmationOptions(), write_id="w2").witnesses
+
+
+def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> None:
+    """Where the map's own photos were matched with the new ones, what matched nothing need not be asked."""
+    photos = [replace(photo, owner="somebody") for photo in new.photos]
+    made_of = [replace(image, owner="keeper", sha256=photos[0].sha256) for image in existing().images[:1]]
+    here = replace(existing(), images=(*made_of, *existing().images[1:]))
+    asked = WitnessPhotos(
+        photos=photos,
+        rows=range(1, len(photos)),
+        features_of=new.features_of,
+        localised={},
+        overlaps={(0, 2), (0, 3), (1, 4)},
+    )
+    # Other images of the map are not among the photos: nobody knows what overlaps with them.
+    assert asked.that_may_see(here) == list(asked.rows)
+    of_photos = replace(here, images=tuple(made_of), observations=_of_image(here, made_of[0].image_id))
+    assert asked.that_may_see(of_photos) == [2, 3]
+    assert replace(asked, overlaps=None).that_may_see(of_photos) == list(asked.rows)
+    heard = hear_witnesses(of_photos, [], asked, ConfirmationOptions(), write_id="w1")
+    assert {name for name, _ in asked.heard} == {"w1"}
+    assert {row for _, row in asked.heard} == {2, 3}
+    assert {w.name for w in heard.witnesses} <= {photos[2].name, photos[3].name}
+
+
+def _of_image(feature_map: FeatureMap, image_id: int) -> MapObservations:
+    """What one image of a map sees."""
+    seen = feature_map.observations
+    rows = seen.image_id == image_id
+    return MapObservations(**{f.name: getattr(seen, f.name)[rows] for f in fields(MapObservations)})
 
 
 def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, LocalisedPhoto]) -> None:
