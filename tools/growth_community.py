@@ -6,7 +6,8 @@ The world is that of `featuredb.simworld.community`: geotags with 30 m of error 
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once.
 
-Prints what became of each kind of photo, by kind, owner and geotag; writes community.json and plan.png.
+Prints what became of each kind of photo, by kind, owner and geotag, and by how much of what it shows the
+survey has mapped; writes community.json and plan.png.
 Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
 active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
 more than 2 m.
@@ -17,12 +18,16 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.community import CommunityOptions, write_community
+from featuredb.simworld.photograph import render_depth
+from featuredb.store import Database
 from ingest.growing import grow_candidates
 from tools.growth_common import (
     Album,
@@ -46,6 +51,8 @@ from tools.growth_common import (
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
 _SHARE, _MEDIAN_M = 0.70, 0.30
+_RAYS, _FAR_M, _NEAR_M = 200, 150.0, 4.0  # what a photo shows: across the picture, how far, how near a point
+_SHARES = (0.0, 0.1, 0.3, 0.6, 1.01)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,6 +80,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)
     sys.stdout.write(breakdown(album, found))
+    shares = surveyed_shares(database, album, options)
+    sys.stdout.write(surveyed_table(shares, {r.fact.name for r in found if r.status == "active"}))
     verdicts = [*judge(album, found), none_failed(failures(report))]
     for status in ("active", "quarantined"):
         some = [r for r in found if r.status == status]
@@ -112,6 +121,35 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
         ),
         Verdict(name="wrong by more than 2 m", text=f"{len(wrong)}, none wanted", holds=not wrong),
     ]
+
+
+def surveyed_shares(database: Database, album: Album, options: CommunityOptions) -> dict[str, float]:
+    """For each photo of the town, the share of what it truly shows that the survey has points of.
+
+    Up to `_FAR_M`, on rays over the picture; a place counts if a point of the survey is within `_NEAR_M`.
+    """
+    survey = next(m for m in database.snapshot().maps() if m.method == "gps")
+    tree = cKDTree(database.snapshot().load_map(survey.map_id).points_local(album.truth.frame))
+    scene, shares = options.scene("home/0/000"), {}
+    for fact in album.of(*_OWN):
+        true = album.truth.images[fact.name]
+        camera = true.camera.scaled_to(_RAYS, round(_RAYS * true.camera.height / true.camera.width))
+        depth = render_depth(scene, camera, true.cam_from_local).depth
+        v, u = (5 * rows for rows in np.nonzero(depth[::5, ::5] < _FAR_M))
+        xy = camera.unproject(np.stack([u, v], axis=1) + 0.5)
+        seen = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth[v, u, None]
+        near, _ = tree.query(true.cam_from_local.inverse().act(seen), distance_upper_bound=_NEAR_M)
+        shares[fact.name] = float(np.isfinite(near).sum() / depth[::5, ::5].size)
+    return shares
+
+
+def surveyed_table(shares: dict[str, float], active: set[str]) -> str:
+    """How many photos show how much of the survey, and how many of them are in active maps."""
+    rows = []
+    for low, high in pairwise(_SHARES):
+        those = [name for name, share in shares.items() if low <= share < high]
+        rows.append((f"{low:.0%} to {min(high, 1.0):.0%}", len(those), sum(name in active for name in those)))
+    return table(rows, ("of the photo surveyed", "photos", "active")) + "\n"
 
 
 def breakdown(album: Album, found: Sequence[Registered]) -> str:

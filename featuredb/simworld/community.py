@@ -45,7 +45,8 @@ class CommunityOptions:
 
     Attributes:
         seed: of everything. town_size_m: width and height of the town.
-        flight: the anchored survey; it covers the part of the town that most people visit.
+        flight: the anchored survey, of most of what people visit (`tools/growth_community.py` prints how much
+            of their photos it has mapped).
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
@@ -58,7 +59,7 @@ class CommunityOptions:
     town_size_m: tuple[float, float] = (440.0, 350.0)
     flight: FlightOptions = field(
         default_factory=lambda: FlightOptions(
-            lines=7, per_line=11, oblique=12, gps_error="rtk", center_m=(-50.0, 15.0)
+            lines=9, per_line=13, height_m=100.0, oblique=14, gps_error="rtk", center_m=(-50.0, 15.0)
         )
     )
     photos: int = 300
