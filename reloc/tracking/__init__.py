@@ -1,0 +1,1 @@
+"""Poses of the frames of a video: optical flow between frames, the feature map against drift."""

@@ -1,0 +1,67 @@
+"""Settings of the tracking, one class per stage, every threshold with its reason."""
+
+from dataclasses import dataclass, field
+
+from reloc.options import LocaliseOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlowOptions:
+    """Optical flow, at `reference_side_px`; lengths grow with the frames.
+
+    Attributes:
+        window_px: side of the patches. levels: of the pyramid above the frame.
+        iterations: on each level. max_back_px: a patch that does not come back to where it was by more is
+            lost (Kalal, Mikolajczyk and Matas, Forward-Backward Error, 2010).
+    """
+
+    window_px: int = 17
+    levels: int = 2
+    iterations: int = 12
+    max_back_px: float = 0.6
+    reference_side_px: int = 1280
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FitOptions:
+    """The pose of a frame, at 1280 px.
+
+    Attributes:
+        loss_px: scale of the Cauchy loss. tolerance_px: beyond it a landmark does not agree with the pose.
+        iterations: at most.
+    """
+
+    loss_px: float = 1.0
+    tolerance_px: float = 4.0
+    iterations: int = 10
+    reference_side_px: int = 1280
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackOptions:
+    """From frames to poses.
+
+    Attributes:
+        landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
+        columns, rows: of the grid over which they are spread.
+        min_landmarks: that agree with a pose; fewer are a lost track. least_share: of those that the flow
+            followed.
+        keyframe_every: frames from one that is matched against the map to the next.
+        answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
+            the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
+        min_matches: of a keyframe with the map.
+        localise: how a lost track is found again; its extractor is that of keyframes, too.
+    """
+
+    flow: FlowOptions = field(default_factory=FlowOptions)
+    fit: FitOptions = field(default_factory=FitOptions)
+    landmarks: int = 220
+    columns: int = 16
+    rows: int = 9
+    min_landmarks: int = 20
+    least_share: float = 0.4
+    keyframe_every: int = 12
+    answer_after: int = 12
+    lost_answer_after: int = 20
+    min_matches: int = 30
+    localise: LocaliseOptions = field(default_factory=LocaliseOptions)

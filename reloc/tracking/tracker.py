@@ -1,0 +1,278 @@
+"""The pose of every frame of a video: flow between frames, keyframes against the map in the background."""
+
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import Area
+from reloc.candidates import IndexedArea
+from reloc.pose import estimate_pose
+from reloc.result import LocaliseRequest
+from reloc.tracking.flow import follow
+from reloc.tracking.keyframe import Keyframe, Unmatched, find_frame, match_keyframe
+from reloc.tracking.landmarks import Landmarks
+from reloc.tracking.options import TrackOptions
+from reloc.tracking.pose_fit import FittedPose, fit_pose
+
+TrackState = Literal["tracking", "relocalised", "lost"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedFrame:
+    """What is known of one frame.
+
+    Attributes:
+        index, time_s: of the frame.
+        state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
+        cam_from_local: pose in the area's frame, None where the track is lost.
+        covariance: (6, 6), see `FittedPose`; None with the pose.
+        inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them.
+        detail: why there is no pose.
+    """
+
+    index: int
+    time_s: float
+    state: TrackState
+    cam_from_local: Rigid3 | None = None
+    covariance: FloatArray | None = None
+    inliers: int = 0
+    pixels: FloatArray | None = None
+    points: FloatArray | None = None
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sent:
+    """A keyframe that is being matched: its number, and the frame at which the answer is waited for."""
+
+    index: int
+    due: int
+    answer: "Future[Keyframe | Unmatched]"
+
+
+class Tracker:
+    """Follows one video. Frames come in order; a context manager, since keyframes have a thread.
+
+    The same frames give the same poses: what the thread answers is taken at a frame that is known beforehand.
+    """
+
+    def __init__(
+        self,
+        areas: Sequence[IndexedArea],
+        camera: Camera | None = None,
+        options: TrackOptions | None = None,
+        request: LocaliseRequest | None = None,
+    ) -> None:
+        """
+        Args:
+            camera: intrinsics of the frames; None: those of the first frame that is localised.
+            request: what else is known of the first frame.
+        """
+        self._areas, self._options = tuple(areas), options or TrackOptions()
+        self._request = replace(request or LocaliseRequest(), camera=camera)
+        self._camera = camera
+        self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
+        self._area: Area | None = None
+        self._landmarks = Landmarks.none()
+        self._poses: deque[tuple[float, Rigid3]] = deque(maxlen=2)
+        self._frames: deque[tuple[int, NDArray[np.uint8]]] = deque(
+            maxlen=1 + max(self._options.answer_after, self._options.lost_answer_after)
+        )
+        self._sent: _Sent | None = None
+        self._next_keyframe = 0
+        self._index = -1
+        self._why = "nothing was localised yet"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    @property
+    def camera(self) -> Camera | None:
+        """Intrinsics in use; None until something was localised."""
+        return self._camera
+
+    @property
+    def area(self) -> Area | None:
+        """The area in whose frame the poses are; None until something was localised."""
+        return self._area
+
+    def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
+        """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
+        self._index += 1
+        self._frames.append((self._index, gray))
+        fitted = self._followed(gray, time_s) if len(self._landmarks) else None
+        if fitted is not None:
+            self._poses.append((time_s, fitted.cam_from_local))
+        answered = self._answer()
+        state: TrackState = "tracking"
+        if isinstance(answered, Keyframe):
+            found = self._taken(answered, gray, fitted)
+            if found is not None:
+                state = "tracking" if fitted is not None else "relocalised"
+                fitted = found
+                if state == "relocalised":
+                    self._poses.clear()
+                    self._poses.append((time_s, fitted.cam_from_local))
+                else:
+                    self._poses[-1] = (time_s, fitted.cam_from_local)
+        elif isinstance(answered, Unmatched) and fitted is None:
+            self._why = f"{answered.reason}: {answered.detail}"
+        self._send(gray, fitted)
+        if fitted is None:
+            self._landmarks = Landmarks.none()
+            self._poses.clear()
+            return TrackedFrame(index=self._index, time_s=time_s, state="lost", detail=self._why)
+        return TrackedFrame(
+            index=self._index,
+            time_s=time_s,
+            state=state,
+            cam_from_local=fitted.cam_from_local,
+            covariance=fitted.covariance,
+            inliers=len(self._landmarks),
+            pixels=self._landmarks.pixels,
+            points=self._landmarks.points,
+        )
+
+    def _followed(self, gray: NDArray[np.uint8], time_s: float) -> FittedPose | None:
+        """The landmarks in this frame, and the pose that they give; those that disagree are dropped."""
+        assert self._camera is not None
+        before, marks = self._frames[-2][1], self._landmarks
+        last = self._poses[-1][1]
+        predicted = self._predicted(time_s)
+        step = self._camera.project(predicted.act(marks.points)) - self._camera.project(
+            last.act(marks.points)
+        )
+        guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
+        pixels, good = follow(before, gray, marks.pixels, guess, self._options.flow)
+        return self._agreed(replace(marks, pixels=pixels), good, predicted)
+
+    def _agreed(
+        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3
+    ) -> FittedPose | None:
+        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
+        assert self._camera is not None
+        options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
+        if len(followed) < options.min_landmarks:
+            self._why = f"LOST: {len(followed)} of {len(marks)} landmarks are found again"
+            return None
+        fitted = fit_pose(self._camera, followed.pixels, followed.points, predicted, options.fit)
+        agree = 0 if fitted is None else int(fitted.inlier.sum())
+        if fitted is None or agree < max(options.min_landmarks, options.least_share * len(followed)):
+            self._why = f"LOST: {agree} of {len(followed)} landmarks agree with a pose"
+            return None
+        self._landmarks = followed.take(fitted.inlier)
+        return fitted
+
+    def _predicted(self, time_s: float) -> Rigid3:
+        """The last pose, moved on as it moved before."""
+        if len(self._poses) < 2:
+            return self._poses[-1][1]
+        (first_s, first), (second_s, second) = self._poses
+        share = (time_s - second_s) / max(second_s - first_s, 1e-9)
+        return Rigid3.exp(min(share, 3.0) * (second @ first.inverse()).log()) @ second
+
+    def _answer(self) -> Keyframe | Unmatched | None:
+        """What became of a keyframe that is due."""
+        if self._sent is None or self._index < self._sent.due:
+            return None
+        return self._sent.answer.result()
+
+    def _taken(
+        self, keyframe: Keyframe, gray: NDArray[np.uint8], fitted: FittedPose | None
+    ) -> FittedPose | None:
+        """Landmarks of a keyframe carried into this frame, and the pose with them.
+
+        While the track holds, the guess where they are now is the track's; else they are looked for where the
+        keyframe had them.
+        """
+        assert self._sent is not None
+        sent, self._sent = self._sent, None
+        before = next((p for i, p in self._frames if i == sent.index), None)
+        if before is None or (fitted is not None and keyframe.area is not self._area):
+            return None
+        self._area = keyframe.area
+        self._camera = self._camera or keyframe.camera
+        points = keyframe.area.points[keyframe.rows]
+        # A point may be seen by two keypoints; it is followed once.
+        _, first = np.unique(keyframe.rows, return_index=True)
+        fresh = Landmarks(
+            rows=keyframe.rows[first],
+            points=points[first],
+            pixels=keyframe.pixels[first],
+            born=np.full(len(first), sent.index, dtype=np.int64),
+        )
+        if fitted is None:
+            return self._begun(fresh, sent.index, gray)
+        pose, options = fitted.cam_from_local, self._options
+        step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
+            keyframe.cam_from_local.act(fresh.points)
+        )
+        usable = np.flatnonzero(np.isfinite(step).all(axis=1))
+        fresh = fresh.take(usable)
+        pixels, good = follow(before, gray, fresh.pixels, fresh.pixels + step[usable], options.flow)
+        everything = self._landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
+        return self._agreed(self._spread(everything, gray), None, pose)
+
+    def _begun(self, fresh: Landmarks, index: int, gray: NDArray[np.uint8]) -> FittedPose | None:
+        """Landmarks of a localised frame followed frame by frame to this one, and its pose by them.
+
+        Nothing says where they went meanwhile, so the pose is looked for anew (RANSAC).
+        """
+        assert self._camera is not None
+        marks = fresh
+        for before, after in pairwise([p for i, p in self._frames if i >= index]):
+            moved, kept = follow(before, after, marks.pixels, marks.pixels, self._options.flow)
+            marks = replace(marks, pixels=moved).take(np.flatnonzero(kept))
+            if len(marks) < self._options.min_landmarks:
+                self._why = f"LOST: {len(marks)} of {len(fresh)} landmarks of a localised frame are followed"
+                return None
+        start = estimate_pose(
+            marks.pixels, marks.points, self._camera, "request", self._options.localise.pose
+        )
+        if start is None:
+            self._why = f"LOST: no pose agrees with {len(marks)} landmarks of a localised frame"
+            return None
+        return self._agreed(self._spread(marks, gray), None, start.cam_from_local)
+
+    def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
+        options = self._options
+        return marks.spread(options.landmarks, options.columns, options.rows, gray.shape[1], gray.shape[0])
+
+    def _send(self, gray: NDArray[np.uint8], fitted: FittedPose | None) -> None:
+        """Hand this frame to the thread if it is time for a keyframe and the thread is free."""
+        options = self._options
+        if self._sent is not None and self._index >= self._sent.due:
+            self._sent = None
+        if self._sent is not None:
+            return
+        if fitted is None:
+            answer = self._pool.submit(find_frame, gray.copy(), self._request_now(), self._areas, options)
+            self._sent = _Sent(index=self._index, due=self._index + options.lost_answer_after, answer=answer)
+            return
+        if self._index < self._next_keyframe:
+            return
+        assert self._camera is not None
+        assert self._area is not None
+        answer = self._pool.submit(
+            match_keyframe, gray.copy(), self._camera, fitted.cam_from_local, self._area, options
+        )
+        self._sent = _Sent(index=self._index, due=self._index + options.answer_after, answer=answer)
+        self._next_keyframe = self._index + options.keyframe_every
+
+    def _request_now(self) -> LocaliseRequest:
+        return self._request if self._camera is None else replace(self._request, camera=self._camera)
