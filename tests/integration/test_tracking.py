@@ -1,6 +1,5 @@
 """A film over the test hills, tracked by the map of a survey; the truth is known."""
 
-
 import numpy as np
 import pytest
 
