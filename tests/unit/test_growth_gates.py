@@ -56,6 +56,23 @@ def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
     assert gates.geotags(np.zeros((0, 2)), np.zeros((0, 2, 2)), 0.5).passes
 
 
+def test_more_wrong_geotags_than_come_by_accident_are_none() -> None:
+    """Of many positions half is too much, of few it is not; a fifth never is."""
+    spread = np.tile(np.eye(2) * 900.0, (20, 1, 1))
+
+    def passes(wrong: int, count: int) -> bool:
+        offsets = np.zeros((count, 2))
+        offsets[:wrong] = (150.0, 0.0)
+        return gates.geotags(offsets, spread[:count], 0.5).passes
+
+    assert passes(2, 4)
+    assert passes(3, 6)
+    assert passes(4, 20)
+    assert not passes(10, 20)
+    assert not passes(8, 20)
+    assert "once in 100 times" in gates.geotags(np.zeros((2, 2)), spread[:2], 0.5).message
+
+
 def test_geotags_count_by_their_own_sigma() -> None:
     """Chi-square of (20, 0) is 16 at a sigma of 5 m and 25 at 4 m; the limit is 18.42."""
     offsets = np.array([[20.0, 0.0], [20.0, 0.0]])
