@@ -1,6 +1,6 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full] [--seed 1]
+    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--survey 7 11 70 12]
 
 The world is that of `featuredb.simworld.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
@@ -62,7 +62,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = CommunityOptions.short(args.seed) if args.size == "short" else CommunityOptions(seed=args.seed)
     if args.pieces is not None:
         options = replace(options, pieces=args.pieces)
-    folder = args.world or args.out / f"world-{args.size}-{args.seed}-{options.pieces}"
+    name = f"world-{args.size}-{args.seed}-{options.pieces}"
+    if args.survey is not None:
+        lines, per_line, height_m, oblique = args.survey
+        flight = replace(
+            options.flight, lines=lines, per_line=per_line, height_m=float(height_m), oblique=oblique
+        )
+        options = replace(options, flight=flight)
+        name += "-" + "-".join(map(str, args.survey))
+    folder = args.world or args.out / name
     album = made(write_community, folder, options, args.workers)
     database = anchored(
         args.out / "db", album, "survey", max_features=args.max_features, workers=args.workers
@@ -198,6 +206,14 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     parser.add_argument("--pieces", type=int, default=None, help="of the town's walls; 1: a town of twins")
+    parser.add_argument(
+        "--survey",
+        type=int,
+        nargs=4,
+        default=None,
+        metavar=("LINES", "PHOTOS", "METRES", "OBLIQUE"),
+        help="the anchored flight: lines, photos of each, height, oblique photos around",
+    )
     parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)
 
