@@ -49,7 +49,8 @@ class TrackOptions:
         keyframe_every: frames from one that is matched against the map to the next.
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
-        min_matches: of a keyframe with the map.
+        min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
+            track is lost, however well its old landmarks agree with each other.
         localise: how a lost track is found again; its extractor is that of keyframes, too.
     """
 
@@ -64,4 +65,5 @@ class TrackOptions:
     answer_after: int = 12
     lost_answer_after: int = 20
     min_matches: int = 30
+    max_unconfirmed: int = 3
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)

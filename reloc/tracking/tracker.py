@@ -90,6 +90,7 @@ class Tracker:
         )
         self._sent: _Sent | None = None
         self._next_keyframe = 0
+        self._unconfirmed = 0  # keyframes in a row of which the map knew nothing
         self._index = -1
         self._why = "nothing was localised yet"
 
@@ -130,8 +131,11 @@ class Tracker:
                     self._poses.append((time_s, fitted.cam_from_local))
                 else:
                     self._poses[-1] = (time_s, fitted.cam_from_local)
-        elif isinstance(answered, Unmatched) and fitted is None:
-            self._why = f"{answered.reason}: {answered.detail}"
+                self._unconfirmed = 0
+        elif isinstance(answered, Unmatched):
+            self._unconfirmed += 1
+            if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
+                self._why, fitted = f"{answered.reason}: {answered.detail}", None
         self._send(gray, fitted)
         if fitted is None:
             self._landmarks = Landmarks.none()

@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+import reloc.tracking.tracker as tracker_module
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
+from reloc.tracking.keyframe import Unmatched
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from tests.support.hill_photos import CAMERA, FRAME, _render
@@ -92,3 +94,16 @@ def test_a_film_of_elsewhere_stays_lost(areas: tuple[IndexedArea, ...]) -> None:
 
 def test_without_maps_there_are_no_poses(film: list[np.ndarray]) -> None:
     assert {frame.state for frame in tracked((), film[:8])} == {"lost"}
+
+
+def test_a_track_that_the_map_does_not_confirm_is_lost(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its landmarks agree with each other still; three keyframes without the map are enough."""
+    nothing = Unmatched(reason="TOO_FEW_MATCHES", detail="nothing")
+    monkeypatch.setattr(tracker_module, "match_keyframe", lambda *_: nothing)
+    track = tracked(areas, film[:20])
+    # Keyframes at frames 6, 10 and 14 are answered at 10, 14 and 18.
+    assert [frame.state for frame in track[7:18]] == ["tracking"] * 11
+    assert [frame.state for frame in track[18:]] == ["lost"] * 2
+    assert track[18].detail == "TOO_FEW_MATCHES: nothing"
