@@ -50,8 +50,9 @@ def strip_map(
     seed: int = 0,
     days: Sequence[int] = (1,),
     covariance: FloatArray | None = None,
+    cameras: int = 8,
 ) -> FeatureMap:
-    """A map of the strip around `east_m` by eight cameras; owners and days take turns.
+    """A map of the strip around `east_m` by cameras on a circle; owners and days take turns.
 
     Args:
         parents: maps that placed it, each by an edge that says it lies exactly right.
@@ -59,8 +60,10 @@ def strip_map(
     """
     near = np.flatnonzero(np.abs(POINTS[:, 0] - east_m) < reach_m)
     rng = np.random.default_rng(seed)
-    turn = np.arange(8) * (2 * np.pi / 8)
-    centers = np.column_stack([east_m + 35 * np.cos(turn), 35 * np.sin(turn), 35 + rng.uniform(-3, 3, 8)])
+    turn = np.arange(cameras) * (2 * np.pi / cameras)
+    centers = np.column_stack(
+        [east_m + 35 * np.cos(turn), 35 * np.sin(turn), 35 + rng.uniform(-3, 3, cameras)]
+    )
     poses = [looking_at(center, np.array([east_m, 0.0, 3.0])) for center in centers]
     made = scene_map(
         points=POINTS[near],

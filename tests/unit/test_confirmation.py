@@ -18,6 +18,7 @@ from ingest.growth.confirmation import (
 from tests.support.scene_strip import strip_map
 
 _OPTIONS = ConfirmationOptions()
+_NOBODY = ["ONE_SOURCE", "FEW_CONFIRMED", "MOSTLY_ONE_SOURCE", "FEW_PAIRS"]
 
 
 def _reasons(found: Confirmation) -> list[str]:
@@ -39,7 +40,7 @@ def test_two_owners_of_one_place_confirm_each_other() -> None:
 def test_one_owner_does_not_confirm_himself() -> None:
     found = confirm(_owned(["anna"], days=(1, 2)), _OPTIONS)
     assert not found.confirmed_by_others
-    assert _reasons(found) == ["ONE_SOURCE", "FEW_CONFIRMED", "MOSTLY_ONE_SOURCE"]
+    assert _reasons(found) == _NOBODY
     assert found.confirmed == ()
 
 
@@ -65,7 +66,7 @@ def test_photos_that_share_no_points_confirm_nothing() -> None:
     keep = np.flatnonzero(west == anna)
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     apart = replace(feature_map, observations=type(seen)(**parts))
-    assert _reasons(confirm(apart, _OPTIONS)) == ["ONE_SOURCE", "FEW_CONFIRMED", "MOSTLY_ONE_SOURCE"]
+    assert _reasons(confirm(apart, _OPTIONS)) == _NOBODY
 
 
 def test_the_same_picture_given_by_two_is_one_source() -> None:
@@ -104,6 +105,18 @@ def test_a_map_that_mostly_hangs_on_one_source_is_not_confirmed() -> None:
     found = confirm(replace(feature_map, images=tuple(images), observations=type(seen)(**parts)), _OPTIONS)
     assert found.confirmed == (0, 7)
     assert _reasons(found) == ["MOSTLY_ONE_SOURCE"]
+
+
+def test_one_photo_is_not_the_second_source_of_many() -> None:
+    """Eve's photo shows what all nineteen of Anna's do."""
+    one = _owned(["eve"] + 19 * ["anna"], cameras=20)
+    found = confirm(one, _OPTIONS)
+    assert len(found.confirmed) == 20
+    assert _reasons(found) == ["FEW_PAIRS"]
+    assert "1 separate pairs of independent photos, 2.0 are needed" in found.message
+    assert confirm(_owned(["eve", "eve"] + 18 * ["anna"], cameras=20), _OPTIONS).confirmed_by_others
+    assert confirm(_owned(["eve"] + 7 * ["anna"]), _OPTIONS).confirmed_by_others
+    assert confirm(one, replace(_OPTIONS, trusted_owners=("anna",))).confirmed_by_others
 
 
 def _witness(feature_map: FeatureMap, owner: str, points: int = 200) -> Witness:
