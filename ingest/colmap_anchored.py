@@ -92,15 +92,17 @@ def adjust_anchored(
     focal_px: Mapping[int, float] | None = None,
     *,
     free_centers: bool = False,
+    constant_photos: Sequence[int] = (),
 ) -> Anchored:
     """Adjust poses, free points and lenses (focal lengths and distortion) but those of `constant_cameras`.
 
-    Without fixed points the gauge is that of the first two photos' poses.
+    Without fixed points and constant photos the gauge is that of the first two photos' poses.
 
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
         focal_px: focal lengths of EXIF by camera, where there is one.
         free_centers: adjust the principal points of these lenses, too.
+        constant_photos: rows of the model's photos whose poses stay.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
@@ -116,6 +118,7 @@ def adjust_anchored(
                 constant_cameras,
                 focal_px or {},
                 free_centers,
+                constant_photos,
                 options,
             )
         observation, kept = _fitting(state, keypoints, fixed, options)
@@ -136,6 +139,7 @@ def _adjusted(
     constant_cameras: Sequence[int],
     focal_px: Mapping[int, float],
     free_centers: bool,
+    constant_photos: Sequence[int],
     options: AnchoredOptions,
 ) -> Model:
     """One round: the model with new poses, lenses and points."""
@@ -155,11 +159,13 @@ def _adjusted(
         config.add_image(k + 1)
     for camera in constant_cameras:
         config.set_constant_cam_intrinsics(camera + 1)
+    for photo in constant_photos:
+        config.set_constant_rig_from_world_pose(reconstruction.image(photo + 1).frame_id)
     for point_id in fixed_ids:
         config.add_constant_point(point_id)
     free = set(np.unique(model.camera_of).tolist()) - set(constant_cameras)
     focals = {c + 1: focal for c, focal in options.focal_prior.of(focal_px, free).items()}
-    if not fixed_ids:
+    if not fixed_ids and not constant_photos:
         fix_gauge(reconstruction, config, 1, focals)
     if focals:
         variance = _shared_variance_px2(model, observation, keypoints)

@@ -7,7 +7,8 @@
    (consecutive) or in a shuffled order. The first reconstruction of at least five photos is placed by GPS,
    or without GPS at a made-up place with a median viewing distance of 50 m. Photos of later portions are
    localised by the maps that exist, reconstructed among themselves, placed and refined by growth. What
-   cannot be placed waits, is tried with the next portion, and once more at the end.
+   cannot be placed waits, is tried with the next portion, and once more at the end. With --adjust all
+   maps are then adjusted together, as `featuredb adjust` does.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
@@ -41,6 +42,7 @@ from ingest.growth.grown_map import GrowOptions
 from ingest.growth.localised import localise_photos
 from ingest.growth.settle import SettleOptions
 from ingest.growth.values import GrownMap
+from ingest.joint.in_database import adjust_maps
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
 from ingest.placed_models import Component, make_maps
@@ -106,6 +108,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for number, rows in enumerate([*cut, []], start=1):
             state.waiting = sorted([*state.waiting, *rows])
             _take_in(state, f"portion {number}" if rows else "end")
+        if args.adjust:
+            _adjust(state)
         grown_s = time.process_time() - started
     return _judge(state, joint, args, joint_s, grown_s)
 
@@ -220,6 +224,26 @@ def _commit(state: State, feature_map: FeatureMap) -> None:
     state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
 
 
+def _adjust(state: State) -> None:
+    """All maps adjusted together, as `featuredb adjust` does; camera centres are the new ones then."""
+    ids = [m.map_id for m in state.database.snapshot().maps()]
+    if len(ids) < 2:
+        print("  adjust: nothing to do, there is one map")
+        return
+    found = adjust_maps(state.database, ids, free=ids)
+    print(f"  adjust: {found.message}; {found.adjustment.shared_points} points in several maps")
+    for report in found.adjustment.reports:
+        moved = f"moved {report.move_m:.2f} m, bent {report.shape_m:.2f} m"
+        print(f"    {report.map_id}: {moved}, {report.kept:.1%} of its observations fit")
+    assert state.frame is not None
+    snapshot = state.database.snapshot()
+    for map_id in ids:
+        feature_map = snapshot.load_map(map_id)
+        to_first = state.frame.enu_from(feature_map.frame)
+        for image in feature_map.images:
+            state.centers[image.name] = to_first.act(image.cam_from_local.center)
+
+
 def _reconstruct(
     photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
 ) -> list[Component]:
@@ -287,6 +311,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         default=5,
         help="least photos of the first map: three or four do not tell its lens from its heights",
     )
+    parser.add_argument("--adjust", action="store_true", help="adjust all maps together at the end")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
     return parser.parse_args(argv)
 

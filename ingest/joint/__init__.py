@@ -1,0 +1,1 @@
+"""Maps that overlap, adjusted together: one bundle adjustment of all their photos."""

@@ -1,0 +1,137 @@
+"""Maps of a database adjusted together, and committed in one commit."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import GROWTH
+from featuredb.store import Database, MapSummary
+from ingest.growth.canaries import CanaryOptions
+from ingest.growth.map_graph import StoredEdge, growth_of, place_of
+from ingest.growth.replacing import ask_persons_canaries
+from ingest.joint.adjust import JointAdjustment, JointOptions, adjust_together
+
+# Their places were measured by more than photos.
+_MEASURED = ("lidar", "gcp")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatabaseAdjustment:
+    """What became of the maps.
+
+    Attributes:
+        reason: None, the adjustment's, or CANARY; nothing was committed where there is one.
+        version: of the database since; -1 where nothing was committed.
+        descendants: maps that joined because they hang on those that were named.
+    """
+
+    reason: str | None
+    message: str
+    adjustment: JointAdjustment
+    version: int = -1
+    descendants: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            **self.adjustment.as_json(),
+            "reason": self.reason,
+            "message": self.message,
+            "version": self.version,
+            "descendants": list(self.descendants),
+        }
+
+
+def adjust_maps(
+    database: Database,
+    named: Sequence[str],
+    *,
+    free: Collection[str] = (),
+    dry_run: bool = False,
+    options: JointOptions | None = None,
+) -> DatabaseAdjustment:
+    """Adjust active maps together, with all active maps that hang on them.
+
+    Args:
+        named: ids or their first letters.
+        free: anchors, likewise, that may move although LiDAR or control points placed them; others are held.
+        dry_run: adjust, and commit nothing.
+
+    Raises:
+        InvalidValueError: fewer than two maps, unknown or ambiguous ids, several extractors or datums.
+        ConflictError: someone else changed one of the maps meanwhile; nothing has changed.
+        MapNotFoundError, StoreError
+    """
+    snapshot = database.snapshot()
+    active = {m.map_id: m for m in snapshot.maps() if m.status == "active"}
+    chosen = [_resolved(active, name) for name in named]
+    wanted = _with_descendants(active, chosen)
+    free_ids = {_resolved(active, name) for name in free}
+    held = {m for m in wanted if active[m].method in _MEASURED and not active[m].parents} - free_ids
+    maps = [snapshot.load_map(m) for m in wanted]
+    found = adjust_together(maps, held, options)
+    descendants = tuple(m for m in wanted if m not in chosen)
+    if found.reason is not None:
+        return DatabaseAdjustment(
+            reason=found.reason, message=found.message, adjustment=found, descendants=descendants
+        )
+    new = _with_overlaps(found.maps)
+    canaries = ask_persons_canaries(database, {m.map_id: m for m in new}, CanaryOptions())
+    if canaries.regressions:
+        return DatabaseAdjustment(
+            reason="CANARY",
+            message=f"nothing is moved: {canaries.message}",
+            adjustment=found,
+            descendants=descendants,
+        )
+    version = -1
+    if not dry_run:
+        ids = [m.map_id for m in new]
+        results = database.commit_maps(new, replaces=ids, based_on={m: active[m].write_id for m in ids})
+        version = max(result.version for result in results)
+    return DatabaseAdjustment(
+        reason=None, message=found.message, adjustment=found, version=version, descendants=descendants
+    )
+
+
+def _resolved(active: Mapping[str, MapSummary], name: str) -> str:
+    if name in active:
+        return name
+    fits = [m for m in active if m.startswith(name)]
+    if len(fits) != 1:
+        raise InvalidValueError(
+            f"expected the id of an active map, or its first letters, found {name!r}, which "
+            f"{'fits none' if not fits else 'fits ' + ', '.join(fits)}"
+        )
+    return fits[0]
+
+
+def _with_descendants(active: Mapping[str, MapSummary], chosen: Sequence[str]) -> list[str]:
+    """The maps and what hangs on them, by generation: a child left behind would hang where nothing is."""
+    wanted = set(chosen)
+    while more := {m for m, e in active.items() if m not in wanted and wanted & set(e.parents)}:
+        wanted |= more
+    return sorted(wanted, key=lambda m: (active[m].generation, -active[m].images, m))
+
+
+def _with_overlaps(maps: Sequence[FeatureMap]) -> list[FeatureMap]:
+    """The maps with what growth has measured between them as it is now: they agree."""
+    places = {m.map_id: place_of(m) for m in maps}
+    new = []
+    for feature_map in maps:
+        growth = growth_of(feature_map.placement.evidence)
+        if "edges" not in growth:
+            new.append(feature_map)
+            continue
+        edges = [StoredEdge.from_json(edge) for edge in growth["edges"]]
+        growth["edges"] = [
+            replace(e, place=places[e.map_id], other_from_map=Sim3.identity()).as_json()
+            if e.map_id in places
+            else e.as_json()
+            for e in edges
+        ]
+        evidence = {**feature_map.placement.evidence, GROWTH: growth}
+        new.append(replace(feature_map, placement=replace(feature_map.placement, evidence=evidence)))
+    return new

@@ -1,0 +1,229 @@
+"""`featuredb adjust`: bent maps of one strip straighten each other; what must not happen does not."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from featuredb.cli.main import main
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import FeatureMap, MapObservations
+from featuredb.store import Database
+from ingest.growth.map_graph import growth_of, place_of
+from ingest.joint.adjust import JointOptions, adjust_together
+from ingest.joint.in_database import adjust_maps
+from ingest.register.gps import similarity_closed_form
+from tests.support.scene_strip import POINTS, strip_map
+
+
+def bent(feature_map: FeatureMap, metres: float) -> FeatureMap:
+    """The map with its middle lifted against its ends; its pixels stay, and so does what they know."""
+    middle = float(np.median(feature_map.points_local()[:, 0]))
+
+    def lift(places: FloatArray) -> FloatArray:
+        moved = places.copy()
+        moved[:, 2] += metres * np.exp(-(((places[:, 0] - middle) / 20.0) ** 2))
+        return moved
+
+    images = []
+    for image in feature_map.images:
+        center = lift(image.cam_from_local.center[None])[0]
+        pose = image.cam_from_local
+        images.append(replace(image, cam_from_local=replace(pose, translation=-pose.rotation @ center)))
+    utm = feature_map.frame.utm_from_enu(lift(feature_map.points_local()), feature_map.epsg)
+    return replace(feature_map, images=tuple(images), points=replace(feature_map.points, utm=utm))
+
+
+def with_pixels(feature_map: FeatureMap, pixels: NDArray[np.float32]) -> FeatureMap:
+    seen = feature_map.observations
+    columns = {name: getattr(seen, name) for name in MapObservations.__slots__}
+    return replace(feature_map, observations=MapObservations(**{**columns, "xy": pixels}))
+
+
+def errors_m(feature_map: FeatureMap) -> FloatArray:
+    """Distances of the map's points from the nearest true ones."""
+    own = feature_map.points_local()
+    return np.array([np.linalg.norm(POINTS - p, axis=1).min() for p in own])
+
+
+@pytest.fixture(scope="module")
+def anchor() -> FeatureMap:
+    return bent(strip_map("anchor", 40.0), 0.6)
+
+
+@pytest.fixture(scope="module")
+def child(anchor: FeatureMap) -> FeatureMap:
+    return replace(bent(strip_map("child", 60.0, parents=[anchor], seed=1), -0.5), status="active")
+
+
+def test_bent_maps_straighten_each_other(anchor: FeatureMap, child: FeatureMap) -> None:
+    before = [float(np.median(errors_m(m))) for m in (anchor, child)]
+    assert min(before) > 0.15
+    found = adjust_together([anchor, child])
+    assert found.reason is None
+    assert [m.map_id for m in found.maps] == ["anchor", "child"]
+    assert found.shared_points > 100
+    shapes = {r.map_id: r.shape_m for r in found.reports}
+    assert min(shapes.values()) > 0.05
+    # The anchor keeps its place as a whole, which the bend had shifted; its shape is the true one.
+    new = found.maps[0].points_local()
+    true = np.array([POINTS[np.linalg.norm(POINTS - p, axis=1).argmin()] for p in new])
+    fit = similarity_closed_form(new, true)
+    assert fit is not None
+    assert np.median(np.linalg.norm(fit.act(new) - true, axis=1)) < 0.01
+    apart = np.abs(np.median(errors_m(found.maps[0])) - np.median(errors_m(found.maps[1])))
+    assert apart < 0.05
+
+
+def test_a_held_map_stays_and_the_others_come_to_it(child: FeatureMap) -> None:
+    straight = strip_map("anchor", 40.0)
+    found = adjust_together([straight, child], held=["anchor"])
+    assert found.reason is None
+    assert [m.map_id for m in found.maps] == ["child"]
+    assert found.reports[0].held
+    assert found.reports[0].move_m < 1e-9
+    assert np.median(errors_m(found.maps[0])) < 0.02
+    assert found.maps[0].placement.evidence["joint"]["with"] == ["anchor", "child"]
+
+
+def test_a_photo_of_two_maps_is_one_photo(anchor: FeatureMap) -> None:
+    """The same photos in both, with descriptors that nobody recognises: the pixels alone tell."""
+    rng = np.random.default_rng(0)
+    twin = bent(replace(strip_map("twin", 40.0), images=anchor.images), -0.5)
+    seen = twin.observations
+    strange = rng.integers(0, 255, seen.descriptors.shape, dtype=np.uint8)
+    columns = {name: getattr(seen, name) for name in MapObservations.__slots__}
+    twin = replace(twin, observations=MapObservations(**{**columns, "descriptors": strange}))
+    found = adjust_together([anchor, twin])
+    assert found.reason is None
+    poses = [[i.cam_from_local.matrix() for i in m.images] for m in found.maps]
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
+
+
+def test_maps_without_common_points_are_refused(anchor: FeatureMap) -> None:
+    found = adjust_together([anchor, strip_map("away", 180.0)])
+    assert (found.reason, found.maps) == ("UNCONNECTED", ())
+    assert "0 photos were found" in found.message
+
+
+def of_another_scene(metres: float) -> FeatureMap:
+    """A map of a scene of another shape, which fits its own pixels."""
+    other = bent(strip_map("other", 40.0, seed=3), metres)
+    seen, points = other.observations, other.points_local()
+    pixels = seen.xy.copy()
+    for image in other.images:
+        mine = seen.image_id == image.image_id
+        pixels[mine] = other.cameras[0].project(image.cam_from_local.act(points[seen.point_index[mine]]))
+    return with_pixels(other, pixels)
+
+
+@pytest.mark.parametrize(("metres", "reason"), [(0.3, "RESIDUALS"), (1.5, "OBSERVATIONS_LOST")])
+def test_maps_that_contradict_each_other_are_refused(metres: float, reason: str) -> None:
+    """No poses and points fit both; the robust loss would rather leave one's observations out."""
+    maps = [strip_map("anchor", 40.0), of_another_scene(metres)]
+    lenient = JointOptions(max_residual_growth=np.inf) if reason == "OBSERVATIONS_LOST" else None
+    found = adjust_together(maps, options=lenient)
+    assert (found.reason, found.maps) == (reason, ())
+    assert "map other" in found.message
+
+
+def test_a_photo_that_loses_its_points_refuses(anchor: FeatureMap) -> None:
+    wrong = strip_map("wrong", 40.0, seed=3)
+    seen = wrong.observations
+    first = seen.image_id == 0
+    pixels = seen.xy.copy()
+    pixels[first] = pixels[first][::-1]
+    found = adjust_together([anchor, with_pixels(wrong, pixels)])
+    assert (found.reason, found.maps) == ("PHOTO_LOST", ())
+
+
+def test_bad_requests_say_what_is_wrong(anchor: FeatureMap, child: FeatureMap) -> None:
+    with pytest.raises(InvalidValueError, match="at least two maps, found 1"):
+        adjust_together([anchor])
+    with pytest.raises(InvalidValueError, match="one height datum"):
+        adjust_together([anchor, replace(child, height_datum="egm96")])
+    with pytest.raises(InvalidValueError, match="one extractor"):
+        adjust_together([anchor, replace(child, extractor_fingerprint="other")])
+    with pytest.raises(InvalidValueError, match="all maps are held"):
+        adjust_together([anchor, child], held=["anchor", "child"])
+    with pytest.raises(InvalidValueError, match="named twice"):
+        adjust_together([anchor, anchor])
+
+
+@pytest.fixture
+def database(anchor: FeatureMap, child: FeatureMap, tmp_path: Path) -> Database:
+    database = Database.create(tmp_path / "db")
+    database.commit_maps([anchor, child])
+    return database
+
+
+def test_in_a_database_all_moves_in_one_commit(database: Database) -> None:
+    version = database.snapshot().version
+    tried = adjust_maps(database, ["anch"], dry_run=True)
+    assert (tried.reason, tried.version, database.snapshot().version) == (None, -1, version)
+    found = adjust_maps(database, ["anch"])
+    assert (found.reason, found.version, found.descendants) == (None, version + 1, ("child",))
+    snapshot = database.snapshot()
+    assert [m.status for m in snapshot.maps()] == ["active", "active"]
+    maps = {m: snapshot.load_map(m) for m in ("anchor", "child")}
+    edge = growth_of(maps["child"].placement.evidence)["edges"][0]
+    assert edge["place"] == place_of(maps["anchor"])
+    np.testing.assert_array_equal(edge["parent_from_new"], Sim3.identity().log())
+    assert maps["child"].parents == ("anchor",)
+    database.rollback(version)
+    assert place_of(database.snapshot().load_map("anchor")) != place_of(maps["anchor"])
+
+
+def test_measured_anchors_stay_unless_freed(anchor: FeatureMap, child: FeatureMap, tmp_path: Path) -> None:
+    database = Database.create(tmp_path / "db")
+    surveyed = replace(anchor, placement=replace(anchor.placement, method="lidar"))
+    database.commit_maps([surveyed, child])
+    held = adjust_maps(database, ["anchor"], dry_run=True)
+    assert [r.held for r in held.adjustment.reports] == [True, False]
+    freed = adjust_maps(database, ["anchor"], free=["anchor"], dry_run=True)
+    assert [r.held for r in freed.adjustment.reports] == [False, False]
+
+
+def test_a_known_query_that_would_be_lost_stops_it(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from ingest.growth.canaries import CanaryCheck, CanaryRun
+
+    check = CanaryCheck(name="known", before="right", after="moved", regression="2.00 m off")
+    monkeypatch.setattr(
+        "ingest.joint.in_database.ask_persons_canaries",
+        lambda *_: CanaryRun(checks=(check,), note="1 known queries"),
+    )
+    version = database.snapshot().version
+    found = adjust_maps(database, ["anchor"])
+    assert (found.reason, found.version, database.snapshot().version) == ("CANARY", -1, version)
+    assert "2.00 m off" in found.message
+
+
+def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> None:
+    def run(*args: str) -> tuple[int, str, str]:
+        code = main(["adjust", database.url, *args])
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    code, out, _ = run("anchor", "--dry-run")
+    assert code == 0
+    assert "nothing is committed" in out
+    assert "with what hangs on the named maps: child" in out
+    code, out, _ = run("anchor", "--json")
+    said: dict[str, Any] = json.loads(out)
+    assert (code, said["reason"], said["version"]) == (0, None, database.snapshot().version)
+    assert [m["map_id"] for m in said["maps"]] == ["anchor", "child"]
+    code, _, err = run("nobody")
+    assert code != 0
+    assert "'nobody', which fits none" in err
+    database.commit_maps([strip_map("away", 180.0)])
+    code, out, _ = run("anchor", "away")
+    assert code == 1
+    assert "refused, UNCONNECTED: maps away" in out
