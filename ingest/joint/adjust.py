@@ -155,6 +155,7 @@ def adjust_together(
         FixedPoints.none(),
         np.unique(joined.model.camera_of[constant]).tolist(),
         options.adjust,
+        joined.known_focal_px,
         constant_photos=constant.tolist(),
     )
     if not len(constant):

@@ -4,7 +4,7 @@ A photo may be in several maps, with other points of it in each: it is one photo
 the same keypoint of it, they have the same point.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,12 +41,15 @@ class Joined:
 
     Attributes:
         keypoints: pixels (n, 2) of each photo of the model.
+        known_focal_px: by camera, what the maps say of a focal length that EXIF has told: the median. From
+            above, focal length and height hardly differ in the pixels, and maps do not keep EXIF's own.
         maps: rows of each map.
         shared: (maps, maps) numbers of points that two maps have in common.
     """
 
     model: Model
     keypoints: tuple[FloatArray, ...]
+    known_focal_px: Mapping[int, float]
     maps: tuple[MapRows, ...]
     shared: NDArray[np.int64]
 
@@ -96,7 +99,13 @@ def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Jo
     has = np.zeros((len(model.xyz), len(maps)), dtype=np.int64)
     for a, part in enumerate(rows):
         has[part.point_of, a] = 1
-    return Joined(model=model, keypoints=keypoints, maps=rows, shared=np.asarray(has.T @ has, dtype=np.int64))
+    return Joined(
+        model=model,
+        keypoints=keypoints,
+        known_focal_px=photos.known_focal_px(),
+        maps=rows,
+        shared=np.asarray(has.T @ has, dtype=np.int64),
+    )
 
 
 class _Photos:
@@ -108,6 +117,10 @@ class _Photos:
         self.cameras: list[Camera] = []
         self._photo_row: dict[tuple[str, ...], int] = {}
         self._camera_row: dict[tuple[str, ...], int] = {}
+        self._focals_px: dict[int, list[float]] = {}
+
+    def known_focal_px(self) -> dict[int, float]:
+        return {row: float(np.median(focals)) for row, focals in self._focals_px.items()}
 
     def row(self, feature_map: FeatureMap, image: MapImage, frame: LocalFrame) -> int:
         name = ("", image.sha256) if image.sha256 else (feature_map.map_id, str(image.image_id))
@@ -125,7 +138,10 @@ class _Photos:
         if name not in self._camera_row:
             self._camera_row[name] = len(self.cameras)
             self.cameras.append(camera)
-        return self._camera_row[name]
+        row = self._camera_row[name]
+        if key:
+            self._focals_px.setdefault(row, []).append(camera.focal_px)
+        return row
 
 
 def _photo_of(feature_map: FeatureMap, photos: NDArray[np.int64]) -> NDArray[np.int64]:

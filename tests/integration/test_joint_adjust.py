@@ -18,6 +18,8 @@ from featuredb.store import Database
 from ingest.growth.map_graph import growth_of, place_of
 from ingest.joint.adjust import JointOptions, adjust_together
 from ingest.joint.in_database import adjust_maps
+from ingest.joint.joined import join_maps
+from ingest.joint.links import Links
 from ingest.register.gps import similarity_closed_form
 from tests.support.scene_strip import POINTS, strip_map
 
@@ -227,3 +229,16 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
     code, out, _ = run("anchor", "away")
     assert code == 1
     assert "refused, UNCONNECTED: maps away" in out
+
+
+def test_focal_lengths_that_exif_told_are_known_beforehand(anchor: FeatureMap, child: FeatureMap) -> None:
+    none = Links(
+        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b", "votes")},
+        heard=0,
+        elsewhere=(),
+    )
+    assert join_maps([anchor, child], none, anchor.frame).known_focal_px == {}
+    keyed = [replace(m, camera_keys=("drone",)) for m in (anchor, child)]
+    joined = join_maps(keyed, none, anchor.frame)
+    assert len(joined.model.cameras) == 1
+    assert joined.known_focal_px == {0: anchor.cameras[0].focal_px}
