@@ -19,7 +19,9 @@ def main() -> int:
     parser.add_argument("--fast", action="store_true", help="leave out slow tests and the demo")
     fast = parser.parse_args().fast
     python = sys.executable
-    tests = [python, "-m", "pytest", "-q", *(["-m", "not slow"] if fast else [])]
+    # Two at a time, a file on one worker each, since modules share what they have made.
+    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--durations", "20"]
+    tests += ["-m", "not slow"] if fast else []
     with tempfile.TemporaryDirectory() as folder:
         steps = [
             ("format", [python, "-m", "ruff", "format", "--check", "."]),
