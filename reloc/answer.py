@@ -33,7 +33,7 @@ def make_answer(
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
-    covariance = _on_earth(area, main, center, uncertainty.covariance)
+    covariance = on_earth(area, main, center, uncertainty.covariance)
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(
         frame=area.frame,
@@ -84,8 +84,12 @@ def placement_covariance(area: Area, feature_map: FeatureMap, center: FloatArray
     return np.asarray(placed, dtype=np.float64)
 
 
-def _on_earth(area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray) -> FloatArray:
-    """Measured covariance plus that of the map's placement, turned to true east-north-up at the camera."""
+def on_earth(area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray) -> FloatArray:
+    """Measured covariance (6, 6) plus that of the map's placement, in true east-north-up at the camera.
+
+    Args:
+        center: (3,) camera centre in the area's frame. measured: in the area's axes.
+    """
     placed = placement_covariance(area, main, center)
     to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
     covariance = to_true @ (measured + placed) @ to_true.T

@@ -10,7 +10,7 @@ from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
-    from reloc.wire import CameraRequest, LocaliseReply, PriorRequest
+    from reloc.wire import LocaliseReply
 
 _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
 _DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -136,8 +136,9 @@ def _serve(args: argparse.Namespace) -> int:
 
 def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
+    from reloc.query_arguments import parse_camera, parse_prior
 
-    prior, camera = _parse_prior(args.prior), _parse_camera(args.camera)
+    prior, camera = parse_prior(args.prior), parse_camera(args.camera)
     if args.contribute and not (args.owner and args.licence):
         raise InvalidValueError(
             "--contribute: expected --owner and --licence, too: whose photos they are, and under what terms"
@@ -170,12 +171,13 @@ def _localise(args: argparse.Namespace) -> int:
     from featuredb.features.decode import DecodeLimits
     from reloc.localiser import Localiser
     from reloc.overlay import map_points_in_view
+    from reloc.query_arguments import parse_camera, parse_prior
     from reloc.service.handler import StageClock, answer_query
     from reloc.wire import LocaliseWireRequest, RequestOptions
 
     request = LocaliseWireRequest(
-        prior=_parse_prior(args.prior),
-        camera=_parse_camera(args.camera),
+        prior=parse_prior(args.prior),
+        camera=parse_camera(args.camera),
         options=RequestOptions(
             inliers=args.overlay is not None,
             exif_prior=args.exif_prior,
@@ -244,41 +246,3 @@ def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:
     if len(list(images)) == 1:
         return overlay
     return overlay.with_name(f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}")
-
-
-def _parse_prior(text: str | None) -> "PriorRequest | None":
-    from pydantic import ValidationError
-
-    from reloc.wire import PriorRequest
-
-    if text is None:
-        return None
-    try:
-        lat, lon, sigma_m = (float(part) for part in text.split(","))
-        return PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
-    except (ValueError, ValidationError) as error:
-        raise InvalidValueError(
-            f"--prior: expected LAT,LON,SIGMA_M in degrees and metres such as 47.37,8.54,25, found {text!r}"
-        ) from error
-
-
-def _parse_camera(text: str | None) -> "CameraRequest | None":
-    from pydantic import ValidationError
-
-    from reloc.wire import CameraRequest
-
-    if text is None:
-        return None
-    try:
-        model, width, height, *params = text.split(",")
-        return CameraRequest(
-            model=model.strip(),
-            width=int(width),
-            height=int(height),
-            params=tuple(float(p) for p in params),
-        )
-    except (ValueError, ValidationError) as error:
-        raise InvalidValueError(
-            "--camera: expected MODEL,WIDTH,HEIGHT,PARAMS... such as "
-            f"PINHOLE,4000,3000,3200,3200,2000,1500, found {text!r}"
-        ) from error

@@ -16,7 +16,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from reloc.candidates import IndexedArea
-from reloc.pose import estimate_pose
 from reloc.result import LocaliseRequest
 from reloc.tracking.flow import follow
 from reloc.tracking.keyframe import Keyframe, Unmatched, find_frame, match_keyframe
@@ -36,7 +35,9 @@ class TrackedFrame:
         state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
         cam_from_local: pose in the area's frame, None where the track is lost.
         covariance: (6, 6), see `FittedPose`; None with the pose.
-        inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them.
+        camera: intrinsics in use; None with the pose. area: in whose frame the pose is.
+        inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them; rows: (k,) of the
+            area's points.
         detail: why there is no pose.
     """
 
@@ -45,9 +46,12 @@ class TrackedFrame:
     state: TrackState
     cam_from_local: Rigid3 | None = None
     covariance: FloatArray | None = None
+    camera: Camera | None = None
+    area: Area | None = None
     inliers: int = 0
     pixels: FloatArray | None = None
     points: FloatArray | None = None
+    rows: NDArray[np.int64] | None = None
     detail: str = ""
 
 
@@ -58,6 +62,15 @@ class _Sent:
     index: int
     due: int
     answer: "Future[Keyframe | Unmatched]"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Frame:
+    """A frame that may still be needed."""
+
+    index: int
+    time_s: float
+    gray: NDArray[np.uint8]
 
 
 class Tracker:
@@ -85,9 +98,10 @@ class Tracker:
         self._area: Area | None = None
         self._landmarks = Landmarks.none()
         self._poses: deque[tuple[float, Rigid3]] = deque(maxlen=2)
-        self._frames: deque[tuple[int, NDArray[np.uint8]]] = deque(
+        self._frames: deque[_Frame] = deque(
             maxlen=1 + max(self._options.answer_after, self._options.lost_answer_after)
         )
+        self._late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
         self._next_keyframe = 0
         self._unconfirmed = 0  # keyframes in a row of which the map knew nothing
@@ -115,8 +129,11 @@ class Tracker:
     def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
         """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
         self._index += 1
-        self._frames.append((self._index, gray))
-        fitted = self._followed(gray, time_s) if len(self._landmarks) else None
+        before = self._frames[-1] if self._frames else None
+        now = _Frame(index=self._index, time_s=time_s, gray=gray)
+        self._frames.append(now)
+        self._late = []
+        fitted = self._followed(before, now) if before is not None and len(self._landmarks) else None
         if fitted is not None:
             self._poses.append((time_s, fitted.cam_from_local))
         answered = self._answer()
@@ -126,11 +143,7 @@ class Tracker:
             if found is not None:
                 state = "tracking" if fitted is not None else "relocalised"
                 fitted = found
-                if state == "relocalised":
-                    self._poses.clear()
-                    self._poses.append((time_s, fitted.cam_from_local))
-                else:
-                    self._poses[-1] = (time_s, fitted.cam_from_local)
+                self._poses[-1] = (time_s, fitted.cam_from_local)
                 self._unconfirmed = 0
         elif isinstance(answered, Unmatched):
             self._unconfirmed += 1
@@ -141,28 +154,42 @@ class Tracker:
             self._landmarks = Landmarks.none()
             self._poses.clear()
             return TrackedFrame(index=self._index, time_s=time_s, state="lost", detail=self._why)
+        return self._known(now, state, fitted)
+
+    @property
+    def late(self) -> Sequence[TrackedFrame]:
+        """Earlier frames, said to be lost then, whose poses the last call of `track` has found.
+
+        A localised frame is answered some frames later; from it on, the frames between are tracked, too.
+        """
+        return tuple(self._late)
+
+    def _known(self, frame: "_Frame", state: TrackState, fitted: FittedPose) -> TrackedFrame:
         return TrackedFrame(
-            index=self._index,
-            time_s=time_s,
+            index=frame.index,
+            time_s=frame.time_s,
             state=state,
             cam_from_local=fitted.cam_from_local,
             covariance=fitted.covariance,
+            camera=self._camera,
+            area=self._area,
             inliers=len(self._landmarks),
             pixels=self._landmarks.pixels,
             points=self._landmarks.points,
+            rows=self._landmarks.rows,
         )
 
-    def _followed(self, gray: NDArray[np.uint8], time_s: float) -> FittedPose | None:
+    def _followed(self, before: "_Frame", now: "_Frame") -> FittedPose | None:
         """The landmarks in this frame, and the pose that they give; those that disagree are dropped."""
         assert self._camera is not None
-        before, marks = self._frames[-2][1], self._landmarks
+        marks = self._landmarks
         last = self._poses[-1][1]
-        predicted = self._predicted(time_s)
+        predicted = self._predicted(now.time_s)
         step = self._camera.project(predicted.act(marks.points)) - self._camera.project(
             last.act(marks.points)
         )
         guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
-        pixels, good = follow(before, gray, marks.pixels, guess, self._options.flow)
+        pixels, good = follow(before.gray, now.gray, marks.pixels, guess, self._options.flow)
         return self._agreed(replace(marks, pixels=pixels), good, predicted)
 
     def _agreed(
@@ -206,7 +233,7 @@ class Tracker:
         """
         assert self._sent is not None
         sent, self._sent = self._sent, None
-        before = next((p for i, p in self._frames if i == sent.index), None)
+        before = next((f for f in self._frames if f.index == sent.index), None)
         if before is None or (fitted is not None and keyframe.area is not self._area):
             return None
         self._area = keyframe.area
@@ -221,37 +248,37 @@ class Tracker:
             born=np.full(len(first), sent.index, dtype=np.int64),
         )
         if fitted is None:
-            return self._begun(fresh, sent.index, gray)
+            return self._begun(fresh, keyframe.cam_from_local, before)
         pose, options = fitted.cam_from_local, self._options
         step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
             keyframe.cam_from_local.act(fresh.points)
         )
         usable = np.flatnonzero(np.isfinite(step).all(axis=1))
         fresh = fresh.take(usable)
-        pixels, good = follow(before, gray, fresh.pixels, fresh.pixels + step[usable], options.flow)
+        pixels, good = follow(before.gray, gray, fresh.pixels, fresh.pixels + step[usable], options.flow)
         everything = self._landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
         return self._agreed(self._spread(everything, gray), None, pose)
 
-    def _begun(self, fresh: Landmarks, index: int, gray: NDArray[np.uint8]) -> FittedPose | None:
-        """Landmarks of a localised frame followed frame by frame to this one, and its pose by them.
+    def _begun(self, fresh: Landmarks, pose: Rigid3, first: "_Frame") -> FittedPose | None:
+        """The track from a localised frame to the one at hand, frame by frame.
 
-        Nothing says where they went meanwhile, so the pose is looked for anew (RANSAC).
+        Where it breaks, the frames before have their poses all the same.
         """
-        assert self._camera is not None
-        marks = fresh
-        for before, after in pairwise([p for i, p in self._frames if i >= index]):
-            moved, kept = follow(before, after, marks.pixels, marks.pixels, self._options.flow)
-            marks = replace(marks, pixels=moved).take(np.flatnonzero(kept))
-            if len(marks) < self._options.min_landmarks:
-                self._why = f"LOST: {len(marks)} of {len(fresh)} landmarks of a localised frame are followed"
+        self._landmarks = self._spread(fresh, first.gray)
+        self._poses.clear()
+        self._poses.append((first.time_s, pose))
+        fitted = self._agreed(self._landmarks, None, pose)
+        state: TrackState = "relocalised"
+        for before, after in pairwise([f for f in self._frames if f.index >= first.index]):
+            if fitted is None:
                 return None
-        start = estimate_pose(
-            marks.pixels, marks.points, self._camera, "request", self._options.localise.pose
-        )
-        if start is None:
-            self._why = f"LOST: no pose agrees with {len(marks)} landmarks of a localised frame"
-            return None
-        return self._agreed(self._spread(marks, gray), None, start.cam_from_local)
+            self._poses[-1] = (before.time_s, fitted.cam_from_local)
+            self._late.append(self._known(before, state, fitted))
+            state = "tracking"
+            fitted = self._followed(before, after)
+            if fitted is not None:
+                self._poses.append((after.time_s, fitted.cam_from_local))
+        return fitted
 
     def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
         options = self._options

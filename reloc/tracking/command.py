@@ -1,0 +1,169 @@
+"""`featuredb track DB VIDEO --out FILE`: arguments in, files and a summary out."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from featuredb.geometry.camera import Camera
+    from featuredb.maps.feature_map import GeoPrior
+    from reloc.tracking.track_video import TrackedVideo
+
+_NOTHING_FOUND = 1  # exit code: everything worked, and no frame was localised
+
+
+def register(subparsers: Any) -> None:
+    """Add `track` to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    parser = subparsers.add_parser(
+        "track",
+        help="the pose of every frame of a video",
+        description="Follow a video by the active maps. Each frame has a pose with its uncertainty, or is "
+        "said to be lost. See docs/video.md.",
+    )
+    add_database_argument(parser)
+    parser.add_argument("video", metavar="VIDEO", help="film, folder of pictures, or an address (rtsp://...)")
+    parser.add_argument(
+        "--out",
+        action="append",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="trajectory: .csv (every frame), .tum, .geojson, .kml, .json (OGC GeoPose series) or .srt; may "
+        "be repeated",
+    )
+    parser.add_argument(
+        "--overlay", type=Path, metavar="MP4", help="write the film with the track drawn over it"
+    )
+    parser.add_argument(
+        "--camera",
+        metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
+        help="intrinsics of the upright frames by COLMAP's model; default: estimated with the first pose",
+    )
+    parser.add_argument(
+        "--prior", metavar="LAT,LON,SIGMA_M", help="where the film begins, WGS84 degrees and metres"
+    )
+    parser.add_argument("--map", action="append", metavar="ID", help="track by this map; may be repeated")
+    parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
+    parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
+    parser.add_argument(
+        "--max-side", type=int, default=1280, metavar="PX", help="frames are tracked at; default 1280"
+    )
+    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    parser.set_defaults(run=run_track)
+
+
+def run_track(args: argparse.Namespace) -> int:
+    """Track and write; 0, or 1 where no frame was localised.
+
+    Raises:
+        InvalidValueError, VideoError, StoreError, ServiceError
+    """
+    from dataclasses import replace
+
+    from featuredb.cli.common import open_database
+    from reloc.localiser import Localiser
+    from reloc.result import LocaliseRequest
+    from reloc.tracking.track_video import TrackVideoOptions, track_video
+    from reloc.tracking.trajectory_files import check_format, write_trajectory
+
+    for file in args.out:
+        check_format(file)
+    localiser = Localiser.open(open_database(args))
+    maps = tuple(args.map) if args.map else None
+    found = track_video(
+        args.video,
+        localiser.areas_of(maps),
+        camera=_camera(args.camera),
+        request=LocaliseRequest(prior=_prior(args.prior)),
+        overlay=args.overlay,
+        options=TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end),
+    )
+    trajectory = replace(found.trajectory, database=args.db, version=localiser.snapshot)
+    found = replace(found, trajectory=trajectory)
+    written = []
+    known = any(point.pose is not None for point in trajectory.points)
+    for file in args.out:
+        if known or file.suffix.lower() == ".csv":
+            write_trajectory(file, trajectory)
+            written.append(str(file))
+    summary = _summary(found, [*written, *([str(args.overlay)] if args.overlay else [])])
+    sys.stdout.write(json.dumps(summary) + "\n" if args.json else _text(summary))
+    return 0 if known else _NOTHING_FOUND
+
+
+def _camera(text: str | None) -> "Camera | None":
+    from featuredb.geometry.camera import Camera
+    from reloc.query_arguments import parse_camera
+
+    asked = parse_camera(text)
+    if asked is None:
+        return None
+    return Camera(model=asked.model, width=asked.width, height=asked.height, params=asked.params)
+
+
+def _prior(text: str | None) -> "GeoPrior | None":
+    from featuredb.maps.feature_map import GeoPrior
+    from reloc.query_arguments import parse_prior
+
+    asked = parse_prior(text)
+    if asked is None:
+        return None
+    return GeoPrior(
+        latitude_deg=asked.lat,
+        longitude_deg=asked.lon,
+        height_m=None,
+        sigma_horizontal_m=asked.sigma_m,
+        sigma_vertical_m=asked.sigma_vertical_m,
+    )
+
+
+def _summary(found: "TrackedVideo", written: list[str]) -> dict[str, Any]:
+    points = found.trajectory.points
+    states = {state: sum(p.state == state for p in points) for state in ("tracking", "relocalised", "lost")}
+    seconds = found.seconds
+    lost = [p for p in points if p.state == "lost"]
+    return {
+        "video": found.trajectory.source,
+        "frames": len(points),
+        **states,
+        "stretches": [[s[0][0].time_s, s[-1][0].time_s] for s in found.trajectory.stretches()],
+        "last_reason": lost[-1].detail if lost else "",
+        "frames_per_s": round(len(points) / max(seconds.total, 1e-9), 1),
+        "seconds": {
+            name: round(getattr(seconds, name), 3)
+            for name in ("total", "decoding", "tracking", "drawing", "longest_gap")
+        },
+        "camera": None
+        if found.camera is None
+        else {
+            "model": found.camera.model,
+            "width": found.camera.width,
+            "height": found.camera.height,
+            "params": list(found.camera.params),
+        },
+        "complaints": list(found.complaints),
+        "written": written,
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    lines = [
+        f"{summary['video']}: {summary['frames']} frames, {summary['tracking']} tracked, "
+        f"{summary['relocalised']} relocalised, {summary['lost']} lost",
+    ]
+    lines += [f"  from {a:.2f} s to {b:.2f} s" for a, b in summary["stretches"]]
+    if summary["last_reason"]:
+        lines.append(f"  lost at the end or before: {summary['last_reason']}")
+    seconds = summary["seconds"]
+    lines.append(
+        f"  {summary['frames_per_s']} frames a second: {seconds['decoding']:.1f} s decoding, "
+        f"{seconds['tracking']:.1f} s tracking, {seconds['drawing']:.1f} s drawing; longest gap "
+        f"{1000 * seconds['longest_gap']:.0f} ms"
+    )
+    lines += [f"  the film: {what}" for what in summary["complaints"]]
+    lines += [f"  wrote {file}" for file in summary["written"]]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,71 @@
+"""Frames with what the track knows of them: landmarks, other points of the map, place and state in words."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from reloc.matching import visible_points
+from reloc.tracking.tracker import TrackedFrame
+from reloc.tracking.trajectory import TrajectoryPoint
+
+_LANDMARK_RGB, _OTHER_RGB = (60, 220, 60), (40, 160, 240)
+_STATE_RGB = {"tracking": (60, 220, 60), "relocalised": (250, 210, 40), "lost": (240, 40, 40)}
+_MAX_OTHER = 1500  # more dots hide the picture
+
+
+def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoint) -> NDArray[np.uint8]:
+    """A copy of the frame (h, w, 3) uint8, red first, drawn over.
+
+    Circles are landmarks where the flow has them; dots are points of the map where the pose says they are.
+    """
+    picture = np.ascontiguousarray(rgb).copy()
+    scale = max(picture.shape[:2]) / 1280
+    if frame.cam_from_local is not None and frame.area is not None and frame.camera is not None:
+        for x, y in _others(frame):
+            cv2.circle(picture, (round(x), round(y)), max(1, round(scale)), _OTHER_RGB, -1, cv2.LINE_AA)
+        for x, y in frame.pixels if frame.pixels is not None else ():
+            cv2.circle(picture, (round(x), round(y)), round(4 * scale) + 1, _LANDMARK_RGB, 1, cv2.LINE_AA)
+    words = _words(point)
+    box = picture[: round((14 + 26 * len(words)) * scale), : round(640 * scale)]
+    box //= 3
+    for row, text in enumerate(words):
+        place = (round(12 * scale), round((28 + 26 * row) * scale))
+        cv2.putText(
+            picture,
+            text,
+            place,
+            cv2.FONT_HERSHEY_SIMPLEX,
+            0.6 * scale,
+            _STATE_RGB[point.state],
+            1,
+            cv2.LINE_AA,
+        )
+    return picture
+
+
+def _others(frame: TrackedFrame) -> NDArray[np.float64]:
+    """Pixels (n, 2) of some points of the map that the pose says are in the picture."""
+    assert frame.area is not None
+    assert frame.camera is not None
+    assert frame.cam_from_local is not None
+    every = max(1, len(frame.area.points) // 20_000)
+    rows = visible_points(
+        frame.area, np.arange(0, len(frame.area.points), every), frame.camera, frame.cam_from_local
+    )
+    rows = rows[:: max(1, len(rows) // _MAX_OTHER)]
+    pixels = frame.camera.project(frame.cam_from_local.act(frame.area.points[rows]))
+    return pixels[np.isfinite(pixels).all(axis=1)]
+
+
+def _words(point: TrajectoryPoint) -> list[str]:
+    head = f"frame {point.index}  {point.time_s:.2f} s  {point.state}"
+    if point.pose is None:
+        return [head, point.detail[:80]]
+    east, north, up = point.pose.utm
+    sigma = float(np.sqrt(np.diag(point.pose.covariance)[3:].sum()))
+    heading, pitch, _ = point.pose.geopose.heading_pitch_roll_deg
+    return [
+        f"{head}  {point.inliers} landmarks",
+        f"EPSG:{point.pose.epsg}  {east:.2f} {north:.2f} {up:.2f}  sigma {sigma:.2f} m",
+        f"heading {heading:.1f}  pitch {pitch:.1f}",
+    ]

@@ -1,0 +1,190 @@
+"""A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+
+from featuredb.errors import IncompatibleExtractorError, VideoError
+from featuredb.geometry.camera import Camera
+from featuredb.video.film import VideoOptions
+from featuredb.video.frames import Source, open_video
+from featuredb.video.writer import VideoWriter, VideoWriterOptions
+from reloc.candidates import IndexedArea
+from reloc.result import LocaliseRequest
+from reloc.tracking.film_overlay import draw_frame
+from reloc.tracking.options import TrackOptions
+from reloc.tracking.tracker import TrackedFrame, Tracker
+from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
+
+_LOG = logging.getLogger(__name__)
+OnFrame = Callable[[TrackedFrame, TrajectoryPoint], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackVideoOptions:
+    """How a video is tracked.
+
+    Attributes:
+        max_side_px: frames are made smaller for tracking; flow costs as their area, and 1280 pixels tell a
+            pose to centimetres at the distances of drones. The overlay is of this size, too.
+        start_s, end_s: the stretch of the film; None: all of it.
+        track: the tracker's settings.
+    """
+
+    max_side_px: int = 1280
+    start_s: float | None = None
+    end_s: float | None = None
+    track: TrackOptions = field(default_factory=TrackOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackSeconds:
+    """Where the time went, seconds: of the whole run, and in decoding, tracking and drawing.
+
+    Attributes:
+        longest_gap: between the poses of two frames.
+    """
+
+    total: float
+    decoding: float
+    tracking: float
+    drawing: float
+    longest_gap: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedVideo:
+    """What came of a video.
+
+    Attributes:
+        camera: intrinsics of the frames as they were tracked; None where nothing was localised.
+        complaints: what was wrong with the film, for people.
+    """
+
+    trajectory: Trajectory
+    camera: Camera | None
+    seconds: TrackSeconds
+    complaints: tuple[str, ...]
+
+
+def track_video(
+    source: Source,
+    areas: Sequence[IndexedArea],
+    *,
+    camera: Camera | None = None,
+    request: LocaliseRequest | None = None,
+    overlay: Path | None = None,
+    options: TrackVideoOptions | None = None,
+    on_frame: OnFrame | None = None,
+) -> TrackedVideo:
+    """Track every frame of a film.
+
+    The overlay shows frames as they were known when they were shown; the trajectory has those that were found
+    a little later, too.
+
+    Args:
+        camera: intrinsics of the film's frames, upright, of any size; None: of the first frame that is found.
+        request: what else is known of the first frame.
+        overlay: an mp4 to be written.
+        on_frame: called after each frame.
+
+    Raises:
+        VideoError: the film cannot be read, or has no frames; the overlay cannot be written.
+        InvalidValueError: the camera is of another shape than the film.
+        IncompatibleExtractorError: all maps are of another extractor.
+    """
+    options = options or TrackVideoOptions()
+    areas = _usable(areas, options.track.localise.extractor.fingerprint)
+    points: list[TrajectoryPoint] = []
+    clock = time.perf_counter
+    began = last = clock()
+    decoding = drawing = gap = 0.0
+    settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
+    threads = cv2.getNumThreads()
+    # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
+    cv2.setNumThreads(1)
+    try:
+        with ExitStack() as stack:
+            video = stack.enter_context(open_video(source, settings))
+            info = video.info
+            lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
+            tracker = stack.enter_context(Tracker(areas, lens, options.track, request))
+            writer = None
+            if overlay is not None:
+                writer = stack.enter_context(
+                    VideoWriter(
+                        overlay,
+                        width=info.frame_width // 2 * 2,
+                        height=info.frame_height // 2 * 2,
+                        fps=None,
+                        options=VideoWriterOptions(crf=23, preset="veryfast"),
+                    )
+                )
+            first_s: float | None = None
+            mark = clock()
+            for frame in video:
+                decoding += clock() - mark
+                tracked = tracker.track(frame.gray, frame.time_s)
+                point = point_of(tracked)
+                points.append(point)
+                _filled(points, tracker.late)
+                now = clock()
+                gap, last = (max(gap, now - last) if len(points) > 1 else 0.0), now
+                if on_frame is not None:
+                    on_frame(tracked, point)
+                if writer is not None:
+                    first_s = frame.time_s if first_s is None else first_s
+                    picture = draw_frame(frame.rgb(), tracked, point)
+                    writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
+                    drawing += clock() - now
+                mark = clock()
+            if not points:
+                raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
+            complaints = video.report.complaints()
+            lens = tracker.camera
+    finally:
+        cv2.setNumThreads(threads)
+    total = clock() - began
+    return TrackedVideo(
+        trajectory=Trajectory(source=info.name, points=tuple(points), start=info.creation_time),
+        camera=lens,
+        seconds=TrackSeconds(
+            total=total,
+            decoding=decoding,
+            tracking=total - decoding - drawing,
+            drawing=drawing,
+            longest_gap=gap,
+        ),
+        complaints=complaints,
+    )
+
+
+def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None:
+    """Earlier points whose poses were found since; the last one then goes on from them."""
+    if not late:
+        return
+    first = points[-1].index - len(points) + 1
+    for frame in late:
+        points[frame.index - first] = point_of(frame)
+    if points[-1].state == "relocalised":
+        points[-1] = replace(points[-1], state="tracking")
+
+
+def _usable(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
+    """Those whose descriptors can be compared with the film's."""
+    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
+    if areas and not usable:
+        raise IncompatibleExtractorError(
+            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
+        )
+    return usable
+
+
+def _resized(camera: Camera, width: int, height: int) -> Camera:
+    """The lens of the full frames, for frames of another size."""
+    return camera if (camera.width, camera.height) == (width, height) else camera.scaled_to(width, height)
