@@ -40,6 +40,27 @@ def register(subparsers: Any) -> None:
     _add_control(photos)
     _add_running(photos)
     photos.set_defaults(run=run_photos)
+    _register_video(kinds)
+
+
+def _register_video(kinds: Any) -> None:
+    from featuredb.cli.common import add_database_argument
+    from ingest.video.command import add_video_arguments, run_video
+
+    video = kinds.add_parser(
+        "video",
+        help="a film, with the telemetry in it or beside it",
+        description="Choose keyframes by the picture's motion, reconstruct them as one camera's photos, "
+        "place them by the telemetry and commit the maps. Goes on where it was when it was killed.",
+    )
+    add_database_argument(video)
+    video.add_argument("folder", metavar="FILE", type=Path, help="mp4, mov, mkv, webm, avi or ts")
+    add_video_arguments(video)
+    _add_selection(video)
+    _add_making(video)
+    _add_control(video)
+    _add_running(video)
+    video.set_defaults(run=run_video)
 
 
 def _add_selection(parser: argparse.ArgumentParser) -> None:

@@ -1,0 +1,1 @@
+"""Films become maps: keyframes chosen, written as photos, ingested like them."""

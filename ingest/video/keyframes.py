@@ -1,0 +1,109 @@
+"""Which frames of a film become photos: by how far the picture has moved, and the sharpest around there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from ingest.video.motion import Motion
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyframeOptions:
+    """How dense keyframes are.
+
+    Attributes:
+        step: the picture has moved by so much from one to the next, a share of its longer side: the mean way
+            of the corners of its inner half. 0.12 leaves seven eighths in common; structure from motion wants
+            each point in three photos, and light enough that matching stays quick.
+        most: keyframes at most; a longer film has longer steps, up to `max_step`, and more keyframes beyond.
+        max_step: neighbours must overlap.
+        window: frames before and after the one that is due among which the sharpest is taken.
+    """
+
+    step: float = 0.12
+    most: int = 60
+    max_step: float = 0.3
+    window: int = 4
+
+    def __post_init__(self) -> None:
+        if not (0.0 < self.step <= self.max_step < 1.0 and self.most >= 2 and self.window >= 0):
+            raise InvalidValueError(f"KeyframeOptions: value out of range in {self}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KeyframeChoice:
+    """The chosen frames.
+
+    Attributes:
+        index: of the frames, rising. time_s: theirs.
+        segment: number of the stretch without a break that each lies in.
+        step: that was used.
+    """
+
+    index: tuple[int, ...]
+    time_s: tuple[float, ...]
+    segment: tuple[int, ...]
+    step: float
+
+
+def choose_keyframes(motion: Motion, options: KeyframeOptions | None = None) -> KeyframeChoice:
+    """Choose keyframes, none where the picture stands still, none twice."""
+    options = options or KeyframeOptions()
+    step = options.step
+    rows = _rows(motion, step, options.window)
+    while len(rows) > options.most and step < options.max_step:
+        step = min(options.max_step, step * max(1.05, 0.98 * len(rows) / options.most))
+        rows = _rows(motion, step, options.window)
+    segment = np.cumsum(motion.broken) - 1
+    return KeyframeChoice(
+        index=tuple(int(motion.index[r]) for r in rows),
+        time_s=tuple(float(motion.time_s[r]) for r in rows),
+        segment=tuple(int(segment[r]) for r in rows),
+        step=step,
+    )
+
+
+# The corners of the picture's inner half, homogeneous, in shares of the longer side.
+_INNER: FloatArray = np.array([[x, y, 1.0] for x in (-0.25, 0.25) for y in (-0.15, 0.15)], dtype=np.float64)
+
+
+def _rows(motion: Motion, step: float, window: int) -> list[int]:
+    """Rows of the frames at which the picture has moved by a step since the last one, and the ends."""
+    chosen: list[int] = []
+    for segment in np.split(np.arange(len(motion)), np.flatnonzero(motion.broken)[1:]):
+        if len(segment) < 2:
+            continue  # a single frame between two breaks: a blink
+        picked = [_sharpest(motion, segment, 0, 0, window)]
+        moved = _since(motion, segment, picked[0])
+        for place in range(picked[0] + 1, len(segment)):
+            if moved[place] < step:
+                continue
+            if place <= picked[-1]:
+                continue
+            picked.append(_sharpest(motion, segment, place, picked[-1] + 1, window))
+            moved = _since(motion, segment, picked[-1])
+        last = len(segment) - 1
+        if moved[last] > 0.5 * step and last > picked[-1]:
+            picked.append(_sharpest(motion, segment, last, picked[-1] + 1, window))
+        if len(picked) > 1 or len(segment) == len(motion):
+            chosen.extend(int(segment[p]) for p in picked)
+    return chosen
+
+
+def _since(motion: Motion, segment: np.ndarray, start: int) -> FloatArray:
+    """How far the picture has moved (n,) since a frame of a segment; 0 before it."""
+    moved = np.zeros(len(segment))
+    total = np.eye(3)
+    for place in range(start + 1, len(segment)):
+        total = np.vstack([motion.step[segment[place]], [0.0, 0.0, 1.0]]) @ total
+        there = _INNER @ total.T
+        moved[place] = float(np.linalg.norm(there[:, :2] - _INNER[:, :2], axis=1).mean())
+    return moved
+
+
+def _sharpest(motion: Motion, segment: np.ndarray, place: int, least: int, window: int) -> int:
+    """The sharpest frame within the window around a place of a segment."""
+    first, end = max(least, place - window), min(len(segment), place + window + 1)
+    return first + int(np.argmax(motion.sharpness[segment[first:end]]))

@@ -1,0 +1,210 @@
+"""Keyframes of a film as photos: JPEG files with what film and telemetry know in their EXIF."""
+
+import hashlib
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import timedelta
+from pathlib import Path
+
+import numpy as np
+from PIL import ExifTags, Image
+
+from featuredb.errors import VideoError
+from featuredb.features.exif_write import gps_directory
+from featuredb.geometry.arrays import FloatArray
+from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
+from featuredb.video.frames import open_video
+from featuredb.video.telemetry.values import Telemetry
+from ingest.executor import Progress, no_progress
+from ingest.fingerprint import digest, options_fingerprint
+from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
+from ingest.video.motion import MotionOptions, measure_motion
+from ingest.workspace import atomic_file, write_json
+
+_DONE = "film.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StillsOptions:
+    """From a film to photos.
+
+    Attributes:
+        motion_side_px: frames are made so small to measure their motion.
+        max_side_px: of the photos; None: as the film is.
+        quality: of JPEG; films are compressed already, and what it adds should not be seen.
+        start_s, end_s: the stretch of the film; None: all of it.
+        telemetry_late_s: telemetry that is shown at t belongs to t minus this.
+    """
+
+    motion_side_px: int = 640
+    max_side_px: int | None = None
+    quality: int = 95
+    start_s: float | None = None
+    end_s: float | None = None
+    telemetry_late_s: float = 0.0
+    motion: MotionOptions = field(default_factory=MotionOptions)
+    keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stills:
+    """What was made of a film.
+
+    Attributes:
+        folder: of the photos. photos: number of them. frames: of the film that were looked at.
+        breaks: where nothing connects a frame with the one before.
+        step: between keyframes, a share of the picture's longer side.
+        positions: photos with a position. heights: what their heights count from, for people.
+        notes: what was wrong with the film or its telemetry.
+    """
+
+    folder: Path
+    photos: int
+    frames: int
+    breaks: int
+    step: float
+    positions: int
+    heights: str
+    notes: tuple[str, ...]
+
+
+def make_stills(
+    film: Path,
+    telemetry: Telemetry | None,
+    root: Path,
+    options: StillsOptions | None = None,
+    progress: Progress = no_progress,
+) -> Stills:
+    """Choose keyframes and write them below `root`; what is there already is not made again.
+
+    Raises:
+        VideoError: the film cannot be read, or shows too little motion for two keyframes.
+    """
+    options = options or StillsOptions()
+    told = "none" if telemetry is None else f"{telemetry.origin} {telemetry.source}"
+    content = _digest_of(film)
+    name = digest(content, options_fingerprint(options), told)[:16]
+    folder = root / "films" / name / film.stem
+    done = folder.parent / _DONE
+    if done.is_file():
+        known = json.loads(done.read_text(encoding="utf-8"))
+        return Stills(**{**known, "folder": folder, "notes": tuple(known["notes"])})
+    small = _video_options(options, options.motion_side_px)
+    with open_video(film, small) as video:
+        progress("motion", 0, video.info.frame_count or 0)
+        motion = measure_motion(video, options.motion)
+        notes = list(video.report.complaints())
+    choice = choose_keyframes(motion, options.keyframes)
+    if len(choice.index) < 2:
+        raise VideoError(
+            f"{film.name}: {len(choice.index)} keyframes in {len(motion)} frames, two are needed: the "
+            "picture hardly moves, or no two frames belong together"
+        )
+    places, heights = _places(telemetry, choice, options)
+    if telemetry is not None:
+        notes += telemetry.warnings
+    _write(film, folder, choice, places, content, options, progress)
+    found = Stills(
+        folder=folder,
+        photos=len(choice.index),
+        frames=len(motion),
+        breaks=int(motion.broken[1:].sum()),
+        step=round(choice.step, 4),
+        positions=sum(place is not None for place in places),
+        heights=heights,
+        notes=tuple(notes),
+    )
+    write_json(done, {name: getattr(found, name) for name in Stills.__slots__ if name != "folder"})
+    return found
+
+
+def _digest_of(film: Path) -> str:
+    try:
+        with film.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise VideoError(
+            f"{film}: expected a film, {error.strerror or error}; folders of pictures go to "
+            "`featuredb ingest photos`"
+        ) from error
+
+
+def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
+    return VideoOptions(max_side_px=side_px, start_s=options.start_s, end_s=options.end_s)
+
+
+def _places(
+    telemetry: Telemetry | None, choice: KeyframeChoice, options: StillsOptions
+) -> tuple[list[tuple[float, float, float] | None], str]:
+    """Position of each keyframe, latitude, longitude, height; and what the heights are."""
+    if telemetry is None:
+        return [None] * len(choice.index), ""
+    if not telemetry.in_video_time:
+        return [None] * len(choice.index), "telemetry is on another clock than the film"
+    at = telemetry.at(np.array(choice.time_s) + options.telemetry_late_s)
+    height: FloatArray = at.height_m
+    heights: str = telemetry.height_datum
+    if not np.isfinite(height).any():
+        height, heights = at.relative_height_m, "above the place of take-off"
+    known = at.has_position & np.isfinite(height)
+    return [
+        (float(at.latitude_deg[k]), float(at.longitude_deg[k]), float(height[k])) if known[k] else None
+        for k in range(len(choice.index))
+    ], heights
+
+
+def _write(
+    film: Path,
+    folder: Path,
+    choice: KeyframeChoice,
+    places: Sequence[tuple[float, float, float] | None],
+    content: str,
+    options: StillsOptions,
+    progress: Progress,
+) -> None:
+    wanted = {index: k for k, index in enumerate(choice.index)}
+    with open_video(film, _video_options(options, options.max_side_px)) as video:
+        for frame in video:
+            k = wanted.get(frame.index)
+            if k is None:
+                continue
+            with atomic_file(folder / f"{frame.index:06d}.jpg") as file:
+                camera = (video.info.make or "film", video.info.model or content[:16])
+                file.write_bytes(_jpeg(frame, video.info, camera, places[k], options.quality))
+            progress("keyframes", k + 1, len(wanted))
+            if k + 1 == len(wanted):
+                return
+    raise VideoError(f"{film.name}: not all keyframes could be read again; was the film changed meanwhile?")
+
+
+def _jpeg(
+    frame: VideoFrame,
+    info: VideoInfo,
+    camera: tuple[str, str],
+    place: tuple[float, float, float] | None,
+    quality: int,
+) -> bytes:
+    """One keyframe.
+
+    Args:
+        camera: make and model. All keyframes of a film name one, and so share their lens; films that do not
+            say theirs name themselves, so that no other film takes that lens for its own.
+    """
+    exif = Image.Exif()
+    base = ExifTags.Base
+    exif[base.Make.value], exif[base.Model.value] = camera
+    exif[base.Software.value] = "featuredb"
+    if info.creation_time is not None:
+        when = info.creation_time + timedelta(seconds=frame.time_s)
+        offset = when.strftime("%z") or "+0000"
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        details[base.DateTimeOriginal.value] = when.strftime("%Y:%m:%d %H:%M:%S")
+        details[base.OffsetTimeOriginal.value] = f"{offset[:3]}:{offset[3:5]}"
+        details[base.SubsecTimeOriginal.value] = f"{when.microsecond // 1000:03d}"
+    if place is not None:
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(place))
+    out = io.BytesIO()
+    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif)
+    return out.getvalue()

@@ -1,0 +1,143 @@
+"""`featuredb ingest video`: a film over the test hills becomes a map where its telemetry has them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from featuredb.cli.main import main
+from featuredb.errors import VideoError
+from featuredb.features.exif import read_exif
+from featuredb.geo.geopose import geopose_from_camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.store import Database
+from featuredb.video.telemetry.read import read_telemetry
+from featuredb.video.writer import VideoWriter
+from ingest.video.keyframes import KeyframeOptions
+from ingest.video.stills import StillsOptions, make_stills
+from tests.support.hill_photos import CAMERA, FRAME, _render
+from tests.support.planar_map import field_texture, view
+
+_RATE_HZ = 10.0
+
+
+def _pose(frame: int) -> Rigid3:
+    """East, north, west: 1.5 m a frame."""
+    leg, along = divmod(frame, 16)
+    east = 1.5 * along if leg == 0 else 24.0 if leg == 1 else 24.0 - 1.5 * along
+    north = 0.0 if leg == 0 else 1.2 * along if leg == 1 else 19.2
+    return view(east - 12.0, north - 9.0, 46.0 + 2.0 * np.sin(frame / 5.0), tilt_deg=6.0, heading_deg=20.0)
+
+
+def _clock(time_s: float) -> str:
+    return f"00:00:{int(time_s):02d},{round(1000 * (time_s % 1)):03d}"
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Forty-eight frames, and subtitles as a DJI drone writes them."""
+    folder = tmp_path_factory.mktemp("film")
+    texture, blocks = field_texture(1), []
+    with VideoWriter(folder / "hills.mp4", width=CAMERA.width, height=CAMERA.height, fps=_RATE_HZ) as writer:
+        for i in range(48):
+            writer.write(_render(texture, _pose(i), i))
+            place = geopose_from_camera(_pose(i), FRAME)
+            blocks.append(
+                f"{i + 1}\n{_clock(i / _RATE_HZ)} --> {_clock((i + 1) / _RATE_HZ)}\nFrameCnt: {i + 1}\n"
+                f"2026-05-01 12:00:{i / _RATE_HZ:06.3f}\n[latitude: {place.latitude_deg:.9f}] [longitude: "
+                f"{place.longitude_deg:.9f}] [rel_alt: 0.0 abs_alt: {place.height_m:.4f}]\n\n"
+            )
+    (folder / "hills.srt").write_text("".join(blocks))
+    return folder / "hills.mp4"
+
+
+@pytest.mark.slow
+def test_a_film_becomes_a_map_where_its_telemetry_says(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["ingest", "video", str(tmp_path / "db"), str(film), "--gps-sigma", "0.05", "--quiet"]
+    command += ["--workers", "1", "--max-features", "1500"]
+    assert main(command) == 0
+    said = capsys.readouterr().out
+    assert "telemetry of hills.srt" in said
+    snapshot = Database.open(tmp_path / "db").snapshot()
+    (summary,) = snapshot.maps()
+    assert summary.name == "hills"
+    feature_map = snapshot.load_map(summary.map_id)
+    assert 6 <= len(feature_map.images) <= 25
+    assert len(feature_map.cameras) == 1
+    assert feature_map.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.02)
+    own_from_hills = feature_map.frame.enu_from(FRAME)
+    for image in feature_map.images:
+        true = own_from_hills.act(_pose(int(Path(image.name).stem)).center)
+        assert np.linalg.norm(image.cam_from_local.center - true) < 0.3, image.name
+    # Again: nothing is decoded or made anew, and nothing is committed twice.
+    stills = sorted((tmp_path / "db" / "_work" / "films").rglob("*.jpg"))
+    before = [f.stat().st_mtime_ns for f in stills]
+    assert main(command) == 0
+    assert [f.stat().st_mtime_ns for f in stills] == before
+    assert len(Database.open(tmp_path / "db").snapshot().maps()) == 1
+
+
+def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Path) -> None:
+    telemetry = read_telemetry(film.with_suffix(".srt"))
+    options = StillsOptions(keyframes=KeyframeOptions(step=0.2, window=0))
+    stills = make_stills(film, telemetry, tmp_path, options)
+    files = sorted(stills.folder.iterdir())
+    assert len(files) == stills.photos == stills.positions
+    assert (stills.frames, stills.breaks) == (48, 0)
+    told = [read_exif(f.read_bytes()) for f in files]
+    assert len({t.camera_key for t in told}) == 1
+    assert told[0].camera_key.startswith("film|")
+    for file, t in zip(files, told, strict=True):
+        place = geopose_from_camera(_pose(int(file.stem)), FRAME)
+        assert t.prior is not None
+        assert t.prior.latitude_deg == pytest.approx(place.latitude_deg, abs=2e-8)
+        assert t.prior.height_m == pytest.approx(place.height_m, abs=2e-3)
+    with Image.open(files[0]) as picture:
+        assert picture.size == (CAMERA.width, CAMERA.height)
+
+
+def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> None:
+    telemetry = read_telemetry(film.with_suffix(".srt"))
+    late = make_stills(film, telemetry, tmp_path, StillsOptions(telemetry_late_s=0.2))
+    file = sorted(late.folder.iterdir())[0]
+    gps = read_exif(file.read_bytes()).prior
+    assert gps is not None
+    there = geopose_from_camera(_pose(int(file.stem) + 2), FRAME)
+    assert gps.longitude_deg == pytest.approx(there.longitude_deg, abs=2e-8)
+
+
+def test_a_film_that_stands_still_is_refused(tmp_path: Path) -> None:
+    picture = _render(field_texture(1), _pose(0), 0)
+    with VideoWriter(tmp_path / "still.mp4", width=CAMERA.width, height=CAMERA.height, fps=10.0) as writer:
+        for _ in range(12):
+            writer.write(picture)
+    with pytest.raises(VideoError, match="1 keyframes in 12 frames, two are needed"):
+        make_stills(tmp_path / "still.mp4", None, tmp_path / "work")
+    assert not (tmp_path / "work").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("missing.mp4", None, "no such video"),
+        ("empty.mp4", b"", "empty.mp4"),
+        ("text.mp4", b"this is no film" * 100, "text.mp4"),
+    ],
+)
+def test_what_is_no_film_is_refused_and_leaves_nothing(
+    name: str, content: bytes | None, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    code = main(["ingest", "video", str(tmp_path / "db"), str(tmp_path / name), "--quiet"])
+    assert code not in (0, 1)
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.jpg"))
+
+
+def test_a_folder_is_not_a_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ingest", "video", str(tmp_path / "db"), str(tmp_path), "--quiet"]) not in (0, 1)
+    assert "featuredb ingest photos" in capsys.readouterr().err
