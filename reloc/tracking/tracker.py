@@ -295,7 +295,9 @@ class Tracker:
             answer = self._pool.submit(find_frame, gray.copy(), self._request_now(), self._areas, options)
             self._sent = _Sent(index=self._index, due=self._index + options.lost_answer_after, answer=answer)
             return
-        if self._index < self._next_keyframe:
+        few = len(self._landmarks) < options.few_landmarks * options.landmarks
+        early = options.keyframe_every - min(options.keyframe_soonest, options.keyframe_every)
+        if self._index < self._next_keyframe - (early if few else 0):
             return
         assert self._camera is not None
         assert self._area is not None
