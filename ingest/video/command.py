@@ -23,9 +23,10 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--telemetry-late",
         type=float,
-        default=0.0,
+        default=None,
         metavar="S",
-        help="how much later than the picture the telemetry shows a place; default: 0",
+        help="how much later than the picture the telemetry shows a place; default: estimated from the "
+        "speeds of both",
     )
     group.add_argument(
         "--keyframes", type=int, default=60, metavar="N", help="about so many at most; default: 60"

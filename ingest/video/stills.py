@@ -20,6 +20,7 @@ from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
+from ingest.video.lag import LagOptions, estimate_lag
 from ingest.video.motion import MotionOptions, measure_motion
 from ingest.workspace import atomic_file, write_json
 
@@ -35,7 +36,8 @@ class StillsOptions:
         max_side_px: of the photos; None: as the film is.
         quality: of JPEG; films are compressed already, and what it adds should not be seen.
         start_s, end_s: the stretch of the film; None: all of it.
-        telemetry_late_s: telemetry that is shown at t belongs to t minus this.
+        telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
+            and 0 where that says nothing.
     """
 
     motion_side_px: int = 640
@@ -43,7 +45,8 @@ class StillsOptions:
     quality: int = 95
     start_s: float | None = None
     end_s: float | None = None
-    telemetry_late_s: float = 0.0
+    telemetry_late_s: float | None = None
+    lag: LagOptions = field(default_factory=LagOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
 
@@ -57,7 +60,8 @@ class Stills:
         breaks: where nothing connects a frame with the one before.
         step: between keyframes, a share of the picture's longer side.
         positions: photos with a position. heights: what their heights count from, for people.
-        notes: what was wrong with the film or its telemetry.
+        late_s: by how much the telemetry was taken to be late.
+        notes: what was found of the film and its telemetry, and what was wrong with them.
     """
 
     folder: Path
@@ -67,6 +71,7 @@ class Stills:
     step: float
     positions: int
     heights: str
+    late_s: float
     notes: tuple[str, ...]
 
 
@@ -102,9 +107,14 @@ def make_stills(
             f"{film.name}: {len(choice.index)} keyframes in {len(motion)} frames, two are needed: the "
             "picture hardly moves, or no two frames belong together"
         )
-    places, heights = _places(telemetry, choice, options)
+    late_s = options.telemetry_late_s or 0.0
     if telemetry is not None:
         notes += telemetry.warnings
+        if options.telemetry_late_s is None and telemetry.in_video_time:
+            lag = estimate_lag(motion, telemetry, options.lag)
+            late_s = lag.late_s or 0.0
+            notes.append(lag.message)
+    places, heights = _places(telemetry, choice, late_s)
     _write(film, folder, choice, places, content, options, progress)
     found = Stills(
         folder=folder,
@@ -114,6 +124,7 @@ def make_stills(
         step=round(choice.step, 4),
         positions=sum(place is not None for place in places),
         heights=heights,
+        late_s=late_s,
         notes=tuple(notes),
     )
     write_json(done, {name: getattr(found, name) for name in Stills.__slots__ if name != "folder"})
@@ -136,14 +147,14 @@ def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
 
 
 def _places(
-    telemetry: Telemetry | None, choice: KeyframeChoice, options: StillsOptions
+    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float
 ) -> tuple[list[tuple[float, float, float] | None], str]:
     """Position of each keyframe, latitude, longitude, height; and what the heights are."""
     if telemetry is None:
         return [None] * len(choice.index), ""
     if not telemetry.in_video_time:
         return [None] * len(choice.index), "telemetry is on another clock than the film"
-    at = telemetry.at(np.array(choice.time_s) + options.telemetry_late_s)
+    at = telemetry.at(np.array(choice.time_s) + late_s)
     height: FloatArray = at.height_m
     heights: str = telemetry.height_datum
     if not np.isfinite(height).any():

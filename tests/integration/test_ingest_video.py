@@ -106,6 +106,13 @@ def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> 
     assert read_exif(file.read_bytes()).longitude_deg == pytest.approx(there.longitude_deg, abs=2e-8)
 
 
+def test_the_lag_is_looked_for_and_what_was_found_is_said(film: Path, tmp_path: Path) -> None:
+    """Not much of a curve in five seconds: no lag is believed, and none is applied."""
+    stills = make_stills(film, read_telemetry(film.with_suffix(".srt")), tmp_path)
+    assert stills.late_s == 0.0
+    assert any("lag" in note for note in stills.notes)
+
+
 def test_a_film_that_stands_still_is_refused(tmp_path: Path) -> None:
     picture = _render(field_texture(1), _pose(0), 0)
     with VideoWriter(tmp_path / "still.mp4", width=CAMERA.width, height=CAMERA.height, fps=10.0) as writer:
