@@ -93,6 +93,7 @@ def adjust_anchored(
     *,
     free_centers: bool = False,
     constant_photos: Sequence[int] = (),
+    constant_points: Sequence[int] = (),
 ) -> Anchored:
     """Adjust poses, free points and lenses (focal lengths and distortion) but those of `constant_cameras`.
 
@@ -102,7 +103,7 @@ def adjust_anchored(
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
         focal_px: focal lengths of EXIF by camera, where there is one.
         free_centers: adjust the principal points of these lenses, too.
-        constant_photos: rows of the model's photos whose poses stay.
+        constant_photos: rows of the model's photos whose poses stay. constant_points: of its points.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
@@ -119,6 +120,7 @@ def adjust_anchored(
                 focal_px or {},
                 free_centers,
                 constant_photos,
+                constant_points,
                 options,
             )
         observation, kept = _fitting(state, keypoints, fixed, options)
@@ -140,6 +142,7 @@ def _adjusted(
     focal_px: Mapping[int, float],
     free_centers: bool,
     constant_photos: Sequence[int],
+    constant_points: Sequence[int],
     options: AnchoredOptions,
 ) -> Model:
     """One round: the model with new poses, lenses and points."""
@@ -161,7 +164,7 @@ def _adjusted(
         config.set_constant_cam_intrinsics(camera + 1)
     for photo in constant_photos:
         config.set_constant_rig_from_world_pose(reconstruction.image(photo + 1).frame_id)
-    for point_id in fixed_ids:
+    for point_id in (*fixed_ids, *(free_ids[p] for p in constant_points if p in free_ids)):
         config.add_constant_point(point_id)
     free = set(np.unique(model.camera_of).tolist()) - set(constant_cameras)
     focals = {c + 1: focal for c, focal in options.focal_prior.of(focal_px, free).items()}

@@ -23,6 +23,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints
 from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
 from ingest.colmap_bridge import Model
+from ingest.growth.map_graph import place_sigmas_m
 from ingest.growth.refine import in_metres
 from ingest.joint.joined import Joined, MapRows, join_maps
 from ingest.joint.links import LinkOptions, find_links
@@ -30,6 +31,7 @@ from ingest.precision import linearise, point_covariances, residual_variance, up
 from ingest.register.gps import similarity_closed_form
 
 JOINT = "joint"  # key of Placement.evidence
+_AS_SURE = 2.0  # anchors up to so many times as uncertain as the surest hold the place of all
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,6 +52,7 @@ class JointOptions:
         min_kept: share of a map's observations that must still fit. On `sacre_coeur`, whose first map was
             bent by a fiftieth of its viewing distance, 0.98 to 1 do; 0.83 where one of two maps shows a
             scene that is bent as much in truth.
+        sigmas: of its placement that an anchor's photos may move by, or `least_move_m`.
     """
 
     min_shared_points: int = 30
@@ -58,6 +61,8 @@ class JointOptions:
     least_sigma_px: float = 0.3
     reference_side_px: int = 1600
     min_kept: float = 0.9
+    sigmas: float = 3.0
+    least_move_m: float = 0.05
     links: LinkOptions = field(default_factory=LinkOptions)
     adjust: AnchoredOptions = field(default_factory=lambda: AnchoredOptions(rounds=3))
 
@@ -69,7 +74,7 @@ class AdjustedMap:
     Attributes:
         held: it was not to move.
         shape_m: root mean square of what its camera centres moved against each other: what no similarity of
-            the map explains. move_m: largest way of a camera centre.
+            the map explains. move_m: largest way of a camera centre from where the map has it.
         sigma_before_px, sigma_px: of its reprojection errors, before and after.
         kept: share of its observations that still fit.
     """
@@ -101,7 +106,8 @@ class JointAdjustment:
     """Adjusted maps, or why there are none.
 
     Attributes:
-        reason: None, or UNCONNECTED, PHOTO_LOST, RESIDUALS, OBSERVATIONS_LOST; `message` for people.
+        reason: None, or UNCONNECTED, PHOTO_LOST, RESIDUALS, OBSERVATIONS_LOST, ANCHOR_MOVED; `message` for
+            people.
         maps: those that moved, new; empty where there is a reason.
         reports: of each map, as far as it came.
         shared_points: points that more than one map has.
@@ -126,20 +132,27 @@ class JointAdjustment:
 
 
 def adjust_together(
-    maps: Sequence[FeatureMap], held: Collection[str] = (), options: JointOptions | None = None
+    maps: Sequence[FeatureMap],
+    held: Collection[str] = (),
+    options: JointOptions | None = None,
+    *,
+    free: Collection[str] = (),
 ) -> JointAdjustment:
     """Adjust maps that overlap, all at once.
 
     Args:
         maps: of one extractor and height datum.
         held: ids of those whose photos, points and lenses stay; they are not among the new ones.
+        free: anchors that may move further than their placement's uncertainty explains.
 
     Raises:
         InvalidValueError: fewer than two maps, or of different extractors or datums.
     """
     options = options or JointOptions()
     _check(maps, held)
-    frame = min(maps, key=lambda m: (m.generation, -len(m.images), m.map_id)).frame
+    # What comes first lends the others its photos' poses, its lenses and points.
+    maps = sorted(maps, key=lambda m: (m.map_id not in held, m.generation, -len(m.images), m.map_id))
+    frame = maps[0].frame
     links = find_links(maps, options.links)
     joined = join_maps(maps, links, frame)
     shared = int(np.triu(joined.shared, 1).sum())
@@ -152,7 +165,8 @@ def adjust_together(
             shared_points=shared,
             elsewhere=links.elsewhere,
         )
-    constant = _photos_of(joined, [a for a, m in enumerate(maps) if m.map_id in held])
+    kept = [a for a, m in enumerate(maps) if m.map_id in held]
+    constant = _photos_of(joined, kept)
     result = adjust_anchored(
         joined.model,
         joined.keypoints,
@@ -161,10 +175,13 @@ def adjust_together(
         options.adjust,
         joined.known_focal_px,
         constant_photos=constant.tolist(),
+        constant_points=np.unique(
+            np.concatenate([np.zeros(0, np.int64), *(joined.maps[a].point_of for a in kept)])
+        ).tolist(),
     )
     if not len(constant):
         result = replace(result, model=in_metres(result.model, _back(maps, joined, result.model)))
-    return _judged(maps, held, joined, result, frame, shared, links.elsewhere, options)
+    return _judged(maps, held, free, joined, result, frame, shared, links.elsewhere, options)
 
 
 def _photos_of(joined: Joined, maps: Sequence[int]) -> NDArray[np.int64]:
@@ -195,12 +212,13 @@ def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64], least: i
 
 
 def _back(maps: Sequence[FeatureMap], joined: Joined, adjusted: Model) -> Sim3:
-    """The similarity that takes the photos of the lowest generation back to their places as a whole.
+    """The similarity that takes the photos of the surest anchors back to their places as a whole.
 
     Robust: the photo that the adjustment moved against the others is not what should hold them.
     """
     lowest = min(m.generation for m in maps)
-    rows = _photos_of(joined, [a for a, m in enumerate(maps) if m.generation == lowest])
+    sigma = [_placement_sigma_m(m) if m.generation == lowest else np.inf for m in maps]
+    rows = _photos_of(joined, [a for a in range(len(maps)) if sigma[a] <= _AS_SURE * min(sigma)])
     source, target = _reach(adjusted, rows), _reach(joined.model, rows)
     weights = np.ones(len(source), dtype=np.bool_)
     best = Sim3.identity()
@@ -212,6 +230,12 @@ def _back(maps: Sequence[FeatureMap], joined: Joined, adjusted: Model) -> Sim3:
         off = np.linalg.norm(best.act(source) - target, axis=1)
         weights = off <= 3.0 * max(float(np.median(off)), 1e-9)
     return best
+
+
+def _placement_sigma_m(feature_map: FeatureMap) -> float:
+    """Largest standard deviation of a map's photos by its placement."""
+    centers = np.array([image.cam_from_local.center for image in feature_map.images]).reshape(-1, 3)
+    return float(place_sigmas_m(feature_map.placement.covariance, centers).max(initial=0.0))
 
 
 def _reach(model: Model, rows: NDArray[np.int64]) -> FloatArray:
@@ -228,6 +252,7 @@ def _reach(model: Model, rows: NDArray[np.int64]) -> FloatArray:
 def _judged(
     maps: Sequence[FeatureMap],
     held: Collection[str],
+    free: Collection[str],
     joined: Joined,
     result: Anchored,
     frame: LocalFrame,
@@ -238,7 +263,10 @@ def _judged(
     after = _sigmas_px(joined, result.model)
     reports = []
     for a, feature_map in enumerate(maps):
-        old, new = (m.centers()[joined.maps[a].photos] for m in (joined.model, result.model))
+        new = result.model.centers()[joined.maps[a].photos]
+        old = frame.enu_from(feature_map.frame).act(
+            np.array([image.cam_from_local.center for image in feature_map.images])
+        )
         reports.append(
             AdjustedMap(
                 map_id=feature_map.map_id,
@@ -251,7 +279,7 @@ def _judged(
                 kept=len(_kept(joined.maps[a], result)[0]) / max(len(feature_map.observations), 1),
             )
         )
-    reason, message = _refusal(maps, joined, result.model, reports, options)
+    reason, message = _refusal(maps, free, joined, result.model, reports, options)
     adjusted: list[FeatureMap] = []
     if reason is None:
         precision = _precision(joined, result.model)
@@ -272,6 +300,7 @@ def _judged(
 
 def _refusal(
     maps: Sequence[FeatureMap],
+    free: Collection[str],
     joined: Joined,
     adjusted: Model,
     reports: Sequence[AdjustedMap],
@@ -299,6 +328,15 @@ def _refusal(
             f"map {poor_maps[0].map_id}: {poor_maps[0].kept:.0%} of its observations still fit, "
             f"{options.min_kept:.0%} are needed: the maps contradict each other"
         )
+    for feature_map, report in zip(maps, reports, strict=True):
+        if feature_map.parents or report.held or report.map_id in free:
+            continue
+        most = max(options.sigmas * _placement_sigma_m(feature_map), options.least_move_m)
+        if report.move_m > most:
+            return "ANCHOR_MOVED", (
+                f"map {report.map_id} would move by {report.move_m:.2f} m, its own placement allows "
+                f"{most:.2f} m: anchors contradict each other; name it as free if it is the wrong one"
+            )
     return None, f"{len(reports)} maps adjusted together"
 
 

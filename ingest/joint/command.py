@@ -30,7 +30,8 @@ def register(subparsers: Any) -> None:
         action="append",
         default=[],
         metavar="MAP",
-        help="this anchor may move although LiDAR or control points placed it; may be repeated",
+        help="this anchor may move although LiDAR or control points placed it, or further than its placement "
+        "explains; may be repeated",
     )
     parser.add_argument("--dry-run", action="store_true", help="say what would move, commit nothing")
     parser.add_argument("--json", action="store_true", help="print the report as JSON")
@@ -65,6 +66,10 @@ def _text(found: "DatabaseAdjustment") -> str:
     lines = [format_table(head, rows)] if rows else []
     if found.descendants:
         lines.append(f"with what hangs on the named maps: {', '.join(found.descendants)}\n")
+    if found.flagged:
+        lines.append(
+            f"quarantined, they hang on a moved map and could not join: {', '.join(found.flagged)}\n"
+        )
     if found.adjustment.elsewhere:
         lines.append(f"not heard, other maps have them elsewhere: {', '.join(found.adjustment.elsewhere)}\n")
     lines.append(f"{found.adjustment.shared_points} points in several maps\n")

@@ -26,6 +26,7 @@ class DatabaseAdjustment:
         reason: None, the adjustment's, or CANARY; nothing was committed where there is one.
         version: of the database since; -1 where nothing was committed.
         descendants: maps that joined because they hang on those that were named.
+        flagged: maps that are quarantined now, because they hang on a moved one and could not join.
     """
 
     reason: str | None
@@ -33,6 +34,7 @@ class DatabaseAdjustment:
     adjustment: JointAdjustment
     version: int = -1
     descendants: tuple[str, ...] = ()
+    flagged: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -41,6 +43,7 @@ class DatabaseAdjustment:
             "message": self.message,
             "version": self.version,
             "descendants": list(self.descendants),
+            "flagged": list(self.flagged),
         }
 
 
@@ -52,7 +55,7 @@ def adjust_maps(
     dry_run: bool = False,
     options: JointOptions | None = None,
 ) -> DatabaseAdjustment:
-    """Adjust active maps together, with all active maps that hang on them.
+    """Adjust active maps together, with all active maps that hang on them, held by the parents of them all.
 
     Args:
         named: ids or their first letters.
@@ -65,19 +68,23 @@ def adjust_maps(
         MapNotFoundError, StoreError
     """
     snapshot = database.snapshot()
-    active = {m.map_id: m for m in snapshot.maps() if m.status == "active"}
+    live = {m.map_id: m for m in snapshot.maps() if m.status != "retired"}
+    active = {name: m for name, m in live.items() if m.status == "active"}
     chosen = [_resolved(active, name) for name in named]
-    wanted = _with_descendants(active, chosen)
+    wanted = [m for m in _with_descendants(live, chosen) if m in active]
     free_ids = {_resolved(active, name) for name in free}
     held = {m for m in wanted if active[m].method in _MEASURED and not active[m].parents} - free_ids
-    maps = [snapshot.load_map(m) for m in wanted]
-    found = adjust_together(maps, held, options)
+    # Parents that are not named hold their children, too: else these would drift away from them.
+    parents = sorted({p for m in wanted for p in active[m].parents if p in active} - set(wanted))
+    held |= set(parents)
+    maps = [snapshot.load_map(m) for m in (*parents, *wanted)]
+    found = adjust_together(maps, held, options, free=free_ids)
     descendants = tuple(m for m in wanted if m not in chosen)
     if found.reason is not None:
         return DatabaseAdjustment(
             reason=found.reason, message=found.message, adjustment=found, descendants=descendants
         )
-    new = _with_overlaps(found.maps)
+    new = _with_overlaps(found.maps, [m for m in maps if m.map_id in held])
     canaries = ask_persons_canaries(database, {m.map_id: m for m in new}, CanaryOptions())
     if canaries.regressions:
         return DatabaseAdjustment(
@@ -86,13 +93,19 @@ def adjust_maps(
             adjustment=found,
             descendants=descendants,
         )
-    version = -1
+    version, flagged = -1, tuple[str, ...]()
     if not dry_run:
         ids = [m.map_id for m in new]
         results = database.commit_maps(new, replaces=ids, based_on={m: active[m].write_id for m in ids})
         version = max(result.version for result in results)
+        flagged = tuple(sorted({m for result in results for m in result.flagged}))
     return DatabaseAdjustment(
-        reason=None, message=found.message, adjustment=found, version=version, descendants=descendants
+        reason=None,
+        message=found.message,
+        adjustment=found,
+        version=version,
+        descendants=descendants,
+        flagged=flagged,
     )
 
 
@@ -108,17 +121,20 @@ def _resolved(active: Mapping[str, MapSummary], name: str) -> str:
     return fits[0]
 
 
-def _with_descendants(active: Mapping[str, MapSummary], chosen: Sequence[str]) -> list[str]:
+def _with_descendants(live: Mapping[str, MapSummary], chosen: Sequence[str]) -> list[str]:
     """The maps and what hangs on them, by generation: a child left behind would hang where nothing is."""
     wanted = set(chosen)
-    while more := {m for m, e in active.items() if m not in wanted and wanted & set(e.parents)}:
+    while more := {m for m, e in live.items() if m not in wanted and wanted & set(e.parents)}:
         wanted |= more
-    return sorted(wanted, key=lambda m: (active[m].generation, -active[m].images, m))
+    return sorted(wanted, key=lambda m: (live[m].generation, -live[m].images, m))
 
 
-def _with_overlaps(maps: Sequence[FeatureMap]) -> list[FeatureMap]:
-    """The maps with what growth has measured between them as it is now: they agree."""
-    places = {m.map_id: place_of(m) for m in maps}
+def _with_overlaps(maps: Sequence[FeatureMap], held: Sequence[FeatureMap]) -> list[FeatureMap]:
+    """The maps with what growth has measured between them and the held ones as it is now: they agree.
+
+    Overlaps with others are forgotten, until they are measured again.
+    """
+    places = {m.map_id: place_of(m) for m in (*maps, *held)}
     new = []
     for feature_map in maps:
         growth = growth_of(feature_map.placement.evidence)
@@ -127,9 +143,11 @@ def _with_overlaps(maps: Sequence[FeatureMap]) -> list[FeatureMap]:
             continue
         edges = [StoredEdge.from_json(edge) for edge in growth["edges"]]
         growth["edges"] = [
-            replace(e, place=places[e.map_id], other_from_map=Sim3.identity()).as_json()
-            if e.map_id in places
-            else e.as_json()
+            (
+                replace(e, place=places[e.map_id], other_from_map=Sim3.identity())
+                if e.map_id in places
+                else replace(e, place="")
+            ).as_json()
             for e in edges
         ]
         evidence = {**feature_map.placement.evidence, GROWTH: growth}

@@ -4,11 +4,14 @@ A photo may be in several maps, with other points of it in each: it is one photo
 the same keypoint of it, they have the same point.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -55,12 +58,12 @@ class Joined:
 
 
 def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Joined:
-    """The maps as one reconstruction; photos and joined points are where the first map has them.
+    """The maps as one reconstruction; photos, lenses and joined points are as the first map has them.
 
-    Cameras with one EXIF key and size are one, with the first map's lens.
+    Cameras with one EXIF key that tells a focal length, and those of one photo, are one.
     """
-    photos = _Photos()
-    photo_rows = [np.array([photos.row(m, image, frame) for image in m.images], dtype=np.int64) for m in maps]
+    photos = _Photos(maps, frame)
+    photo_rows = photos.rows
     counts = [len(m.observations) for m in maps]
     ends = np.cumsum([0, *counts])
     photo_of = np.concatenate([_photo_of(m, rows) for m, rows in zip(maps, photo_rows, strict=True)])
@@ -111,37 +114,71 @@ def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Jo
 class _Photos:
     """Photos and cameras of all maps, each once."""
 
-    def __init__(self) -> None:
+    def __init__(self, maps: Sequence[FeatureMap], frame: LocalFrame) -> None:
         self.poses: list[Rigid3] = []
         self.camera_of: list[int] = []
         self.cameras: list[Camera] = []
-        self._photo_row: dict[tuple[str, ...], int] = {}
-        self._camera_row: dict[tuple[str, ...], int] = {}
         self._focals_px: dict[int, list[float]] = {}
+        camera_name = _same_cameras(maps)
+        photo_row: dict[tuple[str, ...], int] = {}
+        camera_row: dict[tuple[str, ...], int] = {}
+        self.rows: list[NDArray[np.int64]] = []
+        for feature_map in maps:
+            to_frame = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
+            mine = []
+            for image in feature_map.images:
+                name = _photo_name(feature_map, image)
+                if name not in photo_row:
+                    photo_row[name] = len(self.poses)
+                    self.poses.append(to_frame.act_on_pose(image.cam_from_local))
+                    camera = camera_name[feature_map.map_id, image.camera_id]
+                    if camera not in camera_row:
+                        camera_row[camera] = len(self.cameras)
+                        self.cameras.append(feature_map.cameras[image.camera_id])
+                    self.camera_of.append(camera_row[camera])
+                    if _tells_focal(_key(feature_map, image.camera_id)):
+                        focals = self._focals_px.setdefault(camera_row[camera], [])
+                        focals.append(feature_map.cameras[image.camera_id].focal_px)
+                mine.append(photo_row[name])
+            self.rows.append(np.array(mine, dtype=np.int64))
 
     def known_focal_px(self) -> dict[int, float]:
         return {row: float(np.median(focals)) for row, focals in self._focals_px.items()}
 
-    def row(self, feature_map: FeatureMap, image: MapImage, frame: LocalFrame) -> int:
-        name = ("", image.sha256) if image.sha256 else (feature_map.map_id, str(image.image_id))
-        if name not in self._photo_row:
-            self._photo_row[name] = len(self.poses)
-            to_frame = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-            self.poses.append(to_frame.act_on_pose(image.cam_from_local))
-            self.camera_of.append(self._camera(feature_map, image.camera_id))
-        return self._photo_row[name]
 
-    def _camera(self, feature_map: FeatureMap, camera_id: int) -> int:
-        camera = feature_map.cameras[camera_id]
-        key = feature_map.camera_keys[camera_id] if feature_map.camera_keys else ""
-        name = (key, f"{camera.width}x{camera.height}") if key else (feature_map.map_id, "", str(camera_id))
-        if name not in self._camera_row:
-            self._camera_row[name] = len(self.cameras)
-            self.cameras.append(camera)
-        row = self._camera_row[name]
-        if key:
-            self._focals_px.setdefault(row, []).append(camera.focal_px)
-        return row
+def _photo_name(feature_map: FeatureMap, image: MapImage) -> tuple[str, ...]:
+    return ("", image.sha256) if image.sha256 else (feature_map.map_id, str(image.image_id))
+
+
+def _key(feature_map: FeatureMap, camera_id: int) -> str:
+    return feature_map.camera_keys[camera_id] if feature_map.camera_keys else ""
+
+
+def _tells_focal(key: str) -> bool:
+    """Whether an EXIF key (`featuredb.features.exif.camera_key`) has a focal length in it."""
+    return re.search(r"\|f\d+(\||$)", key) is not None
+
+
+def _same_cameras(maps: Sequence[FeatureMap]) -> dict[tuple[str, int], tuple[str, ...]]:
+    """A name for each map's cameras; those of one EXIF key with focal length, and of one photo, have one."""
+    nodes = [(m.map_id, c) for m in maps for c in range(len(m.cameras))]
+    place = {node: k for k, node in enumerate(nodes)}
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for feature_map in maps:
+        for image in feature_map.images:
+            node = place[feature_map.map_id, image.camera_id]
+            groups.setdefault(("photo", *_photo_name(feature_map, image)), []).append(node)
+            key, camera = _key(feature_map, image.camera_id), feature_map.cameras[image.camera_id]
+            if _tells_focal(key):
+                groups.setdefault(("key", key, f"{camera.width}x{camera.height}"), []).append(node)
+    pairs = np.array(
+        [(group[0], other) for group in groups.values() for other in group] or [(0, 0)], dtype=np.int64
+    )
+    graph = sparse.csr_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes))
+    )
+    _, label = connected_components(graph, directed=False)
+    return {node: (str(label[k]),) for node, k in place.items()}
 
 
 def _photo_of(feature_map: FeatureMap, photos: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -21,7 +21,9 @@ from ingest.joint.in_database import adjust_maps
 from ingest.joint.joined import join_maps
 from ingest.joint.links import Links
 from ingest.register.gps import similarity_closed_form
-from tests.support.scene_strip import POINTS, strip_map
+from tests.support.scene_strip import POINTS, east, grown, strip_map
+
+_HALF_A_METRE = np.diag(np.repeat([1e-7, 0.5], [4, 3]) ** 2)
 
 
 def bent(feature_map: FeatureMap, metres: float) -> FeatureMap:
@@ -56,7 +58,7 @@ def errors_m(feature_map: FeatureMap) -> FloatArray:
 
 @pytest.fixture(scope="module")
 def anchor() -> FeatureMap:
-    return bent(strip_map("anchor", 40.0), 0.6)
+    return bent(strip_map("anchor", 40.0, covariance=_HALF_A_METRE), 0.6)
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +92,7 @@ def test_a_held_map_stays_and_the_others_come_to_it(child: FeatureMap) -> None:
     assert [m.map_id for m in found.maps] == ["child"]
     assert found.reports[0].held
     assert found.reports[0].move_m < 1e-9
+    assert found.reports[0].map_id == "anchor"
     assert np.median(errors_m(found.maps[0])) < 0.02
     assert found.maps[0].placement.evidence["joint"]["with"] == ["anchor", "child"]
 
@@ -97,7 +100,7 @@ def test_a_held_map_stays_and_the_others_come_to_it(child: FeatureMap) -> None:
 def test_a_photo_of_two_maps_is_one_photo(anchor: FeatureMap) -> None:
     """The same photos in both, with descriptors that nobody recognises: the pixels alone tell."""
     rng = np.random.default_rng(0)
-    twin = bent(replace(strip_map("twin", 40.0), images=anchor.images), -0.5)
+    twin = bent(replace(strip_map("twin", 40.0, covariance=_HALF_A_METRE), images=anchor.images), -0.5)
     seen = twin.observations
     strange = rng.integers(0, 255, seen.descriptors.shape, dtype=np.uint8)
     columns = {name: getattr(seen, name) for name in MapObservations.__slots__}
@@ -106,6 +109,46 @@ def test_a_photo_of_two_maps_is_one_photo(anchor: FeatureMap) -> None:
     assert found.reason is None
     poses = [[i.cam_from_local.matrix() for i in m.images] for m in found.maps]
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
+
+
+def test_a_held_map_holds_the_photos_that_it_shares_whatever_the_order() -> None:
+    """A bigger map by GPS, a metre off, with the same photos; what LiDAR placed lends it their poses."""
+    held = strip_map("held", 40.0)
+    made = strip_map("gps", 40.0, move=east(1.0), covariance=_HALF_A_METRE)
+    images = tuple(
+        replace(image, sha256=other.sha256) for image, other in zip(made.images, held.images, strict=True)
+    )
+    gps = replace(made, images=images)
+    for maps in ([gps, held], [held, gps]):
+        found = adjust_together(maps, held=["held"])
+        assert found.reason is None, found.message
+        assert [m.map_id for m in found.maps] == ["gps"]
+        assert np.median(errors_m(found.maps[0])) < 0.02
+        assert {r.map_id: r.move_m for r in found.reports}["gps"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_surer_anchor_keeps_its_place(anchor: FeatureMap) -> None:
+    """An RTK survey, and a map by phones that is 2 m off and says that it may be."""
+    tight, loose = (np.diag(np.repeat([1e-7, sigma], [4, 3]) ** 2) for sigma in (0.02, 3.0))
+    rtk = strip_map("rtk", 40.0, covariance=tight)
+    phones = strip_map("phones", 45.0, move=east(2.0), covariance=loose, cameras=16, seed=4)
+    found = adjust_together([phones, rtk])
+    assert found.reason is None, found.message
+    new = {m.map_id: m for m in found.maps}
+    assert np.median(errors_m(new["rtk"])) < 0.02
+    assert np.median(errors_m(new["phones"])) < 0.05
+
+
+def test_an_anchor_that_would_move_more_than_it_can_be_wrong_refuses() -> None:
+    tight = np.diag(np.repeat([1e-7, 0.02], [4, 3]) ** 2)
+    maps = [
+        strip_map("one", 40.0, covariance=tight),
+        strip_map("two", 45.0, move=east(1.0), covariance=tight, seed=4),
+    ]
+    found = adjust_together(maps)
+    assert (found.reason, found.maps) == ("ANCHOR_MOVED", ())
+    assert "its own placement allows 0.06 m" in found.message
+    assert adjust_together(maps, free=["one", "two"]).reason is None
 
 
 def test_maps_without_common_points_are_refused(anchor: FeatureMap) -> None:
@@ -182,6 +225,52 @@ def test_in_a_database_all_moves_in_one_commit(database: Database) -> None:
     assert place_of(database.snapshot().load_map("anchor")) != place_of(maps["anchor"])
 
 
+def test_a_parent_that_is_not_named_holds_its_children(anchor: FeatureMap, tmp_path: Path) -> None:
+    """Two children of one anchor, whose overlaps say that the anchor lies east; afterwards they agree."""
+    straight = strip_map("anchor", 40.0)
+    children = [
+        replace(
+            bent(strip_map(name, 60.0, parents=[straight], seed=k, move=east(0.3)), -0.4), status="active"
+        )
+        for k, name in ((1, "first"), (2, "second"))
+    ]
+    wrong = []
+    for child in children:
+        growth = growth_of(child.placement.evidence)
+        growth["edges"][0]["parent_from_new"] = east(-0.3).log().tolist()
+        evidence = {**child.placement.evidence, "growth": growth}
+        wrong.append(replace(child, placement=replace(child.placement, evidence=evidence)))
+    database = Database.create(tmp_path / "db")
+    database.commit_maps([straight, *wrong])
+    found = adjust_maps(database, ["first", "second"])
+    assert found.reason is None, found.message
+    assert [(r.map_id, r.held) for r in found.adjustment.reports] == [
+        ("anchor", True), ("first", False), ("second", False),
+    ]  # fmt: skip
+    snapshot = database.snapshot()
+    assert snapshot.load_map("anchor").placement.evidence.get("joint") is None
+    for name in ("first", "second"):
+        new = snapshot.load_map(name)
+        assert np.median(errors_m(new)) < 0.05
+        edge = growth_of(new.placement.evidence)["edges"][0]
+        np.testing.assert_array_equal(edge["parent_from_new"], Sim3.identity().log())
+        assert edge["place"] == place_of(straight)
+
+
+def test_active_maps_behind_quarantined_ones_join(
+    anchor: FeatureMap, child: FeatureMap, tmp_path: Path
+) -> None:
+    between = strip_map("between", 60.0, parents=[anchor], seed=5)
+    behind = replace(grown(strip_map("behind", 70.0, seed=6), [between]), status="active")
+    database = Database.create(tmp_path / "db")
+    database.commit_maps([anchor, child, between, behind])
+    found = adjust_maps(database, ["anchor"])
+    assert found.reason is None, found.message
+    assert found.descendants == ("child", "behind")
+    status = {m.map_id: m.status for m in database.snapshot().maps()}
+    assert status == {"anchor": "active", "child": "active", "between": "quarantined", "behind": "active"}
+
+
 def test_measured_anchors_stay_unless_freed(anchor: FeatureMap, child: FeatureMap, tmp_path: Path) -> None:
     database = Database.create(tmp_path / "db")
     surveyed = replace(anchor, placement=replace(anchor.placement, method="lidar"))
@@ -238,7 +327,10 @@ def test_focal_lengths_that_exif_told_are_known_beforehand(anchor: FeatureMap, c
         elsewhere=(),
     )
     assert join_maps([anchor, child], none, anchor.frame).known_focal_px == {}
-    keyed = [replace(m, camera_keys=("drone",)) for m in (anchor, child)]
+    films = [replace(m, camera_keys=("film|x|640x480|unknown",)) for m in (anchor, child)]
+    assert join_maps(films, none, anchor.frame).known_focal_px == {}
+    assert len(join_maps(films, none, anchor.frame).model.cameras) == 2
+    keyed = [replace(m, camera_keys=("maker|drone|640x480|f600|7",)) for m in (anchor, child)]
     joined = join_maps(keyed, none, anchor.frame)
     assert len(joined.model.cameras) == 1
     assert joined.known_focal_px == {0: anchor.cameras[0].focal_px}
