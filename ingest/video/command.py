@@ -18,7 +18,7 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=None,
         metavar="FILE",
-        help="a drone's .srt, GPX or CSV log; default: what is in the film or beside it under its name",
+        help="a drone's .srt; default: what is in the film (GoPro, DJI) or beside it under its name",
     )
     group.add_argument(
         "--telemetry-late",
@@ -43,6 +43,7 @@ def run_video(args: argparse.Namespace) -> int:
         TelemetryError, IngestError, StoreError, InvalidValueError
     """
     from featuredb.cli.common import storage_options
+    from featuredb.geo.datum import HEIGHT_DATUMS
     from featuredb.store import Database
     from ingest.cli import run_photos
     from ingest.progress_bars import progress_bars
@@ -57,13 +58,34 @@ def run_video(args: argparse.Namespace) -> int:
         keyframes=KeyframeOptions(most=args.keyframes),
     )
     telemetry = _telemetry(args)
+    if telemetry is not None:
+        _check(telemetry, args)
     database = Database.create(args.db, storage_options=storage_options(args))
     root = args.work or default_root(database.url)
     with progress_bars(args.quiet) as progress:
         stills = make_stills(args.folder, telemetry, root, options, progress)
     sys.stdout.write(_text(args.folder, stills, telemetry))
+    if args.height_datum == "unknown" and stills.heights in HEIGHT_DATUMS:
+        args.height_datum = stills.heights
     args.folder, args.name = stills.folder, args.name or args.folder.stem
     return run_photos(args)
+
+
+def _check(telemetry: "Telemetry", args: argparse.Namespace) -> None:
+    """Telemetry that cannot place the film is refused before anything is made."""
+    import numpy as np
+
+    from featuredb.errors import InvalidValueError, TelemetryError
+
+    if not telemetry.in_video_time and args.gcp is None:
+        raise TelemetryError(
+            f"{telemetry.origin or telemetry.source}: its times are on a clock of its own and cannot be laid "
+            "on the film's yet; give the drone's .srt, a film with its telemetry inside, or --gcp"
+        )
+    if args.height_datum != "unknown" and not np.isfinite(telemetry.height_m).any():
+        raise InvalidValueError(
+            f"--height-datum {args.height_datum}: the telemetry has heights above the place of take-off only"
+        )
 
 
 def _telemetry(args: argparse.Namespace) -> "Telemetry | None":

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -76,34 +77,33 @@ def _rows(motion: Motion, step: float, window: int) -> list[int]:
         if len(segment) < 2:
             continue  # a single frame between two breaks: a blink
         picked = [_sharpest(motion, segment, 0, 0, window)]
-        moved = _since(motion, segment, picked[0])
-        for place in range(picked[0] + 1, len(segment)):
-            if moved[place] < step:
-                continue
-            if place <= picked[-1]:
-                continue
+        place, moved = _due(motion, segment, picked[-1], step)
+        while place is not None:
             picked.append(_sharpest(motion, segment, place, picked[-1] + 1, window))
-            moved = _since(motion, segment, picked[-1])
+            place, moved = _due(motion, segment, picked[-1], step)
         last = len(segment) - 1
-        if moved[last] > 0.5 * step and last > picked[-1]:
+        if moved > 0.5 * step and last > picked[-1]:
             picked.append(_sharpest(motion, segment, last, picked[-1] + 1, window))
         if len(picked) > 1 or len(segment) == len(motion):
             chosen.extend(int(segment[p]) for p in picked)
     return chosen
 
 
-def _since(motion: Motion, segment: np.ndarray, start: int) -> FloatArray:
-    """How far the picture has moved (n,) since a frame of a segment; 0 before it."""
-    moved = np.zeros(len(segment))
-    total = np.eye(3)
+def _due(motion: Motion, segment: NDArray[np.int64], start: int, step: float) -> tuple[int | None, float]:
+    """The first place of a segment at which the picture has moved by a step since `start`, and by how much.
+
+    None where there is none; the way is that to the end then.
+    """
+    total, moved = np.eye(3), 0.0
     for place in range(start + 1, len(segment)):
         total = np.vstack([motion.step[segment[place]], [0.0, 0.0, 1.0]]) @ total
-        there = _INNER @ total.T
-        moved[place] = float(np.linalg.norm(there[:, :2] - _INNER[:, :2], axis=1).mean())
-    return moved
+        moved = float(np.linalg.norm((_INNER @ total.T)[:, :2] - _INNER[:, :2], axis=1).mean())
+        if moved >= step:
+            return place, moved
+    return None, moved
 
 
-def _sharpest(motion: Motion, segment: np.ndarray, place: int, least: int, window: int) -> int:
+def _sharpest(motion: Motion, segment: NDArray[np.int64], place: int, least: int, window: int) -> int:
     """The sharpest frame within the window around a place of a segment."""
     first, end = max(least, place - window), min(len(segment), place + window + 1)
     return first + int(np.argmax(motion.sharpness[segment[first:end]]))

@@ -25,6 +25,7 @@ from ingest.video.motion import MotionOptions, measure_motion
 from ingest.workspace import atomic_file, write_json
 
 _DONE = "film.json"
+RELATIVE_HEIGHTS = "above the place of take-off"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,14 +89,14 @@ def make_stills(
         VideoError: the film cannot be read, or shows too little motion for two keyframes.
     """
     options = options or StillsOptions()
-    told = "none" if telemetry is None else f"{telemetry.origin} {telemetry.source}"
     content = _digest_of(film)
-    name = digest(content, options_fingerprint(options), told)[:16]
+    name = digest(content, film.stem, options_fingerprint(options), _digest_of_telemetry(telemetry))[:16]
     folder = root / "films" / name / film.stem
     done = folder.parent / _DONE
     if done.is_file():
         known = json.loads(done.read_text(encoding="utf-8"))
-        return Stills(**{**known, "folder": folder, "notes": tuple(known["notes"])})
+        if len(list(folder.glob("*.jpg"))) == known["photos"]:
+            return Stills(**{**known, "folder": folder, "notes": tuple(known["notes"])})
     small = _video_options(options, options.motion_side_px)
     with open_video(film, small) as video:
         progress("motion", 0, video.info.frame_count or 0)
@@ -142,6 +143,21 @@ def _digest_of(film: Path) -> str:
         ) from error
 
 
+def _digest_of_telemetry(telemetry: Telemetry | None) -> str:
+    """Of all that positions are made of."""
+    if telemetry is None:
+        return "none"
+    columns = (
+        telemetry.times_s,
+        telemetry.latitude_deg,
+        telemetry.longitude_deg,
+        telemetry.height_m,
+        telemetry.relative_height_m,
+    )
+    parts = [hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest() for column in columns]
+    return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time))
+
+
 def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
     return VideoOptions(max_side_px=side_px, start_s=options.start_s, end_s=options.end_s)
 
@@ -158,8 +174,10 @@ def _places(
     height: FloatArray = at.height_m
     heights: str = telemetry.height_datum
     if not np.isfinite(height).any():
-        height, heights = at.relative_height_m, "above the place of take-off"
+        height, heights = at.relative_height_m, RELATIVE_HEIGHTS
     known = at.has_position & np.isfinite(height)
+    if not known.any():
+        return [None] * len(choice.index), "not known: positions without heights are not used"
     return [
         (float(at.latitude_deg[k]), float(at.longitude_deg[k]), float(height[k])) if known[k] else None
         for k in range(len(choice.index))

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -57,7 +58,7 @@ def register(subparsers: Any) -> None:
 
 
 def run_track(args: argparse.Namespace) -> int:
-    """Track and write; 0, or 1 where no frame was localised.
+    """Track and write; 0, 1 where no frame was localised, 2 where a file could not be written.
 
     Raises:
         InvalidValueError, VideoError, StoreError, ServiceError
@@ -65,6 +66,7 @@ def run_track(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from featuredb.cli.common import open_database
+    from featuredb.errors import FeatureDbError
     from reloc.localiser import Localiser
     from reloc.result import LocaliseRequest
     from reloc.tracking.track_video import TrackVideoOptions, track_video
@@ -72,6 +74,7 @@ def run_track(args: argparse.Namespace) -> int:
 
     for file in args.out:
         check_format(file)
+        _check_folder(file)
     localiser = Localiser.open(open_database(args))
     maps = tuple(args.map) if args.map else None
     found = track_video(
@@ -86,13 +89,33 @@ def run_track(args: argparse.Namespace) -> int:
     found = replace(found, trajectory=trajectory)
     written = []
     known = any(point.pose is not None for point in trajectory.points)
+    failed = []
     for file in args.out:
-        if known or file.suffix.lower() == ".csv":
+        if not known and file.suffix.lower() != ".csv":
+            continue
+        try:
             write_trajectory(file, trajectory)
             written.append(str(file))
+        except (FeatureDbError, OSError) as error:
+            failed.append(f"{file}: {error}")
     summary = _summary(found, [*written, *([str(args.overlay)] if args.overlay else [])])
     sys.stdout.write(json.dumps(summary) + "\n" if args.json else _text(summary))
+    for text in failed:
+        sys.stderr.write(f"featuredb: {text}\n")
+    if failed:
+        return 2
     return 0 if known else _NOTHING_FOUND
+
+
+def _check_folder(file: Path) -> None:
+    """Before an hour of tracking, not after it."""
+    from featuredb.errors import InvalidValueError
+
+    folder = file.parent
+    while not folder.exists() and folder != folder.parent:
+        folder = folder.parent
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise InvalidValueError(f"{file}: expected a folder that can be written, found {folder}")
 
 
 def _camera(text: str | None) -> "Camera | None":

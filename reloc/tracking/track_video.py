@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,7 +11,7 @@ import cv2
 
 from featuredb.errors import IncompatibleExtractorError, VideoError
 from featuredb.geometry.camera import Camera
-from featuredb.video.film import VideoOptions
+from featuredb.video.film import Video, VideoFrame, VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.candidates import IndexedArea
@@ -94,13 +94,15 @@ def track_video(
         on_frame: called after each frame.
 
     Raises:
-        VideoError: the film cannot be read, or has no frames; the overlay cannot be written.
+        VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
+            breaks off, or is stopped by Ctrl-C, what was tracked until then is the result.
         InvalidValueError: the camera is of another shape than the film.
         IncompatibleExtractorError: all maps are of another extractor.
     """
     options = options or TrackVideoOptions()
     areas = _usable(areas, options.track.localise.extractor.fingerprint)
     points: list[TrajectoryPoint] = []
+    trouble: list[str] = []
     clock = time.perf_counter
     began = last = clock()
     decoding = drawing = gap = 0.0
@@ -127,7 +129,7 @@ def track_video(
                 )
             first_s: float | None = None
             mark = clock()
-            for frame in video:
+            for frame in _until_it_ends(video, trouble):
                 decoding += clock() - mark
                 tracked = tracker.track(frame.gray, frame.time_s)
                 point = point_of(tracked)
@@ -145,7 +147,8 @@ def track_video(
                 mark = clock()
             if not points:
                 raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
-            complaints = video.report.complaints()
+            _filled(points, tracker.finish())
+            complaints = (*trouble, *video.report.complaints())
             lens = tracker.camera
     finally:
         cv2.setNumThreads(threads)
@@ -164,14 +167,36 @@ def track_video(
     )
 
 
+def _until_it_ends(video: Video, trouble: list[str]) -> Iterator[VideoFrame]:
+    """The frames, up to where the film cannot be read any more or somebody presses Ctrl-C.
+
+    What was tracked until then is not lost with it; without any frame the error is the caller's.
+    """
+    frames, read = iter(video), 0
+    while True:
+        try:
+            frame = next(frames)
+        except StopIteration:
+            return
+        except (VideoError, KeyboardInterrupt) as error:
+            if not read:
+                raise
+            trouble.append(str(error) or "stopped by hand")
+            return
+        read += 1
+        yield frame
+
+
 def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None:
-    """Earlier points whose poses were found since; the last one then goes on from them."""
-    if not late:
-        return
+    """Lost points whose poses were found since; the last one then goes on from them."""
     first = points[-1].index - len(points) + 1
     for frame in late:
-        points[frame.index - first] = point_of(frame)
-    if points[-1].state == "relocalised":
+        row = frame.index - first
+        if points[row].pose is not None:
+            continue
+        goes_on = row > 0 and points[row - 1].pose is not None
+        points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
+    if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].pose is not None:
         points[-1] = replace(points[-1], state="tracking")
 
 

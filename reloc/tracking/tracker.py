@@ -94,6 +94,7 @@ class Tracker:
         self._areas, self._options = tuple(areas), options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
         self._camera = camera
+        self._found = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._area: Area | None = None
         self._landmarks = Landmarks.none()
@@ -162,6 +163,20 @@ class Tracker:
 
         A localised frame is answered some frames later; from it on, the frames between are tracked, too.
         """
+        return tuple(self._late)
+
+    def finish(self) -> Sequence[TrackedFrame]:
+        """After the last frame: poses of those before it that a frame still being looked for has found."""
+        if self._sent is None or len(self._landmarks):
+            return ()
+        answered = self._sent.answer.result()
+        if not isinstance(answered, Keyframe):
+            return ()
+        self._late = []
+        last = self._frames[-1]
+        found = self._taken(answered, last.gray, None)
+        if found is not None:
+            self._late.append(self._known(last, "tracking" if self._late else "relocalised", found))
         return tuple(self._late)
 
     def _known(self, frame: "_Frame", state: TrackState, fitted: FittedPose) -> TrackedFrame:
@@ -238,6 +253,7 @@ class Tracker:
             return None
         self._area = keyframe.area
         self._camera = self._camera or keyframe.camera
+        self._found = True
         points = keyframe.area.points[keyframe.rows]
         # A point may be seen by two keypoints; it is followed once.
         _, first = np.unique(keyframe.rows, return_index=True)
@@ -308,4 +324,7 @@ class Tracker:
         self._next_keyframe = self._index + options.keyframe_every
 
     def _request_now(self) -> LocaliseRequest:
-        return self._request if self._camera is None else replace(self._request, camera=self._camera)
+        if not self._found:
+            return self._request
+        # What was known of the first frame is not known of one after a loss.
+        return replace(self._request, camera=self._camera, prior=None)

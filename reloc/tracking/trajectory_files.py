@@ -97,6 +97,7 @@ def csv_text(trajectory: Trajectory) -> str:
 def tum_text(trajectory: Trajectory) -> str:
     """TUM's format for evo and its like: time x y z qx qy qz qw, world from camera, world is the UTM grid."""
     found = _known(trajectory, "TUM")
+    _one_datum(trajectory, found)
     zones = {pose.epsg for _, pose in found}
     if len(zones) > 1:
         raise InvalidValueError(
@@ -159,6 +160,7 @@ def geojson_text(trajectory: Trajectory) -> str:
 def kml_text(trajectory: Trajectory) -> str:
     """A line for each stretch without loss, for Google Earth and the like; heights as the maps have them."""
     found = _known(trajectory, "KML")
+    _one_datum(trajectory, found)
     marks = []
     for number, stretch in enumerate(trajectory.stretches()):
         places = " ".join(",".join(f"{v:.10g}" for v in _place(pose)) for _, pose in stretch)
@@ -181,6 +183,7 @@ def geopose_text(trajectory: Trajectory) -> str:
     are Unix milliseconds, or since the film's start where that is not known.
     """
     found = _known(trajectory, "GeoPose")
+    _one_datum(trajectory, found)
     outer = _frame_at(found[0][1])
     start_ms = 0.0 if trajectory.start is None else 1000.0 * trajectory.start.timestamp()
     series = [
@@ -221,9 +224,16 @@ def srt_text(trajectory: Trajectory) -> str:
     abs_alt is the height as the maps have it; angles are those of the camera.
     """
     found = _known(trajectory, "SRT")
-    blocks = []
-    for number, (point, pose) in enumerate(found, start=1):
-        end_s = point.time_s + 1 / 30 if number == len(found) else found[number][0].time_s
+    _one_datum(trajectory, found)
+    times = [point.time_s for point in trajectory.points]
+    usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+    ends_s = [*times[1:], times[-1] + usual_s]
+    end_of = {point.index: end_s for point, end_s in zip(trajectory.points, ends_s, strict=True)}
+    blocks: list[str] = []
+    for point, pose in found:
+        if point.time_s < 0:
+            continue  # subtitles begin with the film
+        number, end_s = len(blocks) + 1, end_of[point.index]
         heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
         clock = ""
         if trajectory.start is not None:
@@ -266,6 +276,15 @@ def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint,
             + (f" ({sorted(reasons)[0]})" if reasons else "")
         )
     return found
+
+
+def _one_datum(trajectory: Trajectory, found: Sequence[tuple[TrajectoryPoint, EarthPose]]) -> None:
+    datums = sorted({pose.height_datum for _, pose in found})
+    if len(datums) > 1:
+        raise InvalidValueError(
+            f"{trajectory.source}: the track crosses from maps with heights {datums[0]} to {datums[1]}, "
+            "which this format cannot say; write CSV or GeoJSON, or name maps of one datum"
+        )
 
 
 def _place(pose: EarthPose) -> list[float]:

@@ -1,5 +1,6 @@
 """`featuredb ingest video`: a film over the test hills becomes a map where its telemetry has them."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,48 @@ def test_the_lag_is_looked_for_and_what_was_found_is_said(film: Path, tmp_path: 
     stills = make_stills(film, read_telemetry(film.with_suffix(".srt")), tmp_path)
     assert stills.late_s == 0.0
     assert any("lag" in note for note in stills.notes)
+
+
+def test_other_telemetry_and_other_names_are_made_anew(film: Path, tmp_path: Path) -> None:
+    """The same file name with other positions; the same film under another name."""
+    telemetry = read_telemetry(film.with_suffix(".srt"))
+    first = make_stills(film, telemetry, tmp_path / "work")
+    moved = tmp_path / film.with_suffix(".srt").name
+    moved.write_text(film.with_suffix(".srt").read_text().replace("[latitude: 4", "[latitude: 3"))
+    second = make_stills(film, read_telemetry(moved), tmp_path / "work")
+    latitudes = [read_exif(sorted(s.folder.iterdir())[0].read_bytes()).latitude_deg for s in (first, second)]
+    assert latitudes[0] is not None
+    assert latitudes[1] is not None
+    assert latitudes[0] - latitudes[1] == pytest.approx(10.0, abs=1e-3)
+    renamed = tmp_path / "renamed.mp4"
+    renamed.write_bytes(film.read_bytes())
+    for name in (film, renamed):
+        stills = make_stills(name, None, tmp_path / "work")
+        assert len(list(stills.folder.glob("*.jpg"))) == stills.photos
+    # A photo that somebody deleted is made again.
+    next(iter(first.folder.glob("*.jpg"))).unlink()
+    again = make_stills(film, telemetry, tmp_path / "work")
+    assert len(list(again.folder.glob("*.jpg"))) == first.photos
+
+
+def test_telemetry_that_cannot_place_the_film_is_refused_at_once(
+    film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log.csv"
+    log.write_text(
+        "time,latitude,longitude,height\n"
+        + "".join(f"2026-05-01T12:00:{k:02d}Z,49.0,8.4{k:03d},150.0\n" for k in range(20))
+    )
+    database = str(tmp_path / "db")
+    command = ["ingest", "video", database, str(film), "--quiet", "--telemetry"]
+    assert main([*command, str(log)]) not in (0, 1)
+    assert "on a clock of its own" in capsys.readouterr().err
+    relative = tmp_path / "relative.srt"
+    text = film.with_suffix(".srt").read_text()
+    relative.write_text(re.sub(r" abs_alt: [\d.]+", "", text))
+    assert main([*command, str(relative), "--height-datum", "egm96"]) not in (0, 1)
+    assert "above the place of take-off only" in capsys.readouterr().err
+    assert not list(tmp_path.rglob("*.jpg"))
 
 
 def test_a_film_that_stands_still_is_refused(tmp_path: Path) -> None:

@@ -2,22 +2,31 @@
 
 import csv
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import reloc.tracking.track_video as track_video_module
 import reloc.tracking.tracker as tracker_module
+import reloc.tracking.trajectory_files as trajectory_files_module
 from featuredb.cli.main import main
+from featuredb.errors import InvalidValueError, VideoError
+from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
+from featuredb.video.film import Video, VideoFrame
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
+from reloc.result import LocaliseRequest
 from reloc.tracking.keyframe import Unmatched
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
+from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import WEST_M, anchored_database
 from tests.support.planar_map import field_texture, view
@@ -139,6 +148,125 @@ def test_frames_between_a_localised_one_and_its_answer_have_poses_in_the_end(
         assert frame.cam_from_local is not None
         off = frame.cam_from_local.center - area_from_hills.act(pose_at(frame.index).center)
         assert np.linalg.norm(off) < 0.3
+
+
+def test_a_film_that_ends_before_the_answer_has_its_poses(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray]
+) -> None:
+    for count in (1, 4):
+        with Tracker(areas, CAMERA, _OPTIONS) as tracker:
+            now = [tracker.track(gray, i / 30.0).state for i, gray in enumerate(film[:count])]
+            late = tracker.finish()
+            assert not tracker.finish()
+        assert now == ["lost"] * count
+        assert [frame.state for frame in late] == ["relocalised", *["tracking"] * (count - 1)]
+        assert [frame.index for frame in late] == list(range(count))
+    with Tracker(areas, CAMERA, _OPTIONS) as tracker:
+        for i, gray in enumerate(film[:9]):
+            tracker.track(gray, i / 30.0)
+        assert not tracker.finish()
+
+
+def test_where_the_film_begins_says_nothing_after_a_loss(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    latitude, longitude, _ = FRAME.geodetic_from_enu(pose_at(0).center)
+    prior = GeoPrior(
+        latitude_deg=float(latitude),
+        longitude_deg=float(longitude),
+        height_m=None,
+        sigma_horizontal_m=20.0,
+        sigma_vertical_m=100.0,
+    )
+    asked: list[GeoPrior | None] = []
+    real = tracker_module.find_frame
+
+    def noted(gray: np.ndarray, request: LocaliseRequest, *rest: object) -> object:
+        asked.append(request.prior)
+        return real(gray, request, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(tracker_module, "find_frame", noted)
+    with Tracker(areas, CAMERA, _OPTIONS, LocaliseRequest(prior=prior)) as tracker:
+        for i, gray in enumerate(film[:32]):
+            tracker.track(gray, i / 30.0)
+    assert asked[0] is prior
+    assert len(asked) > 1
+    assert set(asked[1:]) == {None}
+
+
+def test_frames_that_were_tracked_stay_as_they_were(film: list[np.ndarray]) -> None:
+    """The answer to a keyframe of before the loss comes after it."""
+    known = EarthPose(
+        epsg=32632,
+        utm=np.zeros(3),
+        height_datum="unknown",
+        cam_from_utm_xyzw=np.array([0.0, 0.0, 0.0, 1.0]),
+        geopose=geopose_from_camera(pose_at(0), FRAME),
+        covariance=np.eye(6),
+        map_id="m",
+    )
+    points = [
+        TrajectoryPoint(index=i, time_s=i / 30.0, state=state, pose=None if state == "lost" else known)
+        for i, state in enumerate(["relocalised", "tracking", "lost", "lost", "relocalised"])
+    ]
+    late = [
+        TrackedFrame(index=i, time_s=i / 30.0, state="relocalised" if i == 1 else "tracking") for i in (1, 2)
+    ]
+    track_video_module._filled(points, late)
+    assert points[1].state == "tracking"
+    assert points[1].pose is known
+    assert points[2].state == "tracking"
+    assert [p.state for p in points[3:]] == ["lost", "relocalised"]
+
+
+def test_a_film_that_breaks_off_keeps_what_was_tracked(
+    areas: tuple[IndexedArea, ...], folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = track_video_module.open_video
+
+    class Breaking:
+        def __init__(self, video: Video) -> None:
+            self._video = video
+            self.info, self.report = video.info, video.report
+
+        def __enter__(self) -> "Breaking":
+            self._video.__enter__()
+            return self
+
+        def __exit__(self, *error: object) -> None:
+            self._video.__exit__(*error)  # type: ignore[arg-type]
+
+        def __iter__(self) -> Iterator[VideoFrame]:
+            for k, frame in enumerate(self._video):
+                if k == 12:
+                    raise VideoError("film.mp4: reading failed after the frame at 0.37 s")
+                yield frame
+
+    monkeypatch.setattr(track_video_module, "open_video", lambda *args: Breaking(real(*args)))
+    found = track_video_module.track_video(folder / "film.mp4", areas, camera=CAMERA)
+    assert len(found.trajectory.points) == 12
+    assert "reading failed" in found.complaints[0]
+
+
+def test_one_file_that_cannot_be_written_does_not_cost_the_others(
+    anchored: Path,
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(trajectory: object) -> str:
+        raise InvalidValueError("crosses a zone")
+
+    monkeypatch.setitem(trajectory_files_module._FORMATS, ".tum", refuse)
+    outs = ["--out", str(tmp_path / "t.tum"), "--out", str(tmp_path / "t.csv")]
+    assert main(["track", str(anchored), str(folder / "film.mp4"), *outs, "--end", "0.5"]) == 2
+    assert "t.tum: crosses a zone" in capsys.readouterr().err
+    assert (tmp_path / "t.csv").exists()
+    (tmp_path / "file").write_text("")
+    nowhere = ["--out", str(tmp_path / "file" / "t.csv")]
+    assert main(["track", str(anchored), str(folder / "film.mp4"), *nowhere]) not in (0, 1)
+    assert "a folder that can be written" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

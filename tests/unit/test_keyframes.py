@@ -68,6 +68,20 @@ def test_a_long_film_has_longer_steps_up_to_a_limit() -> None:
     assert len(many.index) > 10
 
 
+def test_the_work_grows_with_the_film_and_not_with_its_square(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How many frames are composed for each keyframe."""
+    seen: list[int] = []
+    real = np.vstack
+
+    def counted(*args: object, **more: object) -> object:
+        seen.append(1)
+        return real(*args, **more)  # type: ignore[call-overload]
+
+    monkeypatch.setattr("ingest.video.keyframes.np.vstack", counted)
+    choose_keyframes(_motion([0.03] * 400), KeyframeOptions(window=0, most=200))
+    assert len(seen) <= 2 * 400
+
+
 def test_nothing_goes_across_a_break() -> None:
     choice = choose_keyframes(_motion([0.03] * 30, broken=(10, 11, 20)), _EXACT)
     rows = [k - 5 for k in choice.index]

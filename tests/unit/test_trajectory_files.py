@@ -170,6 +170,32 @@ def test_our_own_reader_understands_the_subtitles(trajectory: Trajectory, tmp_pa
         assert down == pytest.approx(pitch, abs=0.01)
 
 
+def test_subtitles_end_where_the_track_is_lost(trajectory: Trajectory, tmp_path: Path) -> None:
+    """Frame 2 is lost: the one before is not shown in its place. Frames before the film have no subtitle."""
+    text = _written(tmp_path, "t.srt", trajectory)
+    times = re.findall(r"(\S+) --> (\S+)", text)
+    assert times[1] == ("00:00:00,040", "00:00:00,080")
+    assert times[2] == ("00:00:00,120", "00:00:00,160")
+    assert times[-1] == ("00:00:00,200", "00:00:00,240")
+    early = replace(trajectory, points=tuple(replace(p, time_s=p.time_s - 0.06) for p in trajectory.points))
+    write_trajectory(tmp_path / "t.srt", early)
+    shown = re.findall(r"(\S+) --> ", (tmp_path / "t.srt").read_text())
+    assert shown == ["00:00:00,060", "00:00:00,100", "00:00:00,140"]
+
+
+@pytest.mark.parametrize("kind", ["tum", "kml", "json", "srt"])
+def test_heights_of_two_datums_are_not_mixed(kind: str, trajectory: Trajectory, tmp_path: Path) -> None:
+    last = trajectory.points[-1]
+    assert last.pose is not None
+    other = replace(last, pose=replace(last.pose, height_datum="egm96"))
+    mixed = replace(trajectory, points=(*trajectory.points[:-1], other))
+    with pytest.raises(InvalidValueError, match="heights egm96 to ellipsoidal"):
+        write_trajectory(tmp_path / f"t.{kind}", mixed)
+    for fine in ("csv", "geojson"):
+        write_trajectory(tmp_path / f"t.{fine}", mixed)
+        assert "egm96" in (tmp_path / f"t.{fine}").read_text()
+
+
 @pytest.mark.parametrize("name", ["t.txt", "t", "t.gpx"])
 def test_other_formats_are_refused_before_anything_is_done(
     name: str, trajectory: Trajectory, tmp_path: Path
