@@ -240,10 +240,10 @@ def test_priors_select_and_contradict(server, photos, capsys):
 
 
 def test_a_southern_prior_is_understood():
-    from reloc.cli import _parse_prior
+    from reloc.query_arguments import parse_prior
 
     args = parse("query", "x.jpg", "--prior=-33.86,151.21,25")
-    assert _parse_prior(args.prior) == PriorRequest(lat=-33.86, lon=151.21, sigma_m=25.0)
+    assert parse_prior(args.prior) == PriorRequest(lat=-33.86, lon=151.21, sigma_m=25.0)
 
 
 def test_bad_arguments_are_explained(photos, tmp_path, capsys):
