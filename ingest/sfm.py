@@ -16,6 +16,7 @@ from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap_bridge import Model, SfmPhoto, run_incremental, write_database
 from ingest.extract import read_keypoints
 from ingest.matching import read_two_view
+from ingest.submodel import keep_photos
 from ingest.view_graph_focals import calibrate_focals, start_from
 from ingest.workspace import atomic_folder
 
@@ -213,16 +214,16 @@ def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
 
 
 def disjoint(models: Sequence[Model], min_photos: int) -> list[Model]:
-    """Large models first; a later model keeps out if it shares photos with an earlier one.
+    """Large models first; a later model loses the photos that it shares with earlier ones.
 
     COLMAP may grow a second model into photos of the first. Two maps with the same photos would agree
-    with themselves; the smaller one says nothing that the larger does not.
+    with themselves. What is left of the smaller one counts if it still hangs together.
     """
     chosen: list[Model] = []
     taken: set[int] = set()
     for model in models:
-        rows = set(model.rows.tolist())
-        if len(rows) >= min_photos and not rows & taken:
-            chosen.append(model)
-            taken |= rows
+        rest = keep_photos(model, set(model.rows.tolist()) - taken, least=min_photos)
+        if rest is not None:
+            chosen.append(rest)
+            taken |= set(rest.rows.tolist())
     return chosen

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 from ingest.colmap_bridge import Model
 from ingest.growth.links import firm_parts
-from ingest.growth.submodel import keep_photos
+from ingest.submodel import keep_photos
 
-# What a reconstruction is refused for whose photos are at several places.
-AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "AMBIGUOUS", "RESIDUALS")
+# What a reconstruction is refused for whose photos are at several places. Of 194 photos of a simulated
+# town, 125 of one place, the localised ones agreed well enough, and 54 of 158 geotags did not.
+AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "AMBIGUOUS", "RESIDUALS", "CONTRADICTS_GPS", "NOT_VISIBLE")
 _LEAST_PHOTOS = 3
 
 

@@ -30,12 +30,12 @@ from ingest.growth.map_graph import growth_of, placed_maps
 from ingest.growth.not_found import NotFound, NotFoundRows
 from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
 from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
-from ingest.growth.submodel import keep_photos
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.growth.witnesses import NewPhotos
 from ingest.map_builder import MapIdentity
 from ingest.pairs import Pair
 from ingest.photo import Photo
+from ingest.submodel import keep_photos
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 

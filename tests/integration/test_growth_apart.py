@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.store import Database
 from ingest.colmap_bridge import Model
 from ingest.growth.grow import GrowthOptions, GrowthPhotos, grow
 from ingest.growth.growth_report import GrowthReport
-from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, walk
+from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import looking_at
 
@@ -20,11 +21,11 @@ _JOINT = 25  # points of one facade that the joint rests on; photos see several 
 _APART_M = 60.0  # that the reconstruction has the two groups from where they are to each other
 
 
-def _north() -> list:
+def _north(count: int = 5) -> list[Rigid3]:
     """Cameras on the other side, which see other faces of the box from a little further off."""
     return [
         looking_at(np.array([-12.0 + 6.0 * k, 50.0, 32.0]), np.array([6.0 * k - 8.0, 0.0, 3.0]))
-        for k in range(5)
+        for k in range(count)
     ]
 
 
@@ -50,15 +51,17 @@ def _joined(first: Model, second: Model) -> Model:
     )
 
 
-@pytest.fixture(scope="module")
-def groups() -> tuple[NewPhotos, NewPhotos]:
+def _groups(south: int, north: int, *, tagged: bool = False) -> tuple[NewPhotos, NewPhotos]:
+    """Photos from two sides; with `tagged` those from the north say truly where they are."""
     shift = Sim3(scale=1.0, rotation=np.eye(3), translation=np.array([_APART_M, 0.0, 0.0]))
-    rng = np.random.default_rng(11)
-    south = take_photos(rng, POINTS, DESCRIPTORS, walk(5), camera_key=KEY)
-    north = take_photos(
-        rng, POINTS, DESCRIPTORS, _north(), camera_key=KEY, sfm_from_local=SFM_FROM_LOCAL @ shift
-    )
-    return south, north
+    rng, poses = np.random.default_rng(11), _north(north)
+    return (
+        take_photos(rng, POINTS, DESCRIPTORS, walk(south, step_m=4.0), camera_key=KEY),
+        take_photos(
+            rng, POINTS, DESCRIPTORS, poses, camera_key=KEY, sfm_from_local=SFM_FROM_LOCAL @ shift,
+            gps=[prior(p) for p in poses] if tagged else None,
+        ),
+    )  # fmt: skip
 
 
 def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOptions) -> GrowthReport:
@@ -80,14 +83,11 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOpt
 
 @pytest.mark.parametrize("links", [GrowthOptions().joint_links, ()], ids=["apart", "whole"])
 def test_both_places_become_maps(
-    groups: tuple[NewPhotos, NewPhotos],
-    tmp_path: Path,
-    caplog: pytest.LogCaptureFixture,
-    links: tuple[float, ...],
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, links: tuple[float, ...]
 ) -> None:
     """As a whole it is refused; then the photos that are localised by themselves form a group."""
     with caplog.at_level(logging.INFO, "ingest.growth"):
-        report = _grown(groups, tmp_path, replace(GrowthOptions(), joint_links=links))
+        report = _grown(_groups(5, 5), tmp_path, replace(GrowthOptions(), joint_links=links))
     names = [set(m.photos) for m in report.maps if m.map_id]
     apart = [r.message for r in caplog.records if "at several places" in r.message]
     if not links:
@@ -100,3 +100,14 @@ def test_both_places_become_maps(
     north = {f"north-new-{k}.jpg" for k in range(5)}
     south = {f"new-{k}.jpg" for k in range(5)}
     assert sorted(names, key=min) == sorted((south, north), key=min)
+
+
+def test_geotags_say_so_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Three of ten photos may see themselves elsewhere; that their geotags are there as well is enough."""
+    with caplog.at_level(logging.INFO, "ingest.growth"):
+        report = _grown(_groups(7, 3, tagged=True), tmp_path, GrowthOptions())
+    apart = [r.message for r in caplog.records if "at several places" in r.message]
+    assert len(apart) == 1
+    assert "3 of 3 positions contradict" in apart[0]
+    names = sorted((set(m.photos) for m in report.maps if m.map_id), key=len)
+    assert names == [{f"north-new-{k}.jpg" for k in range(3)}, {f"new-{k}.jpg" for k in range(7)}]

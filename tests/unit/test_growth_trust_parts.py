@@ -30,9 +30,9 @@ from ingest.growth.new_overlaps import overlaps_to_measure
 from ingest.growth.overlaps import model_of
 from ingest.growth.promotion import Promotion, canary_gate, contradiction_gate, points_gate
 from ingest.growth.replacing import MovedMap, Replacement
-from ingest.growth.submodel import keep_photos
 from ingest.growth.trusted_points import answering_with, confirmed_points
 from ingest.growth.witnesses import Heard
+from ingest.submodel import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, strip_map
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
@@ -146,6 +146,7 @@ def _model() -> Model:
 def test_a_model_is_cut_to_the_photos_that_hang_together() -> None:
     model = _model()
     assert keep_photos(model, range(8)) is model
+    assert keep_photos(model, range(8), least=len(model.rows) + 1) is None
     cut = keep_photos(model, [1, 2, 5])
     assert cut is not None
     assert cut.rows.tolist() == [1, 2, 5]

@@ -80,23 +80,31 @@ def test_a_stray_position_does_not_move_the_frame() -> None:
 
 
 def _model(rows: list[int]) -> Model:
+    """Photos that all see the same forty points."""
     count = len(rows)
     return Model(
         cameras=(CAMERA,),
         rows=np.array(rows),
         camera_of=np.zeros(count, np.int64),
         cam_from_sfm=tuple(Rigid3.identity() for _ in rows),
-        xyz=np.zeros((0, 3)),
-        point_of=np.zeros(0, np.int64),
-        photo_of=np.zeros(0, np.int64),
-        keypoint_of=np.zeros(0, np.int64),
+        xyz=np.zeros((40, 3)),
+        point_of=np.repeat(np.arange(40), count),
+        photo_of=np.tile(np.arange(count), 40),
+        keypoint_of=np.repeat(np.arange(40), count),
     )
 
 
-def test_small_and_overlapping_models_are_dropped() -> None:
+def test_small_models_are_dropped_and_a_photo_is_in_one_model_only() -> None:
+    """The second model loses the photo that it shares with the first, and what hung on that photo alone."""
     models = [_model([0, 1, 2, 3]), _model([3, 4, 5]), _model([6, 7, 8]), _model([9, 10])]
     assert [m.rows.tolist() for m in disjoint(models, 3)] == [[0, 1, 2, 3], [6, 7, 8]]
-    assert [m.rows.tolist() for m in disjoint(models, 2)] == [[0, 1, 2, 3], [6, 7, 8], [9, 10]]
+    parts = disjoint(models, 2)
+    assert [m.rows.tolist() for m in parts] == [[0, 1, 2, 3], [4, 5], [6, 7, 8], [9, 10]]
+    assert (parts[1].track_lengths() == 2).all()
+    chain = _model([3, 11, 12])
+    apart = replace(chain, point_of=chain.point_of + 40 * (chain.photo_of == 2))  # 12 sees nothing of 11's
+    apart = replace(apart, xyz=np.zeros((80, 3)))
+    assert [m.rows.tolist() for m in disjoint([models[0], apart], 2)] == [[0, 1, 2, 3]]
 
 
 def test_pixel_thresholds_grow_with_the_image() -> None:

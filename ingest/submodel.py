@@ -16,7 +16,7 @@ def keep_photos(model: Model, rows: Collection[int], least: int = 2) -> Model | 
     """The largest part of the model that hangs together among the given rows; None if it is under `least`."""
     wanted = np.isin(model.rows, np.array(sorted(rows), dtype=np.int64))
     if wanted.all():
-        return model
+        return model if len(model.rows) >= least else None
     seen = wanted[model.photo_of]
     count = len(model.rows)
     sees = sparse.csr_array(
