@@ -1,10 +1,11 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--survey 7 11 70 12]
+    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--survey 9 13 100 14] [--alike 30]
 
 The world is that of `featuredb.simworld.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
-with the accuracy of its receiver. All other photos are contributed and grown at once.
+with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
+most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
 
 Prints what became of each kind of photo, by kind, owner and geotag, and by how much of what it shows the
 survey has mapped; writes community.json and plan.png.
@@ -70,6 +71,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         options = replace(options, flight=flight)
         name += "-" + "-".join(map(str, args.survey))
+    if args.alike is not None:
+        options = replace(options, sights=args.alike, zipf=None)
+        name += f"-alike-{args.alike}"
     folder = args.world or args.out / name
     album = made(write_community, folder, options, args.workers)
     database = anchored(
@@ -213,6 +217,9 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         default=None,
         metavar=("LINES", "PHOTOS", "METRES", "OBLIQUE"),
         help="the anchored flight: lines, photos of each, height, oblique photos around",
+    )
+    parser.add_argument(
+        "--alike", type=int, default=None, metavar="SIGHTS", help="so many sights, visited nearly alike"
     )
     parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)

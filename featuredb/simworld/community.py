@@ -50,6 +50,8 @@ class CommunityOptions:
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
+        zipf: how much more they visit the first ones (`plan_visits`). Photo sites show a few landmarks: the
+            paper's 120,000 photos were of seven, and in every town one place leads. None: nearly alike.
         width: of the widest camera, pixels.
         geotags: how wrong they are.
         texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
@@ -67,7 +69,8 @@ class CommunityOptions:
     copies: int = 40
     indoor: int = 12
     portraits: int = 12
-    sights: int = 30
+    sights: int = 12
+    zipf: float | None = 1.0
     width: int = 1600
     geotags: GeotagOptions = field(default_factory=GeotagOptions)
     texel_m: float = 0.06
@@ -139,7 +142,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
     home, away = options.scene("home/0/000"), options.scene("away/0/000")
     people = community(options.width)
     places = find_sights(home, options.sights, options.seed, options.flight.center_m)
-    mine = plan_visits(home, people, places, options.photos, options.seed, "home")
+    mine = plan_visits(home, people, places, options.photos, options.seed, "home", zipf=options.zipf)
     places = find_sights(away, options.sights, options.seed + 1)
     theirs = plan_visits(
         away,
@@ -150,6 +153,7 @@ def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
         "away",
         first_visit=10_000,
         kind="other_town",
+        zipf=options.zipf,
     )
     rng = np.random.default_rng((options.seed, 58))
     mine = tagged(home, mine, people, options.geotags, rng)

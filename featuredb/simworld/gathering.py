@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.album import PlannedPhoto
 from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.edits import Edit
@@ -31,13 +32,17 @@ def plan_visits(
     *,
     first_visit: int = 0,
     kind: str = "",
+    zipf: float | None = None,
 ) -> list[PlannedPhoto]:
     """`count` photos of a town by these people, visit by visit; without geotags, under provisional names.
 
     Everybody goes to the popular sights, and each has a taste of his own.
 
     Args:
+        places: most popular first.
         town: first part of the scenes' keys; only photos of "home" have a place in the truth.
+        zipf: the k-th sight is visited k**-zipf as often as the first, each person's taste apart; None: by
+            the sights' weights, which differ by little.
         first_visit: number of the first visit; visits of one album differ.
         kind: of the facts; by default street or drone.
     """
@@ -47,7 +52,7 @@ def plan_visits(
     around = Surroundings(scene)
     shares = np.array([p.weight for p in people]) / sum(p.weight for p in people)
     taken_by = np.zeros(len(people))
-    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * [s.weight**0.7 for s in places]
+    taste = rng.lognormal(0.0, 0.5, (len(people), len(places))) * _popularity(places, zipf)
     photos: list[PlannedPhoto] = []
     visit = first_visit
     while len(photos) < count:
@@ -64,6 +69,12 @@ def plan_visits(
                 f"plan_visits: only {len(photos)} of {count} photos came of {visit} visits"
             )
     return photos
+
+
+def _popularity(places: Sequence[Sight], zipf: float | None) -> FloatArray:
+    if zipf is None:
+        return np.array([s.weight**0.7 for s in places])
+    return np.arange(1.0, len(places) + 1.0) ** -zipf
 
 
 def _visit(
