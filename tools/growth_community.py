@@ -7,6 +7,9 @@ wrong by kilometres; another town's photos, re-uploads, rooms and faces among th
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
 
+With --scan an airborne scan of the town is in store, and what grows is compared with it
+(`ingest/growth/scan_check.py`; `tools/scan_check_study.py` prints its figures).
+
 Prints what became of each kind of photo, by kind, owner and geotag, and by how much of what it shows the
 survey has mapped; writes community.json and plan.png.
 Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
@@ -25,10 +28,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from featuredb.lidar.add import add_scan
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.community import CommunityOptions, write_community
 from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.scan_file import write_scan
 from featuredb.store import Database
+from featuredb.store.scans import has_scans
 from ingest.growing import grow_candidates
 from tools.growth_common import (
     Album,
@@ -79,6 +86,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     database = anchored(
         args.out / "db", album, "survey", max_features=args.max_features, workers=args.workers
     )
+    if args.scan and not has_scans(database):
+        scan = args.out / "town.laz"
+        write_scan(scan, scan_town(options.scene("home/0/000")))
+        add_scan(database, [scan])
     everything = album.of(*_OWN, *_FOREIGN, "copy")
     give(database, album, everything)
     say(f"{len(everything)} photos contributed")
@@ -221,6 +232,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--alike", type=int, default=None, metavar="SIGHTS", help="so many sights, visited nearly alike"
     )
+    parser.add_argument("--scan", action="store_true", help="a scan of the town is in store")
     parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)
 

@@ -30,6 +30,7 @@ from ingest.growth.map_graph import growth_of, placed_maps
 from ingest.growth.not_found import NotFound, NotFoundRows
 from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
 from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
+from ingest.growth.scan_check import ScanCheckOptions, scan_gate, with_gate
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.growth.witnesses import NewPhotos
 from ingest.map_builder import MapIdentity
@@ -56,7 +57,7 @@ class GrowthOptions:
             less than the first of these of their points, its parts at the second, and so on. 194 photos
             of a simulated town that look-alikes had joined from five places fell apart at 0.10 into parts
             of one place each, but for ten photos; at 0.25 (`SettleOptions.min_link`) right ones do, too.
-        localise, grow, promotion, replacing: of the steps.
+        localise, grow, scan, promotion, replacing: of the steps.
     """
 
     drift_budget_m: float = 0.5
@@ -64,6 +65,7 @@ class GrowthOptions:
     joint_links: tuple[float, ...] = (0.10, 0.15, 0.25)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     grow: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
+    scan: ScanCheckOptions = field(default_factory=ScanCheckOptions)
     promotion: PromotionOptions = field(default_factory=PromotionOptions)
     replacing: ReplaceOptions = field(default_factory=ReplaceOptions)
 
@@ -297,6 +299,13 @@ def _take(
         run.refused.append(_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
         run.why.update(dict.fromkeys(rows, (gate.reason, gate.message)))
         return rows_within(feature_map, rows, relative, options.drift_budget_m)
+    scan = scan_gate(database, feature_map, options.scan)
+    if scan is not None:
+        feature_map = with_gate(feature_map, scan)
+        if not scan.passes:
+            run.refused.append(_entry(feature_map, grown, names, "refused", scan.reason, scan.message))
+            run.why.update(dict.fromkeys(rows, (scan.reason, scan.message)))
+            return None
     known = {m.map_id: m for m in snapshot.maps(include_retired=True)}.get(feature_map.map_id)
     if known is not None and known.status == "retired":
         reason = f"map {known.map_id} of these photos was retired: {known.status_reason}"

@@ -27,6 +27,7 @@ from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 from reloc.result import LocaliseRequest
 from tests.support.hill_photos import CAMERA, FRAME
+from tests.support.hill_scan import write_hill_scan
 from tests.support.hill_walk import (
     NOW,
     WEST_M,
@@ -326,3 +327,26 @@ def test_an_empty_inbox_is_no_error(database: Database) -> None:
         [Contribution(image=b"no image", width=1, height=1, owner="x", licence="y", received_at=NOW)],
     )
     assert [p.outcome for p in grow_candidates(database, growing()).photos] == ["refused"]
+
+
+@pytest.mark.parametrize("up_m", [0.0, 1.0])
+def test_a_scan_in_store_has_its_say(database: Database, tmp_path: Path, up_m: float) -> None:
+    """The grown map claims centimetres; a scan that has the hills a metre higher keeps it out."""
+    pytest.importorskip("small_gicp")
+    pytest.importorskip("laspy")
+    from featuredb.lidar.add import AddOptions, add_scan
+
+    anchor = next(iter(database.snapshot().maps()))
+    datum = database.snapshot().load_map(anchor.map_id).height_datum
+    scan = write_hill_scan(tmp_path / "hills.laz", offset_m=(0.0, 0.0, up_m), half_side_m=50.0, spacing_m=0.4)
+    add_scan(database, [scan], AddOptions(height_datum=datum))
+    give(database, step_of(_EAST_M))
+    report = grow_candidates(database, growing())
+    if up_m:
+        assert {m.reason_code for m in report.maps} == {"CONTRADICTS_SCAN"}
+        assert {p.outcome for p in report.photos} == {"waiting"}
+        assert len(database.snapshot().maps()) == 1
+        return
+    (grown,) = (m for m in report.maps if m.map_id)
+    assert grown.gates["scan"]["passes"]
+    assert 0.0 < grown.gates["scan"]["figure"] < grown.gates["scan"]["limit"]
