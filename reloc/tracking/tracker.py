@@ -22,6 +22,7 @@ from reloc.tracking.keyframe import Keyframe, Unmatched, find_frame, match_keyfr
 from reloc.tracking.landmarks import Landmarks
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
+from reloc.tracking.recent import RecentFrame, RecentFrames
 
 TrackState = Literal["tracking", "relocalised", "lost"]
 
@@ -64,19 +65,11 @@ class _Sent:
     answer: "Future[Keyframe | Unmatched]"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Frame:
-    """A frame that may still be needed."""
-
-    index: int
-    time_s: float
-    gray: NDArray[np.uint8]
-
-
 class Tracker:
     """Follows one video. Frames come in order; a context manager, since keyframes have a thread.
 
     The same frames give the same poses: what the thread answers is taken at a frame that is known beforehand.
+    With `TrackOptions.live` no frame waits for the thread instead.
     """
 
     def __init__(
@@ -99,9 +92,7 @@ class Tracker:
         self._area: Area | None = None
         self._landmarks = Landmarks.none()
         self._poses: deque[tuple[float, Rigid3]] = deque(maxlen=2)
-        self._frames: deque[_Frame] = deque(
-            maxlen=1 + max(self._options.answer_after, self._options.lost_answer_after)
-        )
+        self._frames = RecentFrames(1 + max(self._options.answer_after, self._options.lost_answer_after))
         self._late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
         self._next_keyframe = 0
@@ -130,9 +121,9 @@ class Tracker:
     def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
         """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
         self._index += 1
-        before = self._frames[-1] if self._frames else None
-        now = _Frame(index=self._index, time_s=time_s, gray=gray)
-        self._frames.append(now)
+        before = self._frames.last
+        now = RecentFrame(index=self._index, time_s=time_s, gray=gray)
+        self._frames.add(now, None if self._sent is None else self._sent.index)
         self._late = []
         fitted = self._followed(before, now) if before is not None and len(self._landmarks) else None
         if fitted is not None:
@@ -150,12 +141,29 @@ class Tracker:
             self._unconfirmed += 1
             if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
                 self._why, fitted = f"{answered.reason}: {answered.detail}", None
+        if answered is not None:
+            self._sent = None
         self._send(gray, fitted)
         if fitted is None:
             self._landmarks = Landmarks.none()
             self._poses.clear()
             return TrackedFrame(index=self._index, time_s=time_s, state="lost", detail=self._why)
         return self._known(now, state, fitted)
+
+    def use_areas(self, areas: Sequence[IndexedArea]) -> None:
+        """Track by these areas from the next frame on.
+
+        A track in an area that is still among them goes on; another is lost, and looked for anew, since its
+        map may have been moved or taken back.
+        """
+        self._areas = tuple(areas)
+        if len(self._landmarks) and any(area.area is self._area for area in self._areas):
+            return
+        if len(self._landmarks):
+            self._why = "LOST: the maps have changed"
+        self._landmarks = Landmarks.none()
+        self._poses.clear()
+        self._area, self._sent = None, None
 
     @property
     def late(self) -> Sequence[TrackedFrame]:
@@ -173,13 +181,15 @@ class Tracker:
         if not isinstance(answered, Keyframe):
             return ()
         self._late = []
-        last = self._frames[-1]
+        last = self._frames.last
+        assert last is not None
         found = self._taken(answered, last.gray, None)
+        self._sent = None
         if found is not None:
             self._late.append(self._known(last, "tracking" if self._late else "relocalised", found))
         return tuple(self._late)
 
-    def _known(self, frame: "_Frame", state: TrackState, fitted: FittedPose) -> TrackedFrame:
+    def _known(self, frame: RecentFrame, state: TrackState, fitted: FittedPose) -> TrackedFrame:
         return TrackedFrame(
             index=frame.index,
             time_s=frame.time_s,
@@ -194,7 +204,7 @@ class Tracker:
             rows=self._landmarks.rows,
         )
 
-    def _followed(self, before: "_Frame", now: "_Frame") -> FittedPose | None:
+    def _followed(self, before: RecentFrame, now: RecentFrame) -> FittedPose | None:
         """The landmarks in this frame, and the pose that they give; those that disagree are dropped."""
         assert self._camera is not None
         marks = self._landmarks
@@ -233,10 +243,11 @@ class Tracker:
         return Rigid3.exp(min(share, 3.0) * (second @ first.inverse()).log()) @ second
 
     def _answer(self) -> Keyframe | Unmatched | None:
-        """What became of a keyframe that is due."""
-        if self._sent is None or self._index < self._sent.due:
+        """What became of a keyframe: at the frame at which it is due; live: as soon as it is there."""
+        if self._sent is None:
             return None
-        return self._sent.answer.result()
+        ready = self._sent.answer.done() if self._options.live else self._index >= self._sent.due
+        return self._sent.answer.result() if ready else None
 
     def _taken(
         self, keyframe: Keyframe, gray: NDArray[np.uint8], fitted: FittedPose | None
@@ -247,10 +258,11 @@ class Tracker:
         keyframe had them.
         """
         assert self._sent is not None
-        sent, self._sent = self._sent, None
-        before = next((f for f in self._frames if f.index == sent.index), None)
-        if before is None or (fitted is not None and keyframe.area is not self._area):
+        sent = self._sent
+        since = self._frames.since(sent.index)
+        if not since or (fitted is not None and keyframe.area is not self._area):
             return None
+        before = since[0]
         self._area = keyframe.area
         self._camera = self._camera or keyframe.camera
         self._found = True
@@ -264,7 +276,7 @@ class Tracker:
             born=np.full(len(first), sent.index, dtype=np.int64),
         )
         if fitted is None:
-            return self._begun(fresh, keyframe.cam_from_local, before)
+            return self._begun(fresh, keyframe.cam_from_local, since)
         pose, options = fitted.cam_from_local, self._options
         step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
             keyframe.cam_from_local.act(fresh.points)
@@ -275,17 +287,18 @@ class Tracker:
         everything = self._landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
         return self._agreed(self._spread(everything, gray), None, pose)
 
-    def _begun(self, fresh: Landmarks, pose: Rigid3, first: "_Frame") -> FittedPose | None:
-        """The track from a localised frame to the one at hand, frame by frame.
+    def _begun(self, fresh: Landmarks, pose: Rigid3, since: Sequence[RecentFrame]) -> FittedPose | None:
+        """The track from a localised frame, the first of `since`, to the one at hand, frame by frame.
 
-        Where it breaks, the frames before have their poses all the same.
+        Where it breaks, the frames before have their poses all the same. Live, some frames are passed over.
         """
+        first = since[0]
         self._landmarks = self._spread(fresh, first.gray)
         self._poses.clear()
         self._poses.append((first.time_s, pose))
         fitted = self._agreed(self._landmarks, None, pose)
         state: TrackState = "relocalised"
-        for before, after in pairwise([f for f in self._frames if f.index >= first.index]):
+        for before, after in pairwise(self._catching_up(since)):
             if fitted is None:
                 return None
             self._poses[-1] = (before.time_s, fitted.cam_from_local)
@@ -296,6 +309,14 @@ class Tracker:
                 self._poses.append((after.time_s, fitted.cam_from_local))
         return fitted
 
+    def _catching_up(self, since: Sequence[RecentFrame]) -> Sequence[RecentFrame]:
+        """The frames by which a track comes to the one at hand: all; live, so few that it is soon there."""
+        steps = len(since) - 1
+        if not self._options.live or steps <= self._options.live_steps:
+            return since
+        rows = np.linspace(0, steps, self._options.live_steps + 1).round().astype(np.int64)
+        return [since[row] for row in rows]
+
     def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
         options = self._options
         return marks.spread(options.landmarks, options.columns, options.rows, gray.shape[1], gray.shape[0])
@@ -303,8 +324,6 @@ class Tracker:
     def _send(self, gray: NDArray[np.uint8], fitted: FittedPose | None) -> None:
         """Hand this frame to the thread if it is time for a keyframe and the thread is free."""
         options = self._options
-        if self._sent is not None and self._index >= self._sent.due:
-            self._sent = None
         if self._sent is not None:
             return
         if fitted is None:
