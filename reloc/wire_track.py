@@ -39,8 +39,8 @@ class EndReason(StrEnum):
 class TrackOpenRequest(Request):
     """Attachment of the query that opens a session.
 
-    `camera`: intrinsics of the frames, of any size of the same picture; without it they are estimated with the
-    first pose. `prior`: where the first frame may have been taken.
+    `camera`: intrinsics of the frames, of any size of the same picture; without it they are estimated with
+    the first pose. `prior`: where the first frame may have been taken.
     """
 
     camera: CameraRequest | None = None

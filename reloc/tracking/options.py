@@ -53,8 +53,8 @@ class TrackOptions:
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
         live: answers are taken as soon as they are there, and no frame waits for one. live_steps: frames by
-            which the track is then carried from a frame that was found to the one at hand; six take some 60 ms,
-            and frames that far apart (a tenth of a second) still show the same patches.
+            which the track is then carried from one that was found to the one at hand, not by all of them:
+            the client waits meanwhile.
         min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
             track is lost, however well its old landmarks agree with each other.
         localise: how a lost track is found again; its extractor is that of keyframes, too.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import cv2
 
-from featuredb.errors import IncompatibleExtractorError, VideoError
+from featuredb.errors import VideoError
 from featuredb.geometry.camera import Camera
 from featuredb.video.film import Video, VideoFrame, VideoOptions
 from featuredb.video.frames import Source, open_video
@@ -17,6 +17,7 @@ from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
 from reloc.tracking.film_overlay import draw_frame
+from reloc.tracking.keyframe import usable_areas
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
@@ -100,7 +101,7 @@ def track_video(
         IncompatibleExtractorError: all maps are of another extractor.
     """
     options = options or TrackVideoOptions()
-    areas = _usable(areas, options.track.localise.extractor.fingerprint)
+    areas = usable_areas(areas, options.track.localise.extractor.fingerprint)
     points: list[TrajectoryPoint] = []
     trouble: list[str] = []
     clock = time.perf_counter
@@ -198,16 +199,6 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
         points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
     if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].pose is not None:
         points[-1] = replace(points[-1], state="tracking")
-
-
-def _usable(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
-    """Those whose descriptors can be compared with the film's."""
-    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
-    if areas and not usable:
-        raise IncompatibleExtractorError(
-            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
-        )
-    return usable
 
 
 def _resized(camera: Camera, width: int, height: int) -> Camera:
