@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,11 +11,12 @@ import cv2
 
 from featuredb.errors import VideoError
 from featuredb.geometry.camera import Camera
-from featuredb.video.film import Video, VideoFrame, VideoOptions
+from featuredb.video.film import VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
+from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.film_overlay import draw_frame
 from reloc.tracking.keyframe import usable_areas
 from reloc.tracking.options import TrackOptions
@@ -130,7 +131,7 @@ def track_video(
                 )
             first_s: float | None = None
             mark = clock()
-            for frame in _until_it_ends(video, trouble):
+            for frame in until_it_ends(video, trouble):
                 decoding += clock() - mark
                 tracked = tracker.track(frame.gray, frame.time_s)
                 point = point_of(tracked)
@@ -166,26 +167,6 @@ def track_video(
         ),
         complaints=complaints,
     )
-
-
-def _until_it_ends(video: Video, trouble: list[str]) -> Iterator[VideoFrame]:
-    """The frames, up to where the film cannot be read any more or somebody presses Ctrl-C.
-
-    What was tracked until then is not lost with it; without any frame the error is the caller's.
-    """
-    frames, read = iter(video), 0
-    while True:
-        try:
-            frame = next(frames)
-        except StopIteration:
-            return
-        except (VideoError, KeyboardInterrupt) as error:
-            if not read:
-                raise
-            trouble.append(str(error) or "stopped by hand")
-            return
-        read += 1
-        yield frame
 
 
 def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None:
