@@ -5,8 +5,9 @@
 The server is `featuredb serve DB`, a process of its own on a free port of this machine; the clients are
 threads of this process. Prints, of all clients together, the median and the 95th percentile of the time from
 sending a frame to its pose, how many of the frames were answered, and the median and 95th percentile of the
-server's stages: queue (waiting for the frame before), decode, track, reply (the pose on Earth). The load of
-the machine stands beside it: figures of a busy machine are not those of the program.
+server's stages: queue (waiting for the frame before), decode, track, reply (the pose on Earth); and how many
+cores the server took. The load of the machine stands beside it: figures of a busy machine are not those of the
+program.
 
 A town and a film of it, in a few minutes:
 
@@ -24,6 +25,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -38,8 +40,8 @@ _SERVE = "import sys; from featuredb.cli.main import main; sys.exit(main(sys.arg
 
 
 @contextlib.contextmanager
-def serving(database: Path, sessions: int) -> Iterator[str]:
-    """A server of the database in a process of its own; its endpoint."""
+def serving(database: Path, sessions: int) -> Iterator[tuple[str, int]]:
+    """A server of the database in a process of its own: its endpoint and its number."""
     options = ["--listen", "tcp/127.0.0.1:0", "--live-sessions", str(sessions), "--contributions", "off"]
     with subprocess.Popen(
         [sys.executable, "-c", _SERVE, "serve", str(database), *options],
@@ -53,7 +55,7 @@ def serving(database: Path, sessions: int) -> Iterator[str]:
             found = re.search(r" on (tcp/\S+);", said)
             if found is None:
                 raise SystemExit(f"live_latency: the server did not start ({said!r}); try `featuredb serve`")
-            yield found[1]
+            yield found[1], server.pid
         finally:
             server.terminate()
 
@@ -70,6 +72,12 @@ def measure(
 
     with ThreadPoolExecutor(clients) as pool:
         return list(pool.map(stream, range(clients)))
+
+
+def cpu_s(process: int) -> float:
+    """Processor time that a process has taken so far, as Linux tells it."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def report(found: Sequence[StreamedFilm]) -> str:
@@ -102,9 +110,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--clients", type=int, default=1, help="at a time (%(default)s)")
     parser.add_argument("--seconds", type=float, default=40.0, help="of the film (%(default)s)")
     given = parser.parse_args(arguments)
-    with serving(given.database, given.clients) as endpoint:
+    with serving(given.database, given.clients) as (endpoint, process):
+        began, used = time.perf_counter(), cpu_s(process)
         found = measure(endpoint, given.video, given.camera, given.clients, given.seconds)
-    sys.stdout.write(report(found))
+        cores = (cpu_s(process) - used) / (time.perf_counter() - began)
+    sys.stdout.write(report(found) + f"the server took {cores:.2f} cores\n")
     return 0
 
 

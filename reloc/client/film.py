@@ -29,8 +29,7 @@ class StreamOptions:
 
     Attributes:
         max_side_px: frames are made smaller before they are sent; a server tracks no larger ones by default.
-        jpeg_quality: of the frames. Compressed at 80, they are a fifth of their size at 95, and the flow's
-            patches are the same.
+        jpeg_quality: of the frames.
         start_s, end_s: the stretch of the film; None: all of it.
         max_late_s: a frame of a file that is later than this against the film's clock is not sent: this
             machine is too slow, and a live source would have gone on.

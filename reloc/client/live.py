@@ -22,6 +22,7 @@ _KEPT = 10_000  # poses that nobody has read, and frames whose times are remembe
 _KEPT_REFUSALS = 100
 # Silence after which the client asks whether the server is there still.
 _SILENCE_S = 1.0
+_SERVER_ANSWERS_S = 5.0
 
 
 class LiveTrack:
@@ -136,7 +137,8 @@ class LiveTrack:
         sequence = self._next if sequence is None else sequence
         self._next = sequence + 1
         header = encode(TrackFrame(sequence=sequence, time_s=time_s))
-        _remember(self._sent, sequence, time.perf_counter())
+        with self._changed:
+            _remember(self._sent, sequence, time.perf_counter())
         frames.put(image, attachment=header)
         return sequence
 
@@ -195,7 +197,7 @@ class LiveTrack:
     def _check_server(self) -> None:
         """End the session when its server is not there any more."""
         token = f"{self._database_key}/servers/{self.opened.server_id}"
-        replies = self._session.liveliness().get(token, timeout=_SILENCE_S)
+        replies = self._session.liveliness().get(token, timeout=_SERVER_ANSWERS_S)
         self._heard = time.monotonic()
         if not any(reply.ok is not None for reply in replies):
             self._over(ServiceError(NO_SERVER, "the server of this session is gone"))

@@ -160,8 +160,8 @@ class Server:
             for token in self._tokens.values():
                 token.undeclare()
             self._tokens.clear()
-        self._live.close(self._options.shutdown_grace_s)
         self._queue.close()
+        self._live.close(self._options.shutdown_grace_s)
         left = self._workers.join(self._options.shutdown_grace_s)
         for item in (*self._queue.drain(), *left):
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))

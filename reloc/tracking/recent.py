@@ -39,7 +39,9 @@ class RecentFrames:
         kept = [] if keep_from is None else [f for f in self._frames if f.index >= keep_from]
         kept.append(frame)
         if len(kept) > self._capacity:
-            kept = [*kept[:-1:2], kept[-1]]
+            # The frame goes whose neighbours are closest together; the first and the last stay.
+            gaps = [after.index - before.index for before, after in zip(kept, kept[2:], strict=False)]
+            del kept[1 + gaps.index(min(gaps))]
         self._frames = kept
 
     def since(self, index: int) -> list[RecentFrame]:

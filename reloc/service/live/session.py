@@ -104,9 +104,9 @@ class LiveSession:
             self._states["refused"] += 1
             self._event("refused", error.code, error.message, error.sequence)
             return False
-        self._publish("poses", pose)
         self._states[pose.state] += 1
         self._metrics.frame_answered(pose.state, (time.perf_counter() - arrival.received) * 1e3)
+        self._publish("poses", pose)
         return True
 
     def _say_ended(self) -> None:

@@ -95,13 +95,21 @@ class LiveSessions:
             try:
                 reply = encode(self._opened(name, query))
             except RequestError as error:
-                self._metrics.open_refused(error.code)
-                refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
-                query.reply_err(encode(refusal), encoding=_JSON)
-                _log("live session refused", "live_refused", name, code=error.code, refusal=error.message)
+                self._refuse(query, name, error)
+                return
+            except Exception:
+                logger.exception("live session not opened", extra={"fields": {"event": "internal"}})
+                text = "the server failed to open the session; its log says why"
+                self._refuse(query, name, RequestError(ErrorCode.INTERNAL, text))
                 return
             query.reply(self._keys.track(name), reply, encoding=_JSON)
         _log("live session opened", "live_opened", name)
+
+    def _refuse(self, query: zenoh.Query, name: str, error: RequestError) -> None:
+        self._metrics.open_refused(error.code)
+        refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
+        query.reply_err(encode(refusal), encoding=_JSON)
+        _log("live session refused", "live_refused", name[:80], code=error.code, refusal=error.message)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         """A client's token has come or gone."""
