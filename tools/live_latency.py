@@ -6,8 +6,8 @@ The server is `featuredb serve DB`, a process of its own on a free port of this 
 threads of this process. Prints, of all clients together, the median and the 95th percentile of the time from
 sending a frame to its pose, how many of the frames were answered, and the median and 95th percentile of the
 server's stages: queue (waiting for the frame before), decode, track, reply (the pose on Earth); and how many
-cores the server took. The load of the machine stands beside it: figures of a busy machine are not those of the
-program.
+cores the server took. The load of the machine stands beside it: figures of a busy machine are not those of
+the program.
 
 A town and a film of it, in a few minutes:
 
