@@ -1,4 +1,4 @@
-"""Subcommands `serve`, `query` and `localise`; what they need is imported when they run."""
+"""Subcommands `serve`, `query`, `live` and `localise`; what they need is imported when they run."""
 
 import argparse
 import sys
@@ -19,6 +19,7 @@ _DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 def register(subparsers: Any) -> None:
     """Add the subcommands to the parser of `featuredb`."""
     from featuredb.cli.common import add_database_argument
+    from reloc.tracking.live_command import register as register_live
 
     serve = subparsers.add_parser(
         "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."
@@ -40,6 +41,16 @@ def register(subparsers: Any) -> None:
         choices=("on", "off"),
         default="on",
         help="take photos that clients contribute, with owner and licence, into a bounded inbox; default on",
+    )
+    serve.add_argument(
+        "--live-sessions", type=int, default=2, metavar="N", help="streams followed at a time; default 2"
+    )
+    serve.add_argument(
+        "--live-idle",
+        type=float,
+        default=5.0,
+        metavar="SECONDS",
+        help="a live session without a usable frame for so long ends; default 5",
     )
     serve.set_defaults(run=_serve)
 
@@ -63,6 +74,8 @@ def register(subparsers: Any) -> None:
     )
     _add_query_arguments(query)
     query.set_defaults(run=_query)
+
+    register_live(subparsers)
 
     localise = subparsers.add_parser(
         "localise",
@@ -102,6 +115,7 @@ def _serve(args: argparse.Namespace) -> int:
     import cv2
 
     from featuredb.cli.common import open_database
+    from reloc.service.live.options import LiveOptions
     from reloc.service.logs import log_to
     from reloc.service.options import ServeOptions
     from reloc.service.serve import serve
@@ -116,6 +130,7 @@ def _serve(args: argparse.Namespace) -> int:
         max_queue=args.max_queue,
         deadline_s=args.deadline,
         contributions=args.contributions == "on",
+        live=LiveOptions(max_sessions=args.live_sessions, idle_timeout_s=args.live_idle),
     )
     database = open_database(args)
     log_to(sys.stderr)

@@ -99,6 +99,11 @@ class Localiser:
         return self._snapshot
 
     @property
+    def options(self) -> LocaliseOptions:
+        """Settings by which it answers."""
+        return self._options
+
+    @property
     def areas(self) -> tuple[IndexedArea, ...]:
         """All areas, of whatever extractor."""
         return tuple(loaded.indexed for loaded in self._loaded)

@@ -7,7 +7,7 @@ reader of replies ignores fields that it does not know, so that a newer server c
 
 import json
 from enum import StrEnum
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -39,8 +39,13 @@ class RequestError(ServiceError):
         super().__init__(code.value, message, request_id)
 
 
-class _Request(BaseModel):
+class Request(BaseModel):
+    """Base of what a client sends: unknown fields are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+_Attached = TypeVar("_Attached", bound=Request)
 
 
 class Answer(BaseModel):
@@ -65,7 +70,7 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 NotNegative = Annotated[float, Field(ge=0)]
 
 
-class CameraRequest(_Request):
+class CameraRequest(Request):
     """Intrinsics of the photo by COLMAP's model names; those of another size of the picture are scaled."""
 
     model: Annotated[str, Field(pattern=r"^[A-Z_]{1,32}$")]
@@ -74,7 +79,7 @@ class CameraRequest(_Request):
     params: Annotated[tuple[CameraParam, ...], Field(min_length=3, max_length=12)]
 
 
-class PriorRequest(_Request):
+class PriorRequest(Request):
     """Where the photo may have been taken: WGS84 degrees, metres, one standard deviation.
 
     `h` is in the maps' height datum. Its sigma defaults to 100 m, since heights of GPS receivers and
@@ -88,7 +93,7 @@ class PriorRequest(_Request):
     sigma_vertical_m: Annotated[float, Field(ge=0.01, le=1e6)] = 100.0
 
 
-class RequestOptions(_Request):
+class RequestOptions(Request):
     """Wishes of one query."""
 
     inliers: bool = False
@@ -100,7 +105,7 @@ class RequestOptions(_Request):
     deadline_ms: Annotated[float, Field(ge=1, le=600_000)] | None = None
 
 
-class LocaliseWireRequest(_Request):
+class LocaliseWireRequest(Request):
     """The JSON attachment of a localise query; the payload is the image file's bytes."""
 
     request_id: RequestId | None = None
@@ -276,15 +281,23 @@ def parse_request(attachment: bytes | None) -> LocaliseWireRequest:
     Raises:
         RequestError: BAD_REQUEST with the field, what was expected and what was found.
     """
-    if not attachment:
-        return LocaliseWireRequest()
+    return parse_attachment(LocaliseWireRequest, attachment)
+
+
+def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attached:
+    """Read a JSON attachment; none or an empty one is an object without fields.
+
+    Raises:
+        RequestError: BAD_REQUEST with the field, what was expected and what was found.
+    """
+    attachment = attachment or b"{}"
     if len(attachment) > MAX_ATTACHMENT_BYTES:
         raise RequestError(
             ErrorCode.BAD_REQUEST,
             f"attachment: expected at most {MAX_ATTACHMENT_BYTES} bytes of JSON, found {len(attachment)}",
         )
     try:
-        return LocaliseWireRequest.model_validate_json(attachment)
+        return model.model_validate_json(attachment)
     except ValidationError as error:
         raise RequestError(ErrorCode.BAD_REQUEST, _explain(error), _request_id_of(attachment)) from error
 

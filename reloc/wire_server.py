@@ -3,6 +3,7 @@
 from typing import Literal
 
 from reloc.wire import Answer, Count, NotNegative
+from reloc.wire_track import LiveStatus
 
 
 class QueueStatus(Answer):
@@ -69,6 +70,7 @@ class StatusReply(Answer):
     reload: ReloadStatus
     limits: Limits
     contributions: ContributionStatus | None = None
+    live: LiveStatus | None = None
 
 
 class BoundingBox(Answer):

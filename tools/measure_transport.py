@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from reloc.client import Client
+from reloc.options import LocaliseOptions
 from reloc.result import LocaliseRequest, LocaliseResult
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
@@ -26,6 +27,8 @@ class NoMaps:
     """Answers every query at once."""
 
     snapshot = 0
+    areas = ()
+    options = LocaliseOptions()
 
     def localise(self, gray: np.ndarray, request: LocaliseRequest) -> LocaliseResult:
         return LocaliseResult(

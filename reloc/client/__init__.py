@@ -1,7 +1,10 @@
 """Zenoh client of the relocalisation server."""
 
-from reloc.client.client import BAD_REPLY, NO_SERVER, TIMEOUT, Client, EventStream
+from reloc.client.client import Client, EventStream
+from reloc.client.live import LiveTrack
+from reloc.client.replies import BAD_REPLY, NO_SERVER, TIMEOUT
 from reloc.wire import CameraRequest, LocaliseReply, PriorRequest
+from reloc.wire_track import TrackPose
 
 __all__ = [
     "BAD_REPLY",
@@ -10,6 +13,8 @@ __all__ = [
     "CameraRequest",
     "Client",
     "EventStream",
+    "LiveTrack",
     "LocaliseReply",
     "PriorRequest",
+    "TrackPose",
 ]

@@ -13,9 +13,10 @@ import zenoh
 from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import InvalidValueError, ServiceError
+from reloc.client.live import LiveTrack
+from reloc.client.replies import NO_SERVER, TIMEOUT, read_message, service_error
 from reloc.wire import (
     CameraRequest,
-    ErrorReply,
     LocaliseReply,
     LocaliseWireRequest,
     PriorRequest,
@@ -27,10 +28,6 @@ from reloc.wire_server import Event, MapsReply, StatusReply
 _Message = TypeVar("_Message", bound=BaseModel)
 
 DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
-# Codes that no server sends; the client raises them itself.
-NO_SERVER = "NO_SERVER"
-TIMEOUT = "TIMEOUT"
-BAD_REPLY = "BAD_REPLY"
 
 _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
@@ -171,6 +168,27 @@ class Client:
         """The maps that the server answers from."""
         return self._ask("maps", MapsReply, timeout_s)
 
+    def track(
+        self,
+        camera: CameraRequest | None = None,
+        prior: PriorRequest | None = None,
+        *,
+        timeout_s: float = _TIMEOUT_S,
+    ) -> LiveTrack:
+        """A live session, to be used in a `with` block: frames are sent, and poses come.
+
+            with client.track() as live:
+                for jpeg, time_s in frames:
+                    live.send(jpeg, time_s)
+                    pose = live.next(timeout_s=0.1)
+
+        Args:
+            camera: intrinsics of the frames, of any size of the same picture; None: estimated.
+            prior: where the first frame may have been taken (degrees, metres).
+            timeout_s: the longest wait for the session to open.
+        """
+        return LiveTrack(self._session(), f"featuredb/{self._database}", camera, prior, timeout_s)
+
     @contextmanager
     def watch_events(self) -> Iterator["EventStream"]:
         """Within the block, what the server publishes: maps that come and go, reloads, its end."""
@@ -228,9 +246,9 @@ class Client:
         start = time.perf_counter()
         for reply in replies:
             if reply.ok is not None:
-                return _parse(reply.ok.payload.to_bytes(), model)
+                return read_message(reply.ok.payload.to_bytes(), model)
             if reply.err is not None:
-                raise _service_error(reply.err.payload.to_bytes(), timeout_s)
+                raise service_error(reply.err.payload.to_bytes(), timeout_s)
         waited_s = time.perf_counter() - start
         if waited_s >= 0.9 * timeout_s:
             raise ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s from {self._key(leaf)}")
@@ -281,22 +299,3 @@ def _wait_for_database(session: zenoh.Session, database: str | None, where: str,
     if len(found) > 1:
         raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
     return found.pop()
-
-
-def _parse(payload: bytes, model: type[_Message]) -> _Message:
-    try:
-        return model.model_validate_json(payload)
-    except ValidationError as error:
-        raise ServiceError(
-            BAD_REPLY, f"expected a {model.__name__}, found {payload[:200]!r}: {error}"
-        ) from error
-
-
-def _service_error(payload: bytes, timeout_s: float) -> ServiceError:
-    try:
-        error = ErrorReply.model_validate_json(payload)
-    except ValidationError:  # not of the server: Zenoh itself gave up
-        if payload == b"Timeout":
-            return ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s")
-        return ServiceError(BAD_REPLY, f"expected an error as JSON, found {payload[:200]!r}")
-    return ServiceError(error.code, error.message, error.request_id)

@@ -118,7 +118,7 @@ def localise_request(
     """
     height, width = gray.shape
     exif = read_exif(data)
-    prior = None if wire_request.prior is None else _prior(wire_request.prior)
+    prior = None if wire_request.prior is None else geo_prior(wire_request.prior)
     if prior is None and wire_request.options.exif_prior:
         prior = prior_from_exif(exif)
     return LocaliseRequest(
@@ -152,7 +152,12 @@ def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
         ) from error
 
 
-def _prior(prior: PriorRequest) -> GeoPrior:
+def geo_prior(prior: PriorRequest) -> GeoPrior:
+    """A prior off the wire.
+
+    Raises:
+        RequestError: BAD_REQUEST, it is none.
+    """
     try:
         return GeoPrior(
             latitude_deg=prior.lat,

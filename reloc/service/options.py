@@ -8,6 +8,7 @@ from pathlib import Path
 from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
 from reloc.service.inbox import InboxOptions
+from reloc.service.live.options import LiveOptions
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
@@ -36,6 +37,7 @@ class ServeOptions:
             and under what terms are kept, in a bounded inbox, and nothing of them answers queries before
             growth has checked them.
         inbox: its bounds.
+        live: sessions that follow a stream of frames.
     """
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
@@ -51,6 +53,7 @@ class ServeOptions:
     limits: DecodeLimits = field(default_factory=DecodeLimits)
     contributions: bool = True
     inbox: InboxOptions = field(default_factory=InboxOptions)
+    live: LiveOptions = field(default_factory=LiveOptions)
 
     def __post_init__(self) -> None:
         for name, value in (

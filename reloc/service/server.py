@@ -11,6 +11,7 @@ from typing import Self
 import zenoh
 
 from reloc.service.inbox import Inbox
+from reloc.service.live.sessions import LiveSessions
 from reloc.service.metrics import Metrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
@@ -79,6 +80,7 @@ class Server:
             on_area=self._swap,
             on_failure=self._reload_failed,
         )
+        self._live = LiveSessions(session, self._keys, lambda: self._area, options.live, self.server_id)
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_lock = threading.Lock()
@@ -132,6 +134,7 @@ class Server:
             self._queryables.append(
                 self._session.declare_queryable(self._keys.of(leaf), callback, complete=True)
             )
+        self._live.start()
         self._advertise(self._area)  # after the queryables: who sees the token can ask at once
         self._watcher.start()
         self._log("serving", snapshot=self._area.snapshot, maps=len(self._area.maps), listen=self.endpoints)
@@ -158,6 +161,7 @@ class Server:
                 token.undeclare()
             self._tokens.clear()
         self._queue.close()
+        self._live.close(self._options.shutdown_grace_s)
         left = self._workers.join(self._options.shutdown_grace_s)
         for item in (*self._queue.drain(), *left):
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
@@ -196,6 +200,7 @@ class Server:
                 deadline_s=options.deadline_s,
             ),
             contributions=None if self._inbox is None else self._inbox.status(),
+            live=self._live.status(),
         )
 
     # Zenoh calls these in threads of its own; they must return at once.

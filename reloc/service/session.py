@@ -27,6 +27,10 @@ class Keys:
     def of(self, leaf: str) -> str:
         return f"{KEY_ROOT}/{self.database}/{leaf}"
 
+    def track(self, session: str, leaf: str = "") -> str:
+        """Key of a live session, or of a leaf of it: frames, poses, events, client."""
+        return self.of(f"track/{session}/{leaf}" if leaf else f"track/{session}")
+
     def server_token(self, server_id: str) -> str:
         """Liveliness token of a server."""
         return self.of(f"servers/{server_id}")

@@ -6,6 +6,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from reloc.candidates import IndexedArea
+from reloc.options import LocaliseOptions
 from reloc.result import LocaliseRequest, LocaliseResult
 from reloc.wire_server import MapInfo
 
@@ -16,6 +18,16 @@ class LocaliserLike(Protocol):
     @property
     def snapshot(self) -> int:
         """Version of the database that it answers from."""
+        ...
+
+    @property
+    def options(self) -> LocaliseOptions:
+        """Settings by which it answers."""
+        ...
+
+    @property
+    def areas(self) -> tuple[IndexedArea, ...]:
+        """All areas, of whatever extractor; those whose maps did not change stay the same over reloads."""
         ...
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:

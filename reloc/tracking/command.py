@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,8 +10,6 @@ if TYPE_CHECKING:
     from featuredb.geometry.camera import Camera
     from featuredb.maps.feature_map import GeoPrior
     from reloc.tracking.track_video import TrackedVideo
-
-_NOTHING_FOUND = 1  # exit code: everything worked, and no frame was localised
 
 
 def register(subparsers: Any) -> None:
@@ -66,15 +63,12 @@ def run_track(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from featuredb.cli.common import open_database
-    from featuredb.errors import FeatureDbError
     from reloc.localiser import Localiser
     from reloc.result import LocaliseRequest
+    from reloc.tracking.outputs import check_outputs, exit_code, write_outputs
     from reloc.tracking.track_video import TrackVideoOptions, track_video
-    from reloc.tracking.trajectory_files import check_format, write_trajectory
 
-    for file in args.out:
-        check_format(file)
-        _check_folder(file)
+    check_outputs(args.out)
     localiser = Localiser.open(open_database(args))
     maps = tuple(args.map) if args.map else None
     found = track_video(
@@ -87,35 +81,10 @@ def run_track(args: argparse.Namespace) -> int:
     )
     trajectory = replace(found.trajectory, database=args.db, version=localiser.snapshot)
     found = replace(found, trajectory=trajectory)
-    written = []
-    known = any(point.pose is not None for point in trajectory.points)
-    failed = []
-    for file in args.out:
-        if not known and file.suffix.lower() != ".csv":
-            continue
-        try:
-            write_trajectory(file, trajectory)
-            written.append(str(file))
-        except (FeatureDbError, OSError) as error:
-            failed.append(f"{file}: {error}")
-    summary = _summary(found, [*written, *([str(args.overlay)] if args.overlay else [])])
+    outputs = write_outputs(args.out, trajectory)
+    summary = _summary(found, [*outputs.written, *([str(args.overlay)] if args.overlay else [])])
     sys.stdout.write(json.dumps(summary) + "\n" if args.json else _text(summary))
-    for text in failed:
-        sys.stderr.write(f"featuredb: {text}\n")
-    if failed:
-        return 2
-    return 0 if known else _NOTHING_FOUND
-
-
-def _check_folder(file: Path) -> None:
-    """Before an hour of tracking, not after it."""
-    from featuredb.errors import InvalidValueError
-
-    folder = file.parent
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    if not folder.is_dir() or not os.access(folder, os.W_OK):
-        raise InvalidValueError(f"{file}: expected a folder that can be written, found {folder}")
+    return exit_code(outputs, trajectory)
 
 
 def _camera(text: str | None) -> "Camera | None":

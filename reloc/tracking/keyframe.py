@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -43,6 +44,20 @@ class Unmatched:
 
     reason: str
     detail: str
+
+
+def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
+    """Those whose descriptors can be compared with the film's.
+
+    Raises:
+        IncompatibleExtractorError: there are areas, and none of them is.
+    """
+    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
+    if areas and not usable:
+        raise IncompatibleExtractorError(
+            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
+        )
+    return usable
 
 
 def match_keyframe(

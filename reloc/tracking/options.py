@@ -52,6 +52,9 @@ class TrackOptions:
         keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
+        live: answers are taken as soon as they are there, and no frame waits for one. live_frames: that are
+            kept meanwhile; 60 are two seconds, and 55 MB at 1280x720. live_steps: frames by which a track
+            that was found is carried to the one at hand while a client waits; more are left to the thread.
         min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
             track is lost, however well its old landmarks agree with each other.
         localise: how a lost track is found again; its extractor is that of keyframes, too.
@@ -69,6 +72,9 @@ class TrackOptions:
     few_landmarks: float = 0.5
     answer_after: int = 12
     lost_answer_after: int = 20
+    live: bool = False
+    live_frames: int = 60
+    live_steps: int = 3
     min_matches: int = 30
     max_unconfirmed: int = 3
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)

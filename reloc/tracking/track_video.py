@@ -2,21 +2,23 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 
-from featuredb.errors import IncompatibleExtractorError, VideoError
+from featuredb.errors import VideoError
 from featuredb.geometry.camera import Camera
-from featuredb.video.film import Video, VideoFrame, VideoOptions
+from featuredb.video.film import VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
+from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.film_overlay import draw_frame
+from reloc.tracking.keyframe import usable_areas
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
@@ -100,7 +102,7 @@ def track_video(
         IncompatibleExtractorError: all maps are of another extractor.
     """
     options = options or TrackVideoOptions()
-    areas = _usable(areas, options.track.localise.extractor.fingerprint)
+    areas = usable_areas(areas, options.track.localise.extractor.fingerprint)
     points: list[TrajectoryPoint] = []
     trouble: list[str] = []
     clock = time.perf_counter
@@ -129,7 +131,7 @@ def track_video(
                 )
             first_s: float | None = None
             mark = clock()
-            for frame in _until_it_ends(video, trouble):
+            for frame in until_it_ends(video, trouble):
                 decoding += clock() - mark
                 tracked = tracker.track(frame.gray, frame.time_s)
                 point = point_of(tracked)
@@ -167,26 +169,6 @@ def track_video(
     )
 
 
-def _until_it_ends(video: Video, trouble: list[str]) -> Iterator[VideoFrame]:
-    """The frames, up to where the film cannot be read any more or somebody presses Ctrl-C.
-
-    What was tracked until then is not lost with it; without any frame the error is the caller's.
-    """
-    frames, read = iter(video), 0
-    while True:
-        try:
-            frame = next(frames)
-        except StopIteration:
-            return
-        except (VideoError, KeyboardInterrupt) as error:
-            if not read:
-                raise
-            trouble.append(str(error) or "stopped by hand")
-            return
-        read += 1
-        yield frame
-
-
 def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None:
     """Lost points whose poses were found since; the last one then goes on from them."""
     first = points[-1].index - len(points) + 1
@@ -198,16 +180,6 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
         points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
     if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].pose is not None:
         points[-1] = replace(points[-1], state="tracking")
-
-
-def _usable(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
-    """Those whose descriptors can be compared with the film's."""
-    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
-    if areas and not usable:
-        raise IncompatibleExtractorError(
-            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
-        )
-    return usable
 
 
 def _resized(camera: Camera, width: int, height: int) -> Camera:

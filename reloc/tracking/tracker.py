@@ -1,12 +1,12 @@
 """The pose of every frame of a video: flow between frames, keyframes against the map in the background."""
 
-from collections import deque
+import sys
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,15 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
-from reloc.tracking.flow import follow
+from reloc.tracking.flow_track import FlowTrack, carried
 from reloc.tracking.keyframe import Keyframe, Unmatched, find_frame, match_keyframe
-from reloc.tracking.landmarks import Landmarks
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.pose_fit import FittedPose, fit_pose
+from reloc.tracking.pose_fit import FittedPose
+from reloc.tracking.recent import RecentFrame, RecentFrames
 
 TrackState = Literal["tracking", "relocalised", "lost"]
+Answer = Keyframe | FlowTrack | Unmatched
+_FAR = sys.maxsize
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,26 +59,18 @@ class TrackedFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sent:
-    """A keyframe that is being matched: its number, and the frame at which the answer is waited for."""
+    """What the thread has in hand: the number of its frame, and the frame at which it is waited for."""
 
     index: int
     due: int
-    answer: "Future[Keyframe | Unmatched]"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Frame:
-    """A frame that may still be needed."""
-
-    index: int
-    time_s: float
-    gray: NDArray[np.uint8]
+    answer: "Future[Answer]"
 
 
 class Tracker:
     """Follows one video. Frames come in order; a context manager, since keyframes have a thread.
 
     The same frames give the same poses: what the thread answers is taken at a frame that is known beforehand.
+    With `TrackOptions.live` no frame waits for the thread instead.
     """
 
     def __init__(
@@ -97,13 +91,15 @@ class Tracker:
         self._found = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._area: Area | None = None
-        self._landmarks = Landmarks.none()
-        self._poses: deque[tuple[float, Rigid3]] = deque(maxlen=2)
-        self._frames: deque[_Frame] = deque(
-            maxlen=1 + max(self._options.answer_after, self._options.lost_answer_after)
+        self._track: FlowTrack | None = None
+        self._frames = RecentFrames(
+            self._options.live_frames
+            if self._options.live
+            else 1 + max(self._options.answer_after, self._options.lost_answer_after)
         )
         self._late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
+        self._behind = _FAR  # frames through which the thread carries a track that was found, live
         self._next_keyframe = 0
         self._unconfirmed = 0  # keyframes in a row of which the map knew nothing
         self._index = -1
@@ -130,32 +126,51 @@ class Tracker:
     def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
         """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
         self._index += 1
-        before = self._frames[-1] if self._frames else None
-        now = _Frame(index=self._index, time_s=time_s, gray=gray)
-        self._frames.append(now)
+        before = self._frames.last
+        now = RecentFrame(index=self._index, time_s=time_s, gray=gray)
+        self._frames.add(now, None if self._sent is None else self._sent.index)
         self._late = []
-        fitted = self._followed(before, now) if before is not None and len(self._landmarks) else None
-        if fitted is not None:
-            self._poses.append((time_s, fitted.cam_from_local))
-        answered = self._answer()
+        fitted = None
+        if before is not None and self._track is not None:
+            fitted = self._track.follow(before, now)
+            if fitted is None:
+                self._lost(f"LOST: {self._track.why}")
+        answered, sent = self._answer()
         state: TrackState = "tracking"
-        if isinstance(answered, Keyframe):
-            found = self._taken(answered, gray, fitted)
+        if isinstance(answered, Unmatched):
+            self._unconfirmed += 1
+            if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
+                fitted = None
+                self._lost(f"{answered.reason}: {answered.detail}")
+        elif answered is not None and sent is not None:
+            found = self._taken(answered, sent.index, now, self._track)
             if found is not None:
                 state = "tracking" if fitted is not None else "relocalised"
                 fitted = found
-                self._poses[-1] = (time_s, fitted.cam_from_local)
                 self._unconfirmed = 0
-        elif isinstance(answered, Unmatched):
-            self._unconfirmed += 1
-            if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
-                self._why, fitted = f"{answered.reason}: {answered.detail}", None
-        self._send(gray, fitted)
-        if fitted is None:
-            self._landmarks = Landmarks.none()
-            self._poses.clear()
+        if fitted is None or self._track is None:
+            self._search(gray)
             return TrackedFrame(index=self._index, time_s=time_s, state="lost", detail=self._why)
-        return self._known(now, state, fitted)
+        self._send_keyframe(gray, fitted, self._track)
+        return self._known(now, state, fitted, self._track)
+
+    @property
+    def tracking(self) -> bool:
+        """Whether the last frame has a pose."""
+        return self._track is not None
+
+    def use_areas(self, areas: Sequence[IndexedArea]) -> None:
+        """Track by these areas from the next frame on.
+
+        A track in an area that is still among them goes on; another is lost, and looked for anew, since its
+        map may have been moved or taken back.
+        """
+        self._areas = tuple(areas)
+        if self._track is not None and any(area.area is self._track.area for area in self._areas):
+            return
+        if self._track is not None:
+            self._lost("LOST: the maps have changed")
+        self._sent = None
 
     @property
     def late(self) -> Sequence[TrackedFrame]:
@@ -167,19 +182,24 @@ class Tracker:
 
     def finish(self) -> Sequence[TrackedFrame]:
         """After the last frame: poses of those before it that a frame still being looked for has found."""
-        if self._sent is None or len(self._landmarks):
+        sent, self._sent = self._sent, None
+        if sent is None or self._options.live or self.tracking:
             return ()
-        answered = self._sent.answer.result()
-        if not isinstance(answered, Keyframe):
+        answered = sent.answer.result()
+        if isinstance(answered, Unmatched):
             return ()
         self._late = []
-        last = self._frames[-1]
-        found = self._taken(answered, last.gray, None)
-        if found is not None:
-            self._late.append(self._known(last, "tracking" if self._late else "relocalised", found))
+        last = self._frames.last
+        assert last is not None
+        found, track = self._taken(answered, sent.index, last, None), self._track
+        if found is not None and track is not None:
+            state: TrackState = "tracking" if self._late else "relocalised"
+            self._late.append(self._known(last, state, found, track))
         return tuple(self._late)
 
-    def _known(self, frame: "_Frame", state: TrackState, fitted: FittedPose) -> TrackedFrame:
+    def _known(
+        self, frame: RecentFrame, state: TrackState, fitted: FittedPose, track: FlowTrack
+    ) -> TrackedFrame:
         return TrackedFrame(
             index=frame.index,
             time_s=frame.time_s,
@@ -187,141 +207,119 @@ class Tracker:
             cam_from_local=fitted.cam_from_local,
             covariance=fitted.covariance,
             camera=self._camera,
-            area=self._area,
-            inliers=len(self._landmarks),
-            pixels=self._landmarks.pixels,
-            points=self._landmarks.points,
-            rows=self._landmarks.rows,
+            area=track.area,
+            inliers=len(track.landmarks),
+            pixels=track.landmarks.pixels,
+            points=track.landmarks.points,
+            rows=track.landmarks.rows,
         )
 
-    def _followed(self, before: "_Frame", now: "_Frame") -> FittedPose | None:
-        """The landmarks in this frame, and the pose that they give; those that disagree are dropped."""
-        assert self._camera is not None
-        marks = self._landmarks
-        last = self._poses[-1][1]
-        predicted = self._predicted(now.time_s)
-        step = self._camera.project(predicted.act(marks.points)) - self._camera.project(
-            last.act(marks.points)
-        )
-        guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
-        pixels, good = follow(before.gray, now.gray, marks.pixels, guess, self._options.flow)
-        return self._agreed(replace(marks, pixels=pixels), good, predicted)
+    def _lost(self, why: str) -> None:
+        self._track, self._why = None, why
 
-    def _agreed(
-        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3
-    ) -> FittedPose | None:
-        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
-        assert self._camera is not None
-        options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
-        if len(followed) < options.min_landmarks:
-            self._why = f"LOST: {len(followed)} of {len(marks)} landmarks are found again"
-            return None
-        fitted = fit_pose(self._camera, followed.pixels, followed.points, predicted, options.fit)
-        agree = 0 if fitted is None else int(fitted.inlier.sum())
-        if fitted is None or agree < max(options.min_landmarks, options.least_share * len(followed)):
-            self._why = f"LOST: {agree} of {len(followed)} landmarks agree with a pose"
-            return None
-        self._landmarks = followed.take(fitted.inlier)
-        return fitted
-
-    def _predicted(self, time_s: float) -> Rigid3:
-        """The last pose, moved on as it moved before."""
-        if len(self._poses) < 2:
-            return self._poses[-1][1]
-        (first_s, first), (second_s, second) = self._poses
-        share = (time_s - second_s) / max(second_s - first_s, 1e-9)
-        return Rigid3.exp(min(share, 3.0) * (second @ first.inverse()).log()) @ second
-
-    def _answer(self) -> Keyframe | Unmatched | None:
-        """What became of a keyframe that is due."""
-        if self._sent is None or self._index < self._sent.due:
-            return None
-        return self._sent.answer.result()
+    def _answer(self) -> "tuple[Answer | None, _Sent | None]":
+        """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
+        sent = self._sent
+        if sent is None:
+            return None, None
+        ready = sent.answer.done() if self._options.live else self._index >= sent.due
+        if not ready:
+            return None, None
+        self._sent = None
+        return sent.answer.result(), sent
 
     def _taken(
-        self, keyframe: Keyframe, gray: NDArray[np.uint8], fitted: FittedPose | None
+        self, found: Keyframe | FlowTrack, index: int, now: RecentFrame, track: FlowTrack | None
     ) -> FittedPose | None:
-        """Landmarks of a keyframe carried into this frame, and the pose with them.
+        """The pose of the frame at hand by what was found of frame `index`; None: it says nothing of it.
 
-        While the track holds, the guess where they are now is the track's; else they are looked for where the
-        keyframe had them.
+        Args:
+            track: as it is at the frame at hand; None: it is lost, and begins again at what was found.
         """
-        assert self._sent is not None
-        sent, self._sent = self._sent, None
-        before = next((f for f in self._frames if f.index == sent.index), None)
-        if before is None or (fitted is not None and keyframe.area is not self._area):
+        since = self._frames.since(index)
+        if not since:
             return None
-        self._area = keyframe.area
-        self._camera = self._camera or keyframe.camera
-        self._found = True
-        points = keyframe.area.points[keyframe.rows]
-        # A point may be seen by two keypoints; it is followed once.
-        _, first = np.unique(keyframe.rows, return_index=True)
-        fresh = Landmarks(
-            rows=keyframe.rows[first],
-            points=points[first],
-            pixels=keyframe.pixels[first],
-            born=np.full(len(first), sent.index, dtype=np.int64),
-        )
+        if track is not None:
+            if isinstance(found, FlowTrack) or found.area is not track.area:
+                return None
+            return track.refresh(found, since[0], now)
+        if isinstance(found, FlowTrack):
+            return self._caught_up(found, since)
+        self._camera = self._camera or found.camera
+        self._area, self._found = found.area, True
+        begun = FlowTrack(found, since[0], self._camera, self._options)
+        fitted = begun.settle()
         if fitted is None:
-            return self._begun(fresh, keyframe.cam_from_local, before)
-        pose, options = fitted.cam_from_local, self._options
-        step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
-            keyframe.cam_from_local.act(fresh.points)
-        )
-        usable = np.flatnonzero(np.isfinite(step).all(axis=1))
-        fresh = fresh.take(usable)
-        pixels, good = follow(before.gray, gray, fresh.pixels, fresh.pixels + step[usable], options.flow)
-        everything = self._landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
-        return self._agreed(self._spread(everything, gray), None, pose)
+            self._why = f"LOST: {begun.why}"
+            return None
+        return self._caught_up(begun, since) if self._options.live else self._begun(begun, since, fitted)
 
-    def _begun(self, fresh: Landmarks, pose: Rigid3, first: "_Frame") -> FittedPose | None:
-        """The track from a localised frame to the one at hand, frame by frame.
+    def _begun(self, track: FlowTrack, since: Sequence[RecentFrame], fitted: FittedPose) -> FittedPose | None:
+        """The track from a localised frame, the first of `since`, to the one at hand, frame by frame.
 
         Where it breaks, the frames before have their poses all the same.
         """
-        self._landmarks = self._spread(fresh, first.gray)
-        self._poses.clear()
-        self._poses.append((first.time_s, pose))
-        fitted = self._agreed(self._landmarks, None, pose)
         state: TrackState = "relocalised"
-        for before, after in pairwise([f for f in self._frames if f.index >= first.index]):
-            if fitted is None:
-                return None
-            self._poses[-1] = (before.time_s, fitted.cam_from_local)
-            self._late.append(self._known(before, state, fitted))
+        for before, after in pairwise(since):
+            self._late.append(self._known(before, state, fitted, track))
             state = "tracking"
-            fitted = self._followed(before, after)
-            if fitted is not None:
-                self._poses.append((after.time_s, fitted.cam_from_local))
+            followed = track.follow(before, after)
+            if followed is None:
+                self._lost(f"LOST: {track.why}")
+                return None
+            fitted = followed
+        self._track = track
         return fitted
 
-    def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
-        options = self._options
-        return marks.spread(options.landmarks, options.columns, options.rows, gray.shape[1], gray.shape[0])
+    def _caught_up(self, track: FlowTrack, since: Sequence[RecentFrame]) -> FittedPose | None:
+        """Live: the track from the first of `since` to the frame at hand, soon or in the background.
 
-    def _send(self, gray: NDArray[np.uint8], fitted: FittedPose | None) -> None:
-        """Hand this frame to the thread if it is time for a keyframe and the thread is free."""
-        options = self._options
-        if self._sent is not None and self._index >= self._sent.due:
-            self._sent = None
+        The thread carries it through what has come meanwhile, again and again, and each time that is less.
+        Where it does not become less, the thread is too slow for all frames, and some are passed over.
+        """
+        steps, most = len(since) - 1, self._options.live_steps
+        if most < steps < self._behind:
+            self._behind = steps
+            self._hand_over(since[-1].index, self._pool.submit(carried, track, since), due=self._index + 1)
+            return None
+        self._behind = _FAR
+        rows = np.linspace(0, steps, min(steps, most) + 1).round().astype(np.int64)
+        chosen = [since[row] for row in rows]
+        fitted = None
+        for before, after in pairwise(chosen):
+            fitted = track.follow(before, after)
+            if fitted is None:
+                self._lost(f"LOST: {track.why}")
+                return None
+        self._track = track
+        return fitted
+
+    def _search(self, gray: NDArray[np.uint8]) -> None:
+        """Have this frame localised, if the thread is free."""
         if self._sent is not None:
             return
-        if fitted is None:
-            answer = self._pool.submit(find_frame, gray.copy(), self._request_now(), self._areas, options)
-            self._sent = _Sent(index=self._index, due=self._index + options.lost_answer_after, answer=answer)
+        self._behind = _FAR
+        answer = self._pool.submit(find_frame, gray.copy(), self._request_now(), self._areas, self._options)
+        self._hand_over(self._index, answer, due=self._index + self._options.lost_answer_after)
+
+    def _send_keyframe(self, gray: NDArray[np.uint8], fitted: FittedPose, track: FlowTrack) -> None:
+        """Have this frame matched against the map, if it is time for a keyframe and the thread is free."""
+        options = self._options
+        if self._sent is not None:
             return
-        few = len(self._landmarks) < options.few_landmarks * options.landmarks
+        few = len(track.landmarks) < options.few_landmarks * options.landmarks
         early = options.keyframe_every - min(options.keyframe_soonest, options.keyframe_every)
         if self._index < self._next_keyframe - (early if few else 0):
             return
         assert self._camera is not None
-        assert self._area is not None
         answer = self._pool.submit(
-            match_keyframe, gray.copy(), self._camera, fitted.cam_from_local, self._area, options
+            match_keyframe, gray.copy(), self._camera, fitted.cam_from_local, track.area, options
         )
-        self._sent = _Sent(index=self._index, due=self._index + options.answer_after, answer=answer)
+        self._hand_over(self._index, answer, due=self._index + options.answer_after)
         self._next_keyframe = self._index + options.keyframe_every
+
+    def _hand_over(self, index: int, answer: "Future[Any]", due: int) -> None:
+        self._sent = _Sent(index=index, due=due, answer=answer)
 
     def _request_now(self) -> LocaliseRequest:
         if not self._found:

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from reloc.service.inbox import InboxOptions
+from reloc.service.live.options import LiveOptions
 from tests.support.service import ScriptedLocaliser, photo, running_server
 
 _WIRE = Path(__file__).parents[2] / "docs" / "wire.md"
@@ -54,3 +55,15 @@ def test_the_python_client_of_the_documentation_runs(tmp_path, monkeypatch, caps
     out = capsys.readouterr().out
     assert out.startswith("localised")
     assert "received=1" in out
+
+
+def test_the_live_client_of_the_documentation_runs(tmp_path, monkeypatch, capsys):
+    run(programs()[2], tmp_path, monkeypatch)
+    out = capsys.readouterr().out
+    assert out.startswith("0 lost nothing was localised yet")
+
+
+def test_what_is_said_of_live_sessions_is_what_the_program_does():
+    text, options = _WIRE.read_text(encoding="utf-8"), LiveOptions()
+    assert f"`--live-sessions` ({options.max_sessions})" in text
+    assert f"(`--live-idle`, {options.idle_timeout_s:g} s)" in text

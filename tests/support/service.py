@@ -17,7 +17,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import InboxCounts
+from reloc.candidates import IndexedArea
 from reloc.client import Client
+from reloc.options import LocaliseOptions
 from reloc.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult, RunnerUp
 from reloc.service.inbox import Inbox
 from reloc.service.options import ServeOptions
@@ -90,6 +92,9 @@ def not_localised(snapshot: int) -> LocaliseResult:
 
 class ScriptedLocaliser:
     """Answers from a function of its own; records what it was asked."""
+
+    areas: tuple[IndexedArea, ...] = ()
+    options = LocaliseOptions()
 
     def __init__(
         self,

@@ -1,0 +1,175 @@
+"""A film or a camera streamed to a live session, at its own speed."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ServiceError, VideoError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.video.film import VideoOptions
+from featuredb.video.frames import Source, open_video
+from reloc.client.client import Client
+from reloc.client.live import LiveTrack
+from reloc.tracking.film_end import until_it_ends
+from reloc.tracking.pose_message import point_of_message
+from reloc.tracking.trajectory import Trajectory, TrajectoryPoint
+from reloc.wire import CameraRequest, PriorRequest
+from reloc.wire_track import TrackPose
+
+OnPose = Callable[[TrackPose, float | None], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamOptions:
+    """How a film is streamed.
+
+    Attributes:
+        max_side_px: frames are made smaller before they are sent; a server tracks no larger ones by default.
+        jpeg_quality: of the frames.
+        start_s, end_s: the stretch of the film; None: all of it.
+        max_late_s: a frame of a file that is later than this against the film's clock is not sent: this
+            machine is too slow, and a live source would have gone on.
+        last_wait_s: how long the pose of the last frame is waited for.
+    """
+
+    max_side_px: int = 1280
+    jpeg_quality: int = 80
+    start_s: float | None = None
+    end_s: float | None = None
+    max_late_s: float = 0.1
+    last_wait_s: float = 2.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StreamedFilm:
+    """What came of a stream.
+
+    Attributes:
+        trajectory: the frames that were answered.
+        frames: of the film. sent: of them.
+        latency_ms: (n,) from sending a frame to its pose, of the answered ones.
+        timings_ms: stage of the server -> (n,) of the same frames.
+        refusals: why frames could not be used, the latest. complaints: what was wrong with the film, and
+            why the session ended before it.
+    """
+
+    trajectory: Trajectory
+    frames: int
+    sent: int
+    latency_ms: FloatArray
+    timings_ms: dict[str, FloatArray]
+    refusals: tuple[str, ...]
+    complaints: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class _Answers:
+    """Poses so far."""
+
+    live: LiveTrack
+    on_pose: OnPose | None
+    points: list[TrajectoryPoint] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    timings_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    def take(self, timeout_s: float) -> bool:
+        """Wait for one pose; False if none came in time."""
+        pose = self.live.next(timeout_s)
+        if pose is None:
+            return False
+        latency_ms = self.live.latency_ms(pose.sequence)
+        self.points.append(point_of_message(pose))
+        if latency_ms is not None:
+            self.latency_ms.append(latency_ms)
+        for stage, ms in pose.timings_ms.items():
+            self.timings_ms.setdefault(stage, []).append(ms)
+        if self.on_pose is not None:
+            self.on_pose(pose, latency_ms)
+        return True
+
+    def until(self, moment: float) -> None:
+        """Take what comes until a moment of `time.perf_counter`, and what is there already."""
+        while self.take(max(0.0, moment - time.perf_counter())):
+            pass
+
+
+def stream_film(
+    client: Client,
+    source: Source,
+    *,
+    camera: CameraRequest | None = None,
+    prior: PriorRequest | None = None,
+    options: StreamOptions | None = None,
+    on_pose: OnPose | None = None,
+) -> StreamedFilm:
+    """Send the frames of a film when they are due, those of a camera as they come, and collect the poses.
+
+    Ctrl-C ends the stream, and what came until then is the result; so does the end of the session.
+
+    Args:
+        source: see `featuredb.video.frames.open_video`.
+        camera: intrinsics of the film's frames, of any size; None: estimated.
+        prior: where the film begins.
+        on_pose: called with each pose, and the milliseconds from sending its frame.
+
+    Raises:
+        VideoError: the film cannot be read at all, or has no frames.
+        ServiceError: no session could be opened.
+    """
+    options = options or StreamOptions()
+    settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
+    trouble: list[str] = []
+    sent, last = 0, -1
+    with open_video(source, settings) as video, client.track(camera, prior) as live:
+        answers, info = _Answers(live, on_pose), video.info
+        begun: float | None = None
+        try:
+            for frame in until_it_ends(video, trouble):
+                now = time.perf_counter()
+                begun = now - frame.time_s if begun is None else begun
+                due = now if info.live else begun + frame.time_s
+                answers.until(due)
+                last = frame.index
+                if time.perf_counter() - due <= options.max_late_s:
+                    live.send(_jpeg(frame.gray, options.jpeg_quality), frame.time_s, frame.index)
+                    sent += 1
+            _await_last(answers, last, options.last_wait_s)
+        except ServiceError as error:
+            trouble.append(f"the session ended: {error}")
+        refusals = tuple(f"frame {event.sequence}: {event.message}" for event in live.refusals)
+        complaints = (*trouble, *video.report.complaints())
+    if last < 0:
+        raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
+    return StreamedFilm(
+        trajectory=Trajectory(
+            source=info.name,
+            points=tuple(answers.points),
+            database=client.database,
+            version=live.opened.snapshot,
+            start=info.creation_time,
+        ),
+        frames=last + 1,
+        sent=sent,
+        latency_ms=np.array(answers.latency_ms),
+        timings_ms={stage: np.array(values) for stage, values in answers.timings_ms.items()},
+        refusals=refusals,
+        complaints=complaints,
+    )
+
+
+def _await_last(answers: _Answers, last: int, wait_s: float) -> None:
+    """Poses of the frames that were sent last; the very last is never dropped by the server."""
+    end = time.perf_counter() + wait_s
+    while not answers.points or answers.points[-1].index < last:
+        if not answers.take(end - time.perf_counter()) and time.perf_counter() >= end:
+            return
+
+
+def _jpeg(gray: NDArray[np.uint8], quality: int) -> bytes:
+    done, data = cv2.imencode(".jpg", gray, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    assert done
+    return bytes(data)

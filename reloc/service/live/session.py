@@ -1,0 +1,134 @@
+"""One live session: a thread that takes the latest frame, tracks it and hands out its pose."""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+from pydantic import BaseModel
+
+from reloc.service.live.frames import FrameAnswerer, FrameError
+from reloc.service.live.latest import Arrival, LatestFrame
+from reloc.service.live.metrics import LiveMetrics
+from reloc.wire_track import EndReason, TrackEvent
+
+logger = logging.getLogger(__name__)
+
+_END_TEXT = {
+    EndReason.CLIENT_GONE: "the client has closed the session, or is gone",
+    EndReason.SHUTTING_DOWN: "the server is stopping; open a session of another one or later",
+    EndReason.INTERNAL: "the server failed on this session; its log says why under the session's name",
+}
+
+
+class LiveSession:
+    """Begins with `start` and ends by itself (idle, a defect), or by `end`; never more than one frame waits.
+
+    Attributes:
+        name: of the session on the wire.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        answerer: FrameAnswerer,
+        *,
+        idle_timeout_s: float,
+        publish: Callable[[str, BaseModel], None],
+        metrics: LiveMetrics,
+        on_end: Callable[["LiveSession"], None],
+    ) -> None:
+        """
+        Args:
+            publish: sends a message under a leaf of the session's key; never waits for the client.
+            on_end: called by the session's thread when nothing is left of it, before it says so.
+        """
+        self.name = name
+        self._answerer = answerer
+        self._idle_timeout_s = idle_timeout_s
+        self._publish = publish
+        self._metrics = metrics
+        self._on_end = on_end
+        self._inbox = LatestFrame()
+        self._reason: EndReason | None = None
+        self._lock = threading.Lock()
+        self._states: Counter[str] = Counter()
+        self._thread = threading.Thread(target=self._run, name=f"live-{name}", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def offer(self, arrival: Arrival) -> None:
+        """Leave a frame for the thread; the one that waits, if any, is dropped for it."""
+        self._metrics.frame_received(dropped=not self._inbox.put(arrival))
+
+    def end(self, reason: EndReason) -> None:
+        """Take no more frames; the first reason counts. Returns at once."""
+        with self._lock:
+            self._reason = self._reason or reason
+        self._inbox.close()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the end."""
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            with self._answerer:
+                self._answer_frames()
+        except Exception:
+            logger.exception(
+                "live session failed", extra={"fields": {"event": "internal", "session": self.name}}
+            )
+            self.end(EndReason.INTERNAL)
+        self._on_end(self)
+        self._say_ended()
+
+    def _answer_frames(self) -> None:
+        usable_until = time.perf_counter() + self._idle_timeout_s
+        while self._reason is None:
+            arrival = self._inbox.take(usable_until - time.perf_counter())
+            if arrival is not None and self._answered(arrival):
+                usable_until = time.perf_counter() + self._idle_timeout_s
+            elif self._reason is None and time.perf_counter() >= usable_until:
+                self.end(EndReason.IDLE)
+
+    def _answered(self, arrival: Arrival) -> bool:
+        """Whether the frame could be used: it has been answered then."""
+        try:
+            pose = self._answerer.answer(arrival)
+        except FrameError as error:
+            self._metrics.frame_refused(error.code)
+            self._states["refused"] += 1
+            self._event("refused", error.code, error.message, error.sequence)
+            return False
+        self._states[pose.state] += 1
+        self._metrics.frame_answered(pose.state, (time.perf_counter() - arrival.received) * 1e3)
+        self._publish("poses", pose)
+        return True
+
+    def _say_ended(self) -> None:
+        reason = self._reason or EndReason.INTERNAL
+        text = _END_TEXT.get(reason, f"no usable frame for {self._idle_timeout_s:g} s")
+        self._event("ended", reason, text, None)
+        self._metrics.ended(reason)
+        logger.info(
+            "live session ended",
+            extra={
+                "fields": {
+                    "event": "live_ended",
+                    "session": self.name,
+                    "reason": reason,
+                    "frames": dict(self._states),
+                }
+            },
+        )
+
+    def _event(self, kind: str, code: str, message: str, sequence: int | None) -> None:
+        fields = {"type": kind, "session": self.name, "code": code, "message": message}
+        event = TrackEvent.model_validate(
+            {**fields, "sequence": sequence, "time": datetime.now(UTC).isoformat()}
+        )
+        self._publish("events", event)

@@ -1,0 +1,233 @@
+"""A server's live sessions on Zenoh: opened by a query, fed by publications, ended with their clients."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+
+import zenoh
+from pydantic import BaseModel, TypeAdapter, ValidationError
+from zenoh.handlers import Callback
+
+from reloc.service.live.frames import FrameAnswerer
+from reloc.service.live.latest import Arrival
+from reloc.service.live.metrics import LiveMetrics
+from reloc.service.live.options import LiveOptions
+from reloc.service.live.session import LiveSession
+from reloc.service.session import Keys
+from reloc.service.source import ServedArea
+from reloc.wire import MAX_ATTACHMENT_BYTES, ErrorCode, ErrorReply, RequestError, encode, parse_attachment
+from reloc.wire_track import (
+    EndReason,
+    LiveStatus,
+    SessionName,
+    TrackLimits,
+    TrackOpened,
+    TrackOpenRequest,
+)
+
+logger = logging.getLogger(__name__)
+
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_NAME: TypeAdapter[str] = TypeAdapter(SessionName)
+
+
+class LiveSessions:
+    """Opens and ends sessions; at most `LiveOptions.max_sessions` at a time."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        keys: Keys,
+        area: Callable[[], ServedArea],
+        options: LiveOptions,
+        server_id: str,
+    ) -> None:
+        """
+        Args:
+            area: gives the area in service.
+        """
+        self._session, self._keys, self._area = session, keys, area
+        self._options, self._server_id = options, server_id
+        self._metrics = LiveMetrics()
+        self._lock = threading.Lock()
+        self._open: dict[str, LiveSession] = {}
+        self._frames: dict[str, zenoh.Subscriber[None]] = {}
+        self._closed = False
+        self._queryable: zenoh.Queryable[None] | None = None
+        self._tokens: zenoh.Subscriber[None] | None = None
+
+    def start(self) -> None:
+        """Take sessions from now on."""
+        self._tokens = self._session.liveliness().declare_subscriber(
+            self._keys.track("*", "client"), self._on_token
+        )
+        # `complete`: of several servers of one database the nearest takes the session.
+        self._queryable = self._session.declare_queryable(
+            self._keys.of("track/*"), self._on_open, complete=True
+        )
+
+    def close(self, timeout_s: float) -> None:
+        """End all sessions, and wait for that at most so long; take no more."""
+        with self._lock:
+            self._closed = True
+            sessions = list(self._open.values())
+        for session in sessions:
+            session.end(EndReason.SHUTTING_DOWN)
+        end = time.perf_counter() + timeout_s
+        for session in sessions:
+            session.join(max(0.0, end - time.perf_counter()))
+        if self._queryable is not None:
+            self._queryable.undeclare()
+        if self._tokens is not None:
+            self._tokens.undeclare()
+
+    def status(self) -> LiveStatus:
+        """Counts since the start."""
+        return self._metrics.status(open_now=len(self._open), capacity=self._options.max_sessions)
+
+    # Zenoh calls these in threads of its own; they must return at once.
+
+    def _on_open(self, query: zenoh.Query) -> None:
+        name = str(query.key_expr).rpartition("/")[2]
+        with query:
+            try:
+                reply = encode(self._opened(name, query))
+            except RequestError as error:
+                self._refuse(query, name, error)
+                return
+            except Exception:
+                logger.exception("live session not opened", extra={"fields": {"event": "internal"}})
+                text = "the server failed to open the session; its log says why"
+                self._refuse(query, name, RequestError(ErrorCode.INTERNAL, text))
+                return
+            query.reply(self._keys.track(name), reply, encoding=_JSON)
+        _log("live session opened", "live_opened", name)
+
+    def _refuse(self, query: zenoh.Query, name: str, error: RequestError) -> None:
+        self._metrics.open_refused(error.code)
+        refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
+        query.reply_err(encode(refusal), encoding=_JSON)
+        _log("live session refused", "live_refused", name[:80], code=error.code, refusal=error.message)
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        """A client's token has come or gone."""
+        if sample.kind != zenoh.SampleKind.DELETE:
+            return
+        name = str(sample.key_expr).split("/")[-2]
+        with self._lock:
+            session = self._open.get(name)
+        if session is not None:
+            session.end(EndReason.CLIENT_GONE)
+
+    def _opened(self, name: str, query: zenoh.Query) -> TrackOpened:
+        """Open the session of this name.
+
+        Raises:
+            RequestError: why it is not opened.
+        """
+        try:
+            _NAME.validate_python(name)
+        except ValidationError as error:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST,
+                "session: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit, "
+                f"found {name[:80]!r}",
+            ) from error
+        attachment = None if query.attachment is None else query.attachment.to_bytes()
+        request = parse_attachment(TrackOpenRequest, attachment)
+        with self._lock:
+            self._check_room(name)
+            answerer = FrameAnswerer(name, request, self._area, self._options)
+            session = LiveSession(
+                name,
+                answerer,
+                idle_timeout_s=self._options.idle_timeout_s,
+                publish=lambda leaf, message: self._publish(self._keys.track(name, leaf), message),
+                metrics=self._metrics,
+                on_end=self._forget,
+            )
+
+            def take(sample: zenoh.Sample) -> None:
+                self._on_frame(session, sample)
+
+            # Called by Zenoh's own thread, not by one behind an unbounded queue of samples.
+            self._frames[name] = self._session.declare_subscriber(
+                self._keys.track(name, "frames"), Callback(take, indirect=False)
+            )
+            self._open[name] = session
+            session.start()
+        self._metrics.opened()
+        limits = self._options.limits
+        return TrackOpened(
+            session=name,
+            database=self._keys.database,
+            server_id=self._server_id,
+            snapshot=answerer.snapshot,
+            idle_timeout_s=self._options.idle_timeout_s,
+            limits=TrackLimits(
+                max_payload_bytes=limits.max_bytes,
+                max_pixels=limits.max_pixels,
+                tracked_side_px=self._options.max_side_px,
+            ),
+        )
+
+    def _check_room(self, name: str) -> None:
+        if self._closed:
+            raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
+        if self._options.max_sessions == 0:
+            raise RequestError(
+                ErrorCode.UNSUPPORTED,
+                "this server takes no live sessions; start it with --live-sessions 1 or more",
+            )
+        if name in self._open:
+            raise RequestError(
+                ErrorCode.BAD_REQUEST, f"session: {name!r} is open; choose another name, at random"
+            )
+        if len(self._open) >= self._options.max_sessions:
+            raise RequestError(
+                ErrorCode.BUSY,
+                f"{len(self._open)} live sessions are open, as many as this server takes; try again later, "
+                "ask another server, or start it with more --live-sessions",
+            )
+
+    def _on_frame(self, session: LiveSession, sample: zenoh.Sample) -> None:
+        """Take a frame over; what is too large is not copied, and refused by the session's thread."""
+        size = len(sample.payload)
+        header = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        session.offer(
+            Arrival(
+                # One byte over the limit is refused as all of them would be.
+                header=header[: MAX_ATTACHMENT_BYTES + 1],
+                payload=sample.payload.to_bytes() if size <= self._options.limits.max_bytes else b"",
+                size=size,
+                received=time.perf_counter(),
+                received_at=datetime.now(UTC),
+            )
+        )
+
+    def _forget(self, session: LiveSession) -> None:
+        """Nothing is left of the session; called by its thread."""
+        with self._lock:
+            frames = self._frames.pop(session.name)
+        frames.undeclare()
+        with self._lock:
+            del self._open[session.name]
+
+    def _publish(self, key: str, message: BaseModel) -> None:
+        try:
+            # A client that does not read loses poses; nobody waits for it.
+            self._session.put(
+                key,
+                encode(message),
+                encoding=_JSON,
+                congestion_control=zenoh.CongestionControl.DROP,
+                express=True,
+            )
+        except zenoh.ZError:
+            logger.warning("a live session's message could not be published", exc_info=True)
+
+
+def _log(message: str, event: str, name: str, **fields: object) -> None:
+    logger.info(message, extra={"fields": {"event": event, "session": name, **fields}})

@@ -1,0 +1,129 @@
+"""A track: points of the map carried from frame to frame by optical flow, and the poses that they give."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from reloc.tracking.flow import follow
+from reloc.tracking.keyframe import Keyframe, Unmatched
+from reloc.tracking.landmarks import Landmarks
+from reloc.tracking.options import TrackOptions
+from reloc.tracking.pose_fit import FittedPose, fit_pose
+from reloc.tracking.recent import RecentFrame
+
+
+class FlowTrack:
+    """Landmarks of an area with the last poses; used from one thread at a time.
+
+    Attributes:
+        area: that the landmarks are of.
+        landmarks: as the last frame shows them.
+        why: the last thing that went wrong, in words.
+    """
+
+    def __init__(self, keyframe: Keyframe, frame: RecentFrame, camera: Camera, options: TrackOptions) -> None:
+        """
+        Args:
+            frame: the keyframe's own, at which the track begins.
+            camera: intrinsics of the frames.
+        """
+        self.area = keyframe.area
+        self.why = ""
+        self._camera, self._options = camera, options
+        self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
+        self._poses: deque[tuple[float, Rigid3]] = deque([(frame.time_s, keyframe.cam_from_local)], maxlen=2)
+
+    def settle(self) -> FittedPose | None:
+        """The pose of the landmarks as they are; those that disagree are dropped. None: too few agree."""
+        return self._replaced(self._agreed(self.landmarks, None, self._poses[-1][1]))
+
+    def follow(self, before: RecentFrame, now: RecentFrame) -> FittedPose | None:
+        """Carry the landmarks from the last frame to the next; None where too few are found, or agree."""
+        marks, last = self.landmarks, self._poses[-1][1]
+        predicted = self._predicted(now.time_s)
+        step = self._camera.project(predicted.act(marks.points)) - self._camera.project(
+            last.act(marks.points)
+        )
+        guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
+        pixels, good = follow(before.gray, now.gray, marks.pixels, guess, self._options.flow)
+        fitted = self._agreed(replace(marks, pixels=pixels), good, predicted)
+        if fitted is not None:
+            self._poses.append((now.time_s, fitted.cam_from_local))
+        return fitted
+
+    def refresh(self, keyframe: Keyframe, then: RecentFrame, now: RecentFrame) -> FittedPose | None:
+        """Take over what an earlier frame's matches say of the frame at hand; None: they do not agree.
+
+        The guess where they are now is the track's.
+        """
+        fresh, pose = _landmarks_of(keyframe, then.index), self._poses[-1][1]
+        step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
+            keyframe.cam_from_local.act(fresh.points)
+        )
+        usable = np.flatnonzero(np.isfinite(step).all(axis=1))
+        fresh = fresh.take(usable)
+        pixels, good = follow(
+            then.gray, now.gray, fresh.pixels, fresh.pixels + step[usable], self._options.flow
+        )
+        everything = self.landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
+        return self._replaced(self._agreed(self._spread(everything, now.gray), None, pose))
+
+    def _replaced(self, fitted: FittedPose | None) -> FittedPose | None:
+        """The last frame has this pose."""
+        if fitted is not None:
+            self._poses[-1] = (self._poses[-1][0], fitted.cam_from_local)
+        return fitted
+
+    def _agreed(
+        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3
+    ) -> FittedPose | None:
+        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
+        options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
+        if len(followed) < options.min_landmarks:
+            self.why = f"{len(followed)} of {len(marks)} landmarks are found again"
+            return None
+        fitted = fit_pose(self._camera, followed.pixels, followed.points, predicted, options.fit)
+        agree = 0 if fitted is None else int(fitted.inlier.sum())
+        if fitted is None or agree < max(options.min_landmarks, options.least_share * len(followed)):
+            self.why = f"{agree} of {len(followed)} landmarks agree with a pose"
+            return None
+        self.landmarks = followed.take(fitted.inlier)
+        return fitted
+
+    def _predicted(self, time_s: float) -> Rigid3:
+        """The last pose, moved on as it moved before."""
+        if len(self._poses) < 2:
+            return self._poses[-1][1]
+        (first_s, first), (second_s, second) = self._poses
+        share = (time_s - second_s) / max(second_s - first_s, 1e-9)
+        return Rigid3.exp(min(share, 3.0) * (second @ first.inverse()).log()) @ second
+
+    def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:
+        options = self._options
+        return marks.spread(options.landmarks, options.columns, options.rows, gray.shape[1], gray.shape[0])
+
+
+def carried(track: FlowTrack, frames: Sequence[RecentFrame]) -> FlowTrack | Unmatched:
+    """The track from the first of these frames, which is its last one, to the last of them."""
+    for before, after in pairwise(frames):
+        if track.follow(before, after) is None:
+            return Unmatched(reason="LOST", detail=track.why)
+    return track
+
+
+def _landmarks_of(keyframe: Keyframe, index: int) -> Landmarks:
+    """A keyframe's matches. A point may be seen by two keypoints; it is followed once."""
+    _, first = np.unique(keyframe.rows, return_index=True)
+    rows = keyframe.rows[first]
+    return Landmarks(
+        rows=rows,
+        points=keyframe.area.points[rows],
+        pixels=keyframe.pixels[first],
+        born=np.full(len(first), index, dtype=np.int64),
+    )

@@ -1,0 +1,131 @@
+"""`featuredb live`: a film streamed at its own speed to a server, and what is written of it."""
+
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.cli.main import main
+from featuredb.errors import VideoError
+from featuredb.geo.geopose import BODY_AXES
+from featuredb.video.writer import VideoWriter
+from reloc.client import Client
+from reloc.client.film import StreamOptions, stream_film
+from reloc.service.server import Server
+from reloc.tracking.pose_message import point_of_message, pose_message
+from reloc.wire_track import TrackPose
+from tests.support.live import LENS, error_m, frame, localiser
+from tests.support.planar_map import CAMERA
+from tests.support.service import running_server
+
+_FRAMES, _RATE_HZ = 90, 15.0
+_LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMERA.params))}"
+
+
+@pytest.fixture(scope="module")
+def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Six seconds over one place: enough to be found there on a busy machine."""
+    path = tmp_path_factory.mktemp("film") / "still.mp4"
+    with VideoWriter(path, width=CAMERA.width, height=CAMERA.height, fps=_RATE_HZ) as writer:
+        for _ in range(_FRAMES):
+            writer.write(frame(0))
+    return path
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with running_server(localiser()) as running:
+        yield running
+
+
+def test_the_command_streams_a_film_and_writes_its_track(
+    server: Server, film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    outs = [tmp_path / f"out/track.{kind}" for kind in ("csv", "tum", "geojson", "kml", "json", "srt")]
+    told = [text for file in outs for text in ("--out", str(file))]
+    where = ["--connect", server.endpoints[0], "--camera", _LENS]
+    assert main(["live", str(film), *where, *told, "--json"]) == 0
+    said = capsys.readouterr()
+    poses = [TrackPose.model_validate_json(line) for line in said.out.splitlines()]
+    assert f"{_FRAMES} frames" in said.err
+    numbers = [pose.sequence for pose in poses]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == _FRAMES - 1
+    rows = list(csv.DictReader(outs[0].read_text().splitlines()))
+    assert [int(row["frame"]) for row in rows] == numbers
+    for row, pose in zip(rows, poses, strict=True):
+        assert row["state"] == pose.state
+        assert float(row["time_s"]) == pytest.approx(pose.sequence / _RATE_HZ, abs=1e-4)
+        if pose.utm is not None:
+            assert error_m((pose.utm.easting, pose.utm.northing, pose.utm.height), 0) < 0.3
+    assert {"relocalised", "tracking"} <= {pose.state for pose in poses}
+    assert all(file.exists() for file in outs)
+    assert json.loads(said.out.splitlines()[-1])["latency_ms"] > 0
+
+
+def test_without_json_it_speaks_to_people(
+    server: Server, film: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["live", str(film), "--connect", server.endpoints[0], "--camera", _LENS]) == 0
+    said = capsys.readouterr().out
+    assert "EPSG:32632 E 4567" in said
+    assert "median" in said
+    assert len(said.splitlines()) < 20
+
+
+def test_what_cannot_be_streamed_says_why(
+    server: Server, film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ["--connect", server.endpoints[0]]
+    assert main(["live", str(film), *where, "--out", str(tmp_path / "t.txt")]) == 2
+    assert "expected a name that ends in .csv" in capsys.readouterr().err
+    assert main(["live", str(tmp_path / "none.mp4"), *where]) == 2
+    assert "none.mp4" in capsys.readouterr().err
+    assert main(["live", str(film), *where, "--start", "60"]) == 2
+    assert "no frames" in capsys.readouterr().err
+    assert main(["live", str(film), *where, "--camera", "PINHOLE,100,100,90,90,50,50", "--end", "0.3"]) == 1
+    assert "640x480" in capsys.readouterr().out
+
+
+def test_a_film_that_cannot_be_read_opens_no_session(server: Server, tmp_path: Path) -> None:
+    before = server.status().live
+    (tmp_path / "broken.mp4").write_bytes(b"no film")
+    with Client(server.endpoints[0]) as client, pytest.raises(VideoError):
+        stream_film(client, tmp_path / "broken.mp4", options=StreamOptions())
+    after = server.status().live
+    assert before is not None
+    assert after is not None
+    assert after.opened == before.opened
+
+
+def test_a_pose_survives_the_wire(server: Server, film: Path) -> None:
+    poses: list[TrackPose] = []
+    with Client(server.endpoints[0]) as client:
+        stream_film(client, film, camera=LENS, on_pose=lambda pose, _: poses.append(pose))
+    known = next(pose for pose in poses if pose.state == "tracking")
+    assert known.body_axes == BODY_AXES
+    assert known.accuracy is not None
+    point = point_of_message(TrackPose.model_validate_json(known.model_dump_json()))
+    assert point.pose is not None
+    again = pose_message(
+        point,
+        CAMERA,
+        session=known.session,
+        sequence=known.sequence,
+        snapshot=known.snapshot,
+        dropped=known.dropped,
+        received_at=known.received_at,
+        answered_at=known.answered_at,
+        timings_ms=known.timings_ms,
+    )
+    assert again.utm == known.utm
+    assert again.position == known.position
+    assert np.allclose(again.covariance or (), known.covariance or ())
+    # The radii are those of an independent draw from the covariance.
+    rng = np.random.default_rng(1)
+    drawn = rng.multivariate_normal(np.zeros(6), np.array(known.covariance), 20_000)
+    inside = np.linalg.norm(drawn[:, 3:5], axis=1) < known.accuracy.horizontal_68_m
+    assert inside.mean() == pytest.approx(0.68, abs=0.03)

@@ -1,0 +1,156 @@
+"""The tracker live: a thread whose answers come when the test says, measured in frames."""
+
+from collections.abc import Callable
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reloc.tracking.tracker as tracker_module
+from reloc.candidates import IndexedArea
+from reloc.tracking.options import TrackOptions
+from reloc.tracking.recent import RecentFrame, RecentFrames
+from reloc.tracking.tracker import TrackedFrame, Tracker
+from tests.support.live import error_m, field_area, frame
+from tests.support.planar_map import CAMERA
+
+_LIVE = TrackOptions(live=True, keyframe_every=8)
+
+
+class SlowThread:
+    """An executor that has the answer so many frames after it was asked; none that is waited for."""
+
+    def __init__(self) -> None:
+        self.now = 0
+        self.asked: list[tuple[int, str]] = []
+        self.delays: dict[str, Callable[..., int]] = {
+            "find_frame": lambda *_: 9,
+            "match_keyframe": lambda *_: 5,
+            "carried": lambda track, frames: len(frames) // 3,
+        }
+
+    def submit(self, function: Callable[..., Any], *arguments: Any) -> "Later":
+        self.asked.append((self.now, function.__name__))
+        due = self.now + max(1, self.delays[function.__name__](*arguments))
+        return Later(self, due, function(*arguments))
+
+    def shutdown(self, **_: Any) -> None:
+        pass
+
+
+class Later:
+    """A future of `SlowThread`."""
+
+    def __init__(self, thread: SlowThread, due: int, value: object) -> None:
+        self._thread, self._due, self._value = thread, due, value
+
+    def done(self) -> bool:
+        return self._thread.now >= self._due
+
+    def result(self) -> object:
+        assert self.done(), "a frame waited for the thread"
+        return self._value
+
+
+@pytest.fixture
+def thread(monkeypatch: pytest.MonkeyPatch) -> SlowThread:
+    slow = SlowThread()
+    monkeypatch.setattr(tracker_module, "ThreadPoolExecutor", lambda *_, **__: slow)
+    return slow
+
+
+def followed(tracker: Tracker, thread: SlowThread, frames: range, texture: int = 1) -> list[TrackedFrame]:
+    found = []
+    for number in frames:
+        thread.now = number
+        found.append(tracker.track(frame(number % 60, texture), number / 30.0))
+    return found
+
+
+def runs(found: list[TrackedFrame]) -> list[tuple[str, int]]:
+    return [(state, len(list(same))) for state, same in groupby(f.state for f in found)]
+
+
+def check_poses(found: list[TrackedFrame], first: int = 0) -> None:
+    area = field_area().area
+    for number, tracked in enumerate(found, start=first):
+        if tracked.cam_from_local is not None:
+            utm = area.frame.utm_from_enu(tracked.cam_from_local.center, area.maps[0].epsg)
+            assert error_m(tuple(utm), number % 60) < 0.3, number
+
+
+def test_no_frame_waits_and_a_track_that_was_found_is_carried_to_the_frame_at_hand(
+    thread: SlowThread,
+) -> None:
+    with Tracker((field_area(),), CAMERA, _LIVE) as tracker:
+        found = followed(tracker, thread, range(60))
+        # Found after nine frames; those take three more, and the last three are followed at once.
+        assert runs(found) == [("lost", 12), ("relocalised", 1), ("tracking", 47)]
+        assert [what for _, what in thread.asked[:3]] == ["find_frame", "carried", "match_keyframe"]
+        assert thread.asked[1][0] == 9
+        assert not tracker.finish()
+    check_poses(found)
+
+
+def test_a_thread_that_is_slower_than_the_frames_is_caught_up_with_by_passing_some_over(
+    thread: SlowThread,
+) -> None:
+    thread.delays["carried"] = lambda track, frames: 2 * len(frames)
+    with Tracker((field_area(),), CAMERA, _LIVE) as tracker:
+        found = followed(tracker, thread, range(45))
+    assert [what for _, what in thread.asked].count("carried") == 1
+    assert runs(found)[1:] == [("relocalised", 1), ("tracking", len(found) - 1 - runs(found)[0][1])]
+    check_poses(found)
+
+
+def test_maps_that_change_end_a_track_in_them_and_leave_others_alone(thread: SlowThread) -> None:
+    old = field_area()
+    other = IndexedArea(area=old.area, index=old.index)  # the same area, taken over: not another map
+    moved = _rebuilt(old)
+    with Tracker((old,), CAMERA, _LIVE) as tracker:
+        followed(tracker, thread, range(20))
+        tracker.use_areas([other])
+        assert {f.state for f in followed(tracker, thread, range(20, 30))} == {"tracking"}
+        tracker.use_areas([moved])
+        again = followed(tracker, thread, range(30, 60))
+        assert again[0].detail == "LOST: the maps have changed"
+        assert runs(again) == [("lost", 12), ("relocalised", 1), ("tracking", 17)]
+        assert all(f.area is moved.area for f in again if f.area is not None)
+        check_poses(again, 30)
+        tracker.use_areas([])
+        gone = followed(tracker, thread, range(60, 90))
+        assert {f.state for f in gone} == {"lost"}
+
+
+def test_what_was_found_in_maps_that_have_gone_is_not_used(thread: SlowThread) -> None:
+    old = field_area()
+    with Tracker((old,), CAMERA, _LIVE) as tracker:
+        followed(tracker, thread, range(5))
+        tracker.use_areas([])
+        assert {f.state for f in followed(tracker, thread, range(5, 30))} == {"lost"}
+
+
+def _rebuilt(indexed: IndexedArea) -> IndexedArea:
+    from featuredb.index.area import build_area
+
+    return IndexedArea(area=build_area(indexed.area.maps), index=indexed.index)
+
+
+def test_frames_since_a_keyframe_get_sparser_and_the_keyframe_stays() -> None:
+    gray = np.zeros((4, 4), np.uint8)
+    recent = RecentFrames(8)
+    for index in range(100):
+        recent.add(RecentFrame(index=index, time_s=index / 30.0, gray=gray), 10 if index > 10 else None)
+        assert len(recent) <= 8
+        assert recent.last is not None
+        assert recent.last.index == index
+        since = [f.index for f in recent.since(10)]
+        if index >= 10:
+            assert since[0] == 10
+            assert since[-1] == index
+            assert since == sorted(set(since))
+            assert max(np.diff(since), default=0) <= max(1.0, 4.0 * (index - 10) / 8)
+    recent.add(RecentFrame(index=100, time_s=4.0, gray=gray), None)
+    assert len(recent) == 1
+    assert recent.since(10) == []
