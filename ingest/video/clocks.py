@@ -42,7 +42,7 @@ class ClockOptions:
         deviations, repeat_s: see margin.
         spread_s: beginnings that are not, beside the best, are within so many seconds of it: at 10 m/s an
             error of a second is that of a poor receiver.
-        min_correlation: of the speeds, or of the turns.
+        min_correlation: of the speeds, or of the turns: cameras that tilt and turn all the time have no more.
         max_search_s: of log to be searched; longer ones are no flight.
         match: how movements are compared. Films shorter than its `least_s` have one bend or one stop, and
             those of other flights are like it.
@@ -54,7 +54,7 @@ class ClockOptions:
     deviations: float = 2.0
     repeat_s: float = 10.0
     spread_s: float = 1.0
-    min_correlation: float = 0.8
+    min_correlation: float = 0.5
     match: MatchOptions = field(default_factory=lambda: MatchOptions(least_s=40.0))
     max_search_s: float = 172_800.0
 
