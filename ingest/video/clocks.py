@@ -25,6 +25,7 @@ from ingest.video.motion import Motion
 _ZONES_H = (*(0.5 * k for k in range(-24, 29)), 5.75, 8.75, 12.75, 13.75)
 # Before this year a clock was not set: containers count from 1904 or 1970, chips from 1980 or 2000.
 _FIRST_YEAR = 2005
+_CLOCKS_S = (315_532_800.0, 4_102_444_800.0)  # 1980 to 2100, as in telemetry
 _HALF_DAY_S = 43_200.0
 _OVERRIDE = "give --film-start with when it begins, --gcp, or --no-telemetry"
 
@@ -50,7 +51,7 @@ class ClockOptions:
 
     drift_s: float = 120.0
     told_s: float = 3.0
-    margin: float = 4.0
+    margin: float = 7.0
     deviations: float = 2.0
     repeat_s: float = 10.0
     spread_s: float = 1.0
@@ -95,8 +96,10 @@ def film_start(text: str, telemetry: Telemetry) -> float:
             )
         return float(text)
     clock = parse_wall_clock(text)
-    if clock is None or not re.fullmatch(
-        r"\s*\d{4}-\d\d-\d\d[ T][\d:.,]+\s?(Z|UTC|[+-]\d\d:?\d\d)?\s*", text
+    if (
+        clock is None
+        or not _CLOCKS_S[0] < clock.seconds < _CLOCKS_S[1]
+        or not re.fullmatch(r"\s*\d{4}-\d\d-\d\d[ T][\d:.,]+\s?(Z|UTC|[+-]\d\d:?\d\d)?\s*", text)
     ):
         raise InvalidValueError(
             f"--film-start: expected a date and time like 2024-05-31T12:00:00Z, found {text!r}"

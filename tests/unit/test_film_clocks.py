@@ -2,14 +2,20 @@
 
 from datetime import UTC, datetime, timedelta
 
+import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from featuredb.errors import InvalidValueError, TelemetryError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.video.film import VideoFrame
 from featuredb.video.telemetry.values import Clock, Telemetry
 from ingest.video.clocks import ClockOptions, FilmTime, check_overlap, film_start, lay_on_film
-from ingest.video.motion import Motion
+from ingest.video.match import _picture_turn
+from ingest.video.motion import Motion, measure_motion
+from tests.support.films import picture
 
 _NOON = datetime(2024, 5, 31, 12, 0, tzinfo=UTC)
 _LOG_S, _FILM_S, _BEGIN_S = 1200.0, 150.0, 431.7
@@ -256,6 +262,8 @@ def test_film_starts(flight: _Flight, text: str, clock: Clock, seconds: float) -
         ("431.7", "utc", "expected a date and time"),
         ("noon", "local", "expected a date and time"),
         ("2024-13-31T12:07:11Z", "utc", "expected a date and time"),
+        ("9999-12-31T23:59:59-12:00", "utc", "expected a date and time"),
+        ("0001-01-01T00:00:00+12:00", "utc", "expected a date and time"),
         ("nan", "none", "has no clock"),
     ],
 )
@@ -268,6 +276,51 @@ def test_telemetry_in_the_films_time_has_no_beginning() -> None:
     own = Telemetry(times_s=np.arange(3.0), latitude_deg=np.ones(3), longitude_deg=np.ones(3), source="SRT")
     with pytest.raises(InvalidValueError, match="in the film's time already"):
         film_start("2024-05-31T12:07:11Z", own)
+
+
+@settings(deadline=None, max_examples=60, derandomize=True)
+@given(
+    steps=st.lists(st.sampled_from([1e-9, 0.01, 0.2, 1.0, 30.0, 5000.0]), min_size=1, max_size=60),
+    places=st.lists(
+        st.one_of(st.just(float("nan")), st.floats(-1.0, 1.0), st.sampled_from([0.0, 90.0])),
+        min_size=60,
+        max_size=60,
+    ),
+    told=st.one_of(st.none(), st.floats(-1e5, 1e5)),
+    clock=st.sampled_from(["utc", "none"]),
+)
+def test_any_log_is_laid_or_refused(
+    steps: list[float], places: list[float], told: float | None, clock: Clock
+) -> None:
+    times, values = np.cumsum(steps), np.array(places[: len(steps)])
+    log = Telemetry(
+        times_s=times,
+        latitude_deg=values,
+        longitude_deg=values,
+        clock_s=np.full(len(times), np.nan) if clock == "none" else _NOON.timestamp() + times,
+        clock=clock,
+        in_video_time=False,
+        source="CSV",
+    )
+    film = _film(_TRUE, told)
+    motion = _Flight(1).film(np.random.default_rng(1), length_s=60.0)
+    found = lay_on_film(motion, log, film, ClockOptions(max_search_s=20_000.0))
+    assert found.message
+    assert found.late_s is None or np.isfinite(found.late_s)
+
+
+def test_a_camera_that_turns_clockwise_turns_its_picture_the_other_way() -> None:
+    """Measured in pictures, so that the signs of `match.py` are those of cameras that look down."""
+    ground = picture(0, 480, 360)
+    frames = [
+        cv2.warpAffine(ground, cv2.getRotationMatrix2D((240, 180), 0.5 * k, 1.0), (480, 360))[60:300, 80:400]
+        for k in range(6)  # OpenCV's positive angles are counter-clockwise
+    ]
+    motion = measure_motion(
+        VideoFrame(index=k, time_s=0.1 * k, gray=np.ascontiguousarray(f[:, :, 0]), make_rgb=lambda f=f: f)  # type: ignore[misc]
+        for k, f in enumerate(frames)
+    )
+    np.testing.assert_allclose(_picture_turn(motion).values, np.radians(5.0), rtol=0.05)
 
 
 def test_errors_over_many_flights() -> None:
