@@ -116,7 +116,7 @@ def _telemetry(args: argparse.Namespace) -> "Telemetry | None":
 def _film_start(telemetry: "Telemetry | None", args: argparse.Namespace) -> float | None:
     """Where the film begins in a log with a clock of its own, as was told."""
     from featuredb.errors import InvalidValueError
-    from ingest.video.clocks import film_start
+    from ingest.video.film_time import film_start
 
     if args.film_start is not None:
         if telemetry is None:

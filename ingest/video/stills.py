@@ -19,7 +19,8 @@ from featuredb.video.frames import open_video
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.video.clocks import ClockOptions, FilmTime, check_overlap, lay_on_film
+from ingest.video.clocks import ClockOptions, check_overlap, lay_on_film
+from ingest.video.film_time import FilmTime
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
 from ingest.video.lag import LagOptions, estimate_lag
 from ingest.video.motion import Motion, MotionOptions, measure_motion
@@ -40,7 +41,7 @@ class StillsOptions:
         start_s, end_s: the stretch of the film; None: all of it.
         telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
             and 0 where that says nothing.
-        film_start_s: where the film begins in telemetry that has a clock of its own (`clocks.film_start`);
+        film_start_s: where the film begins in telemetry that has a clock of its own (`film_time.film_start`);
             None: found (`clocks.py`).
         positions: telemetry that cannot be laid on the film is refused; False: it is only told, as the map is
             placed by other means.

@@ -15,7 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
 from featuredb.video.telemetry.read import read_telemetry
 from featuredb.video.writer import VideoWriter
-from ingest.video.clocks import film_start
+from ingest.video.film_time import film_start
 from ingest.video.keyframes import KeyframeOptions
 from ingest.video.stills import StillsOptions, make_stills
 from tests.support.hill_photos import CAMERA, FRAME, _render

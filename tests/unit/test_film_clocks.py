@@ -12,7 +12,8 @@ from featuredb.errors import InvalidValueError, TelemetryError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame
 from featuredb.video.telemetry.values import Clock, Telemetry
-from ingest.video.clocks import ClockOptions, FilmTime, check_overlap, film_start, lay_on_film
+from ingest.video.clocks import ClockOptions, check_overlap, lay_on_film
+from ingest.video.film_time import FilmTime, film_start
 from ingest.video.match import _picture_turn
 from ingest.video.motion import Motion, measure_motion
 from tests.support.films import picture
