@@ -159,7 +159,8 @@ def _judge(
         return outcome(
             "DEGENERATE_LINE",
             f"the photos lie along a line: {spread_ratio:.1f} sigmas of GPS across it, at least "
-            f"{options.min_rotation_sigma_ratio:g} are needed to tell which way is up",
+            f"{options.min_rotation_sigma_ratio:g} are needed to tell which way is up; add photos "
+            "beside the line, or place it by control points (--gcp) or a scan",
             None,
         )
     share = 1.0 - used / len(centers)

@@ -18,7 +18,18 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         default=None,
         metavar="FILE",
-        help="a drone's .srt; default: what is in the film (GoPro, DJI) or beside it under its name",
+        help="a drone's .srt, or a log (GPX, CSV); default: what is in the film (GoPro, DJI) or beside it "
+        "under its name",
+    )
+    group.add_argument(
+        "--no-telemetry", action="store_true", help="take no notice of telemetry in the film or beside it"
+    )
+    group.add_argument(
+        "--film-start",
+        default=None,
+        metavar="WHEN",
+        help="when the film begins on the clock of a GPX or CSV log, like 2024-05-31T12:00:00Z; seconds of "
+        "the log where it has no clock; default: found by the movements of picture and receiver",
     )
     group.add_argument(
         "--telemetry-late",
@@ -26,7 +37,7 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         default=None,
         metavar="S",
         help="how much later than the picture the telemetry shows a place; default: estimated from the "
-        "speeds of both",
+        "speeds of both; of a log with a clock of its own: beside --film-start only",
     )
     group.add_argument(
         "--keyframes", type=int, default=60, metavar="N", help="about so many at most; default: 60"
@@ -51,16 +62,19 @@ def run_video(args: argparse.Namespace) -> int:
     from ingest.video.stills import StillsOptions, make_stills
     from ingest.workspace import default_root
 
+    telemetry = _telemetry(args)
     options = StillsOptions(
         start_s=args.start,
         end_s=args.end,
         telemetry_late_s=args.telemetry_late,
+        film_start_s=_film_start(telemetry, args),
+        positions=args.gcp is None,
         keyframes=KeyframeOptions(most=args.keyframes),
     )
-    telemetry = _telemetry(args)
     if telemetry is not None:
         _check(telemetry, args)
-    database = Database.create(args.db, storage_options=storage_options(args))
+    # Made by `run_photos`: a film that is refused leaves no database behind.
+    database = Database(str(args.db), storage_options(args))
     root = args.work or default_root(database.url)
     with progress_bars(args.quiet) as progress:
         stills = make_stills(args.folder, telemetry, root, options, progress)
@@ -75,13 +89,8 @@ def _check(telemetry: "Telemetry", args: argparse.Namespace) -> None:
     """Telemetry that cannot place the film is refused before anything is made."""
     import numpy as np
 
-    from featuredb.errors import InvalidValueError, TelemetryError
+    from featuredb.errors import InvalidValueError
 
-    if not telemetry.in_video_time and args.gcp is None:
-        raise TelemetryError(
-            f"{telemetry.origin or telemetry.source}: its times are on a clock of its own and cannot be laid "
-            "on the film's yet; give the drone's .srt, a film with its telemetry inside, or --gcp"
-        )
     if args.height_datum != "unknown" and not np.isfinite(telemetry.height_m).any():
         raise InvalidValueError(
             f"--height-datum {args.height_datum}: the telemetry has heights above the place of take-off only"
@@ -89,11 +98,36 @@ def _check(telemetry: "Telemetry", args: argparse.Namespace) -> None:
 
 
 def _telemetry(args: argparse.Namespace) -> "Telemetry | None":
+    from featuredb.errors import InvalidValueError
     from featuredb.video.telemetry.read import read_telemetry, telemetry_of_video
 
+    if args.no_telemetry:
+        told = [
+            name for name in ("telemetry", "telemetry_late", "film_start") if getattr(args, name) is not None
+        ]
+        if told:
+            raise InvalidValueError(f"--no-telemetry: expected no --{told[0].replace('_', '-')} beside it")
+        return None
     if args.telemetry is not None:
         return read_telemetry(args.telemetry)
     return telemetry_of_video(args.folder)
+
+
+def _film_start(telemetry: "Telemetry | None", args: argparse.Namespace) -> float | None:
+    """Where the film begins in a log with a clock of its own, as was told."""
+    from featuredb.errors import InvalidValueError
+    from ingest.video.film_time import film_start
+
+    if args.film_start is not None:
+        if telemetry is None:
+            raise InvalidValueError("--film-start: there is no telemetry; give --telemetry FILE")
+        return film_start(args.film_start, telemetry)
+    if args.telemetry_late is not None and telemetry is not None and not telemetry.in_video_time:
+        raise InvalidValueError(
+            f"--telemetry-late: {telemetry.origin or telemetry.source} has a clock of its own; give "
+            "--film-start, and this beside it if the log is late against that"
+        )
+    return None
 
 
 def _text(film: Path, stills: "Stills", telemetry: "Telemetry | None") -> str:

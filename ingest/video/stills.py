@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from featuredb.errors import VideoError
+from featuredb.errors import TelemetryError, VideoError
 from featuredb.features.exif_write import gps_directory
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
@@ -19,9 +19,11 @@ from featuredb.video.frames import open_video
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
+from ingest.video.clocks import ClockOptions, check_overlap, lay_on_film
+from ingest.video.film_time import FilmTime
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
 from ingest.video.lag import LagOptions, estimate_lag
-from ingest.video.motion import MotionOptions, measure_motion
+from ingest.video.motion import Motion, MotionOptions, measure_motion
 from ingest.workspace import atomic_file, write_json
 
 _DONE = "film.json"
@@ -39,6 +41,10 @@ class StillsOptions:
         start_s, end_s: the stretch of the film; None: all of it.
         telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
             and 0 where that says nothing.
+        film_start_s: where the film begins in telemetry that has a clock of its own (`film_time.film_start`);
+            None: found (`clocks.py`).
+        positions: telemetry that cannot be laid on the film is refused; False: it is only told, as the map is
+            placed by other means.
     """
 
     motion_side_px: int = 640
@@ -47,7 +53,10 @@ class StillsOptions:
     start_s: float | None = None
     end_s: float | None = None
     telemetry_late_s: float | None = None
+    film_start_s: float | None = None
+    positions: bool = True
     lag: LagOptions = field(default_factory=LagOptions)
+    clock: ClockOptions = field(default_factory=ClockOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
 
@@ -61,7 +70,8 @@ class Stills:
         breaks: where nothing connects a frame with the one before.
         step: between keyframes, a share of the picture's longer side.
         positions: photos with a position. heights: what their heights count from, for people.
-        late_s: by how much the telemetry was taken to be late.
+        late_s: the telemetry's time that belongs to the film's time 0: how late it is, or where in the log
+            the film begins; None where that is not known, and no photo has a position.
         notes: what was found of the film and its telemetry, and what was wrong with them.
     """
 
@@ -72,7 +82,7 @@ class Stills:
     step: float
     positions: int
     heights: str
-    late_s: float
+    late_s: float | None
     notes: tuple[str, ...]
 
 
@@ -87,6 +97,7 @@ def make_stills(
 
     Raises:
         VideoError: the film cannot be read, or shows too little motion for two keyframes.
+        TelemetryError: the telemetry has a clock of its own, and where the film lies on it is not clear.
     """
     options = options or StillsOptions()
     content = _digest_of(film)
@@ -99,6 +110,9 @@ def make_stills(
             return Stills(**{**known, "folder": folder, "notes": tuple(known["notes"])})
     small = _video_options(options, options.motion_side_px)
     with open_video(film, small) as video:
+        when = _film_time(video.info, options)
+        if telemetry is not None and options.positions and not telemetry.in_video_time:
+            check_overlap(when, telemetry, options.clock)
         progress("motion", 0, video.info.frame_count or 0)
         motion = measure_motion(video, options.motion)
         notes = list(video.report.complaints())
@@ -108,13 +122,11 @@ def make_stills(
             f"{film.name}: {len(choice.index)} keyframes in {len(motion)} frames, two are needed: the "
             "picture hardly moves, or no two frames belong together"
         )
-    late_s = options.telemetry_late_s or 0.0
+    late_s: float | None = 0.0
     if telemetry is not None:
         notes += telemetry.warnings
-        if options.telemetry_late_s is None and telemetry.in_video_time:
-            lag = estimate_lag(motion, telemetry, options.lag)
-            late_s = lag.late_s or 0.0
-            notes.append(lag.message)
+        late_s, said = _lateness(motion, telemetry, when, options)
+        notes += said
     places, heights = _places(telemetry, choice, late_s)
     _write(film, folder, choice, places, content, options, progress)
     found = Stills(
@@ -130,6 +142,37 @@ def make_stills(
     )
     write_json(done, {name: getattr(found, name) for name in Stills.__slots__ if name != "folder"})
     return found
+
+
+def _film_time(info: VideoInfo, options: StillsOptions) -> FilmTime:
+    return FilmTime(
+        name=info.name,
+        duration_s=info.duration_s or 0.0,
+        created=info.creation_time,
+        told_s=options.film_start_s,
+    )
+
+
+def _lateness(
+    motion: Motion, telemetry: Telemetry, film: FilmTime, options: StillsOptions
+) -> tuple[float | None, tuple[str, ...]]:
+    """`Stills.late_s`, and what there is to say of it.
+
+    Raises:
+        TelemetryError: positions are wanted, and the film cannot be laid on the telemetry's clock.
+    """
+    told = options.telemetry_late_s
+    if telemetry.in_video_time:
+        if told is not None:
+            return told, ()
+        lag = estimate_lag(motion, telemetry, options.lag)
+        return lag.late_s or 0.0, (lag.message,)
+    if told is not None and film.told_s is not None:
+        return film.told_s + told, ()
+    laid = lay_on_film(motion, telemetry, film, options.clock)
+    if laid.late_s is None and options.positions:
+        raise TelemetryError(laid.message)
+    return laid.late_s, (laid.message,)
 
 
 def _digest_of(film: Path) -> str:
@@ -153,9 +196,10 @@ def _digest_of_telemetry(telemetry: Telemetry | None) -> str:
         telemetry.longitude_deg,
         telemetry.height_m,
         telemetry.relative_height_m,
+        telemetry.clock_s,
     )
     parts = [hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest() for column in columns]
-    return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time))
+    return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time), telemetry.clock)
 
 
 def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
@@ -163,19 +207,21 @@ def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
 
 
 def _places(
-    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float
+    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float | None
 ) -> tuple[list[tuple[float, float, float] | None], str]:
     """Position of each keyframe, latitude, longitude, height; and what the heights are."""
     if telemetry is None:
         return [None] * len(choice.index), ""
-    if not telemetry.in_video_time:
-        return [None] * len(choice.index), "telemetry is on another clock than the film"
+    if late_s is None:
+        return [None] * len(choice.index), "not known: where in the log the film begins is not clear"
     at = telemetry.at(np.array(choice.time_s) + late_s)
     height: FloatArray = at.height_m
     heights: str = telemetry.height_datum
     if not np.isfinite(height).any():
         height, heights = at.relative_height_m, RELATIVE_HEIGHTS
     known = at.has_position & np.isfinite(height)
+    if not at.has_position.any():
+        return [None] * len(choice.index), "not known: the telemetry has no positions at the keyframes' times"
     if not known.any():
         return [None] * len(choice.index), "not known: positions without heights are not used"
     return [

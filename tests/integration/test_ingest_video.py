@@ -8,13 +8,14 @@ import pytest
 from PIL import Image
 
 from featuredb.cli.main import main
-from featuredb.errors import VideoError
+from featuredb.errors import TelemetryError, VideoError
 from featuredb.features.exif import read_exif
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
 from featuredb.video.telemetry.read import read_telemetry
 from featuredb.video.writer import VideoWriter
+from ingest.video.film_time import film_start
 from ingest.video.keyframes import KeyframeOptions
 from ingest.video.stills import StillsOptions, make_stills
 from tests.support.hill_photos import CAMERA, FRAME, _render
@@ -139,21 +140,104 @@ def test_other_telemetry_and_other_names_are_made_anew(film: Path, tmp_path: Pat
 def test_telemetry_that_cannot_place_the_film_is_refused_at_once(
     film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = tmp_path / "log.csv"
-    log.write_text(
-        "time,latitude,longitude,height\n"
-        + "".join(f"2026-05-01T12:00:{k:02d}Z,49.0,8.4{k:03d},150.0\n" for k in range(20))
-    )
+    log = _log(tmp_path / "log.csv")
     database = str(tmp_path / "db")
     command = ["ingest", "video", database, str(film), "--quiet", "--telemetry"]
-    assert main([*command, str(log)]) not in (0, 1)
-    assert "on a clock of its own" in capsys.readouterr().err
+    for more, said in (
+        (
+            [],
+            "log.csv has positions from 2026-05-01T12:00:00.0Z to 2026-05-01T12:00:19.0Z; hills.mp4 has less",
+        ),
+        (["--film-start", "2026-05-01T11:00:00Z"], "has no moment in common with it"),
+        (["--film-start", "2026-05-01T12:00:03"], "name the zone"),
+        (["--telemetry-late", "0.2"], "give --film-start"),
+        (["--no-telemetry"], "--no-telemetry: expected no --telemetry beside it"),
+    ):
+        assert main([*command, str(log), *more]) == 2
+        assert said in capsys.readouterr().err
+    for name, content in (
+        ("a.gpx", b"<gpx><trk>"),
+        ("b.csv", b"x,y\n1,2\n"),
+        ("c.srt", b""),
+        ("d.mp4", b"no"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        assert main([*command, str(tmp_path / name)]) == 2
+        assert capsys.readouterr().err.startswith(f"featuredb: {name}: ")
+    assert not (tmp_path / "db").exists()
     relative = tmp_path / "relative.srt"
     text = film.with_suffix(".srt").read_text()
     relative.write_text(re.sub(r" abs_alt: [\d.]+", "", text))
     assert main([*command, str(relative), "--height-datum", "egm96"]) not in (0, 1)
     assert "above the place of take-off only" in capsys.readouterr().err
-    assert not list(tmp_path.rglob("*.jpg"))
+    assert not (tmp_path / "db").exists()
+
+
+def _log(path: Path) -> Path:
+    """Places of the film, a row a second, from three seconds before it begins; it stands before and after."""
+    places = [
+        geopose_from_camera(_pose(min(max(0, round(_RATE_HZ * (k - 3.0))), 47)), FRAME) for k in range(20)
+    ]
+    rows = [
+        f"2026-05-01T12:00:{k:02d}Z,{p.latitude_deg:.9f},{p.longitude_deg:.9f},{p.height_m:.4f}\n"
+        for k, p in enumerate(places)
+    ]
+    path.write_text("time,latitude,longitude,height\n" + "".join(rows))
+    return path
+
+
+def _gpx(log: Path, path: Path) -> Path:
+    """The same as a track."""
+    points = [row.split(",") for row in log.read_text().splitlines()[1:]]
+    path.write_text(
+        "<gpx><trk><trkseg>"
+        + "".join(
+            f'<trkpt lat="{p[1]}" lon="{p[2]}"><ele>{p[3]}</ele><time>{p[0]}</time></trkpt>' for p in points
+        )
+        + "</trkseg></trk></gpx>"
+    )
+    return path
+
+
+@pytest.mark.parametrize("kind", ["csv", "gpx"])
+def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: Path, kind: str) -> None:
+    log = _log(tmp_path / "log.csv")
+    telemetry = read_telemetry(log if kind == "csv" else _gpx(log, tmp_path / "log.gpx"))
+    begins = film_start("2026-05-01T14:00:03+02:00", telemetry)
+    stills = make_stills(film, telemetry, tmp_path, StillsOptions(film_start_s=begins))
+    assert stills.late_s == 3.0
+    assert stills.positions == stills.photos > 2
+    assert any("as was told" in note for note in stills.notes)
+    for file in stills.folder.iterdir():
+        # Between rows a second apart the drone flies straight, but for one corner of its way.
+        place, told = geopose_from_camera(_pose(int(file.stem)), FRAME), read_exif(file.read_bytes())
+        assert told.latitude_deg == pytest.approx(place.latitude_deg, abs=5.0 / 111_000)
+        assert told.longitude_deg == pytest.approx(place.longitude_deg, abs=5.0 / 73_000)
+    # Other clocks are other photos, and beside control points a log that does not fit is only told.
+    again = make_stills(film, telemetry, tmp_path, StillsOptions(film_start_s=begins, telemetry_late_s=1.0))
+    assert (again.late_s, again.folder == stills.folder) == (4.0, False)
+    without = make_stills(film, telemetry, tmp_path, StillsOptions(positions=False))
+    assert (without.late_s, without.positions) == (None, 0)
+    assert any("less than 40 s of movement" in note for note in without.notes)
+
+
+def test_a_log_that_cannot_be_laid_writes_nothing(film: Path, tmp_path: Path) -> None:
+    with pytest.raises(TelemetryError, match="less than 40 s of movement"):
+        make_stills(film, read_telemetry(_log(tmp_path / "log.csv")), tmp_path / "work")
+    assert not (tmp_path / "work").exists()
+
+
+def test_a_table_in_the_films_time_needs_no_clock(film: Path, tmp_path: Path) -> None:
+    rows = _log(tmp_path / "log.csv").read_text().splitlines()[1:]
+    table = tmp_path / "film.csv"
+    table.write_text(
+        "film_time_s,latitude,longitude,height\n"
+        + "".join(f"{k - 3}{row[row.index(',') :]}\n" for k, row in enumerate(rows))
+    )
+    telemetry = read_telemetry(table)
+    assert telemetry.in_video_time
+    stills = make_stills(film, telemetry, tmp_path / "work", StillsOptions(telemetry_late_s=0.0))
+    assert stills.positions == stills.photos
 
 
 def test_a_film_that_stands_still_is_refused(tmp_path: Path) -> None:

@@ -124,6 +124,20 @@ def test_separators_commas_and_quotes(text: str) -> None:
         assert value.resolution_m == pytest.approx(1.11, abs=0.01)
 
 
+def test_only_a_name_says_that_times_are_the_films() -> None:
+    for name, factor in (("film_time_s", 1.0), ("video_time(ms)", 1e-3), ("Film time", 1.0)):
+        value = read_csv(
+            f"{name},utc,lat,lon\n10,2024-05-31 12:00:00,1,2\n11,2024-05-31 12:00:01,1,2\n".encode()
+        )
+        assert value.in_video_time
+        np.testing.assert_allclose(value.times_s, [10.0 * factor, 11.0 * factor], rtol=0, atol=1e-12)
+        assert value.clock == "utc"
+    both = read_csv(b"elapsed_s,film_time_s,lat,lon\n100,0,1,2\n101,1,1,2\n")
+    assert both.times_s.tolist() == [0.0, 1.0]
+    assert both.in_video_time
+    assert not read_csv(b"time_s,lat,lon\n0,1,2\n").in_video_time
+
+
 def test_order_of_columns_is_that_of_the_names() -> None:
     value = read_csv(b"lon,time_s,lat\n-8.5,0,47.25\n")
     assert (value.latitude_deg[0], value.longitude_deg[0]) == (47.25, -8.5)
@@ -170,6 +184,11 @@ def test_gaps_and_words_in_a_column() -> None:
         ("time_s,lat,lon\n0,5262000,465000\n", "none with a position"),
         ('time_s,lat,lon\n0,"1,2\n' + "x" * 200_000, "cannot be read as a table"),
         ("time_s,lat,lon\n" + "," * 5000, "5001 columns"),
+        (
+            "time,lat,lon\n0,1,2\n200,1,2\n400,1,2\n",
+            "200 apart: seconds or thousandths. Write time_s or time_ms",
+        ),
+        ("time_s,lat,lon,lat\n0,1,2,3\n", "2 columns are the latitude_deg by their names, 'lat', 'lat'"),
         # Read cell by cell these would be a place 5 degrees east.
         ("time_s,lat,lon\n0,47,5,8,25\n1,47,6,8,26\n", "semicolons between its cells"),
     ],

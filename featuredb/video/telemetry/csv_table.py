@@ -71,7 +71,7 @@ def read_csv(data: bytes, origin: str = "CSV") -> Telemetry:
 
     Where there is a column of elapsed time, times come from it, and the clock's whole seconds from the other;
     otherwise from the clock alone, and count from the first row. Elapsed times stay as they are written: they
-    may be those of the video, or of the flight.
+    may be those of the video, or of the flight; only names like film_time_s say that they are the video's.
 
     Raises:
         TelemetryError: no table, columns missing, an unknown unit, or no positions.
@@ -82,7 +82,8 @@ def read_csv(data: bytes, origin: str = "CSV") -> Telemetry:
     timing = time_columns(header, origin)
     missing = [name for name in ("latitude_deg", "longitude_deg") if name not in columns]
     if missing or timing is None:
-        wanted = "latitude or lat, longitude, lon or lng, and time, timestamp, time_s or datetime(utc)"
+        times = "time, timestamp, time_s, film_time_s or datetime(utc)"
+        wanted = f"latitude or lat, longitude, lon or lng, and {times}"
         raise TelemetryError(
             f"{origin}: expected a first line with columns for {wanted}; found {', '.join(header)[:500]!r}"
         )
@@ -121,6 +122,12 @@ def _known_columns(header: list[str], origin: str) -> dict[str, tuple[int, float
         index = next((whole.index(alias) for alias in aliases if alias in whole), None)
         if index is None:
             continue
+        same = [cell for cell, name in zip(header, names, strict=True) if name == names[index]]
+        if len(same) > 1 and quantity in ("latitude_deg", "longitude_deg", "height_m"):
+            raise TelemetryError(
+                f"{origin}: {len(same)} columns are the {quantity} by their names, "
+                f"{', '.join(repr(cell) for cell in same)}; expected one: take the others out"
+            )
         unit = names[index].unit
         of, factor = UNITS.get(unit, ("", 0.0)) if unit else (kind, 1.0)
         if of == "frame" and kind == "angle":
@@ -177,7 +184,7 @@ def _telemetry(
         origin=origin,
         clock=times.clock,
         height_datum=datum,
-        in_video_time=False,
+        in_video_time=times.in_film,
         from_first=times.from_clock,
         resolution_m=resolution_of_decimals(max(decimals_of(_with_point(text)) for text in texts)),
         sort=True,

@@ -15,6 +15,11 @@ _NAMES = (
     "datetime", "date_time", "utc", "utc_time", "time_utc", "timestamp_utc", "timestamp", "time", "time_s",
     "elapsed", "elapsed_time", "osd_fly_time", "fly_time", "flight_time", "unix_time", "custom_update_time",
 )  # fmt: skip
+# Elapsed time that is the film's own by its name.
+_FILM_NAMES = ("film_time", "video_time", "film_elapsed", "video_elapsed")
+# Elapsed time whose rows are so far apart is in thousandths: no log has a row in twenty seconds, and none has
+# more than fifty a second.
+_NO_SECONDS = 20.0
 # Numbers that are seconds, thousandths or millionths since 1970, of this century's years.
 _SINCE_1970 = ((1e9, 4.2e9, 1.0), (1e12, 4.2e12, 1e-3), (1e15, 4.2e15, 1e-6))
 # Whole seconds of a clock, cut off, lie half a second early on average.
@@ -28,12 +33,14 @@ class Times(NamedTuple):
     clock_s: FloatArray
     clock: Clock
     from_clock: bool = False  # there is no elapsed time: times_s is clock_s
+    in_film: bool = False  # times_s counts from the film's beginning
 
 
 class _TimeColumn(NamedTuple):
     at: int
     name: str
     unit: str
+    in_film: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +65,7 @@ class TimeColumns:
             TelemetryError: no column can be read as times.
         """
         elapsed: FloatArray | None = None
+        in_film = False
         clock: tuple[FloatArray, Clock] | None = None
         for column in self.columns:
             read = _read_column(cells[column.at], column)
@@ -65,7 +73,9 @@ class TimeColumns:
                 continue
             seconds, kind = read
             if kind == "none":
-                elapsed = seconds if elapsed is None else elapsed
+                if elapsed is None or (column.in_film and not in_film):
+                    _check_unit(seconds, column, origin)
+                    elapsed, in_film = seconds, column.in_film
             elif clock is None:
                 clock = seconds, kind
         if elapsed is None and clock is None:
@@ -75,7 +85,7 @@ class TimeColumns:
                 f"{origin}: expected seconds in the column {names}, or dates with the year first like "
                 f"2024-05-31T12:00:00Z, found {example[:40]!r}"
             )
-        return _joined(elapsed, clock, warnings)
+        return _joined(elapsed, clock, warnings)._replace(in_film=in_film)
 
 
 def time_columns(header: list[str], origin: str) -> TimeColumns | None:
@@ -87,13 +97,14 @@ def time_columns(header: list[str], origin: str) -> TimeColumns | None:
     found = []
     for index, cell in enumerate(header):
         name = column_name(cell)
-        if name.base not in _NAMES and f"{name.base}_{name.unit}" not in _NAMES:
+        in_film = name.base in _FILM_NAMES
+        if not in_film and name.base not in _NAMES and f"{name.base}_{name.unit}" not in _NAMES:
             continue
         if name.unit and UNITS.get(name.unit, ("", 0.0))[0] not in ("time", "zone"):
             raise TelemetryError(
                 f"{origin}: the column {cell!r} has the unit {name.unit!r}, which is no time"
             )
-        found.append(_TimeColumn(index, cell.strip(), name.unit))
+        found.append(_TimeColumn(index, cell.strip(), name.unit, in_film))
     return TimeColumns(tuple(found)) if found else None
 
 
@@ -118,6 +129,16 @@ def _read_column(texts: list[str], column: _TimeColumn) -> tuple[FloatArray, Clo
         seconds = np.array([clock.seconds if clock and clock.is_utc else np.nan for clock in found])
         is_utc = True
     return seconds, "utc" if is_utc else "local"
+
+
+def _check_unit(seconds: FloatArray, column: _TimeColumn, origin: str) -> None:
+    steps = np.diff(seconds[np.isfinite(seconds)])
+    step = float(np.median(steps)) if steps.size else 0.0
+    if not column.unit and step >= _NO_SECONDS:
+        raise TelemetryError(
+            f"{origin}: the column {column.name!r} names no unit and its rows are {step:g} apart: seconds or "
+            f"thousandths? Write {column.name}_s or {column.name}_ms"
+        )
 
 
 def _joined(elapsed: FloatArray | None, clock: tuple[FloatArray, Clock] | None, warnings: list[str]) -> Times:

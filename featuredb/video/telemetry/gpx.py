@@ -43,7 +43,9 @@ def read_gpx(data: bytes, origin: str = "GPX") -> Telemetry:
     try:
         parser.Parse(data, True)
     except (expat.ExpatError, ValueError, LookupError) as error:  # the latter two for unknown encodings
-        raise TelemetryError(f"{origin}: expected GPX, found no well-formed XML ({error})") from error
+        raise TelemetryError(
+            f"{origin}: expected GPX, found no well-formed XML ({error}); if it was cut off, export it again"
+        ) from error
     return reader.telemetry()
 
 

@@ -1,0 +1,239 @@
+"""When a film begins on the clock of a log that is not its own: GPX, tables of flights.
+
+What the film says of its beginning is a first guess: cameras write their local time for UTC, and some write
+the end of the recording. The movements of picture and receiver (`match.py`) then decide, over all of the
+log: the film is laid where they agree if they agree nowhere else, and if its own clock can be read so. All
+else is refused, as positions that belong to other moments bend a map or put it beside its place.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from featuredb.errors import TelemetryError
+from featuredb.video.telemetry.values import Telemetry
+from ingest.video.film_time import (
+    FilmTime,
+    at_text,
+    clock_offset_s,
+    log_span,
+    log_text,
+    moment_text,
+    possible_beginnings,
+    reading,
+    utc_text,
+)
+from ingest.video.lag import Lag
+from ingest.video.match import Match, MatchOptions, match_movement
+from ingest.video.motion import Motion
+
+_HALF_DAY_S = 43_200.0
+_OVERRIDE = "give --film-start with when it begins, --gcp, or --no-telemetry"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockOptions:
+    """When a film's place on a log's clock is believed; `python -m tools.clock_study` prints the shares.
+
+    Attributes:
+        drift_s: how wrong a camera's clock may be beside its zone: one that is set by hand once a month.
+        told_s: how far from what a person says the speeds may move it, as for telemetry in the film's time.
+        margin: every other beginning must be so much less likely, as a natural logarithm (`Match.evidence`),
+            and farther away than `repeat_s`, where a flight may repeat itself, beyond so many deviations of
+            what chance does to that (`Match.luck`).
+        deviations, repeat_s: see margin.
+        spread_s: beginnings that are not, beside the best, are within so many seconds of it: at 10 m/s an
+            error of a second is that of a poor receiver.
+        min_correlation: of the speeds, or of the turns: cameras that tilt and turn all the time have no more.
+        max_search_s: of log to be searched; longer ones are no flight.
+        match: how movements are compared. Films shorter than its `least_s` have one bend or one stop, and
+            those of other flights are like it.
+    """
+
+    drift_s: float = 120.0
+    told_s: float = 3.0
+    margin: float = 7.0
+    deviations: float = 2.0
+    repeat_s: float = 10.0
+    spread_s: float = 1.0
+    min_correlation: float = 0.5
+    match: MatchOptions = field(default_factory=lambda: MatchOptions(least_s=40.0))
+    max_search_s: float = 172_800.0
+
+
+def check_overlap(film: FilmTime, telemetry: Telemetry, options: ClockOptions | None = None) -> None:
+    """Refuse, before the film is looked at, a log that cannot be of it by any reading of the clocks.
+
+    Raises:
+        TelemetryError: names both spans.
+    """
+    options = options or ClockOptions()
+    low, high = log_span(telemetry)
+    if film.told_s is not None:
+        if film.told_s > high or film.told_s + film.duration_s < low:
+            raise TelemetryError(
+                f"{log_text(telemetry)}; a film of {film.duration_s:.0f} s that begins "
+                f"{at_text(film.told_s, telemetry)} (--film-start) has no moment in common with it"
+            )
+        return
+    expected = possible_beginnings(film, telemetry)
+    if expected is not None and not any(
+        start - options.drift_s <= high and start + film.duration_s + options.drift_s >= low
+        for start in expected
+    ):
+        assert film.created is not None
+        raise TelemetryError(
+            f"{log_text(telemetry)}; {film.name} lasts {film.duration_s:.0f} s and was made at "
+            f"{utc_text(film.created.timestamp())} by its own clock: they do not overlap in any time zone, "
+            "whether recording began or ended then. Give the log of this flight, or --film-start if the "
+            "film's clock is wrong"
+        )
+
+
+def lay_on_film(
+    motion: Motion, telemetry: Telemetry, film: FilmTime, options: ClockOptions | None = None
+) -> Lag:
+    """Where on the telemetry's `times_s` the film's time 0 is, as a lag; None with the reason where unclear.
+
+    The telemetry is not in the film's time. A beginning that a person tells is moved by `told_s` at most, and
+    stays as it is where the movements do not tell.
+    """
+    options = options or ClockOptions()
+    low, high = log_span(telemetry)
+    first, last = (float(motion.time_s[k]) for k in (0, -1)) if len(motion) else (0.0, 0.0)
+    search = (low - last, high - first)
+    if film.told_s is not None:
+        # A person who is wrong by an hour can be told so, and need not be by a week.
+        search = (max(search[0], film.told_s - _HALF_DAY_S), min(search[1], film.told_s + _HALF_DAY_S))
+    elif high - low > options.max_search_s:
+        return _refused(
+            f"{log_text(telemetry)}: too long to look for a film in; cut it to the day of the flight, or "
+            f"{_OVERRIDE}"
+        )
+    match = match_movement(motion, telemetry, search, options.match) if search[0] < search[1] else None
+    if match is not None and not (match.evidence > 0).any():
+        match = None
+    if film.told_s is not None:
+        near = (film.told_s - options.told_s, film.told_s + options.told_s)
+        close = match_movement(motion, telemetry, near, MatchOptions())
+        return _near_told(match, close, telemetry, film, film.told_s, options)
+    if match is None:
+        return _refused(
+            f"{log_text(telemetry)}; {film.name} has less than {options.match.least_s:.0f} s of movement in "
+            f"common with it, too little to tell where in it the film begins: {_OVERRIDE}"
+        )
+    return _found(match, telemetry, film, options)
+
+
+def _found(match: Match, telemetry: Telemetry, film: FilmTime, options: ClockOptions) -> Lag:
+    """The beginning by the movements alone, if it is clear and the film's own clock can mean it."""
+    found = best_beginning(match, options)
+    start, correlation = found.lag_s, found.correlation
+    if found.lead < options.margin or correlation < options.min_correlation:
+        return _refused(
+            f"the movements of picture and receiver do not tell where {film.name} begins in all of the log: "
+            f"they correlate by {correlation:.2f} if it does {at_text(start, telemetry)}, and by "
+            f"{found.rival_correlation:.2f} {at_text(found.rival_s, telemetry)}; {log_text(telemetry)}. "
+            f"Steady flights, repeated patterns and short films do not tell: {_OVERRIDE}",
+            correlation,
+        )
+    said = f"the film begins {at_text(start, telemetry)} of the log by the movements of picture and receiver "
+    said += f"(correlation {correlation:.2f})"
+    expected = possible_beginnings(film, telemetry)
+    if expected is None:
+        return Lag(late_s=round(start, 3), correlation=correlation, message=said)
+    assert film.created is not None
+    ahead = film.created.timestamp() - (clock_offset_s(telemetry) or 0.0) - start
+    if np.abs(start - expected).min() > options.drift_s:
+        return _refused(
+            f"{said}, but {film.name} was made at {utc_text(film.created.timestamp())} by its own clock, "
+            f"{ahead:+.0f} s from there, and that is no time zone; if that clock is wrong, give --film-start "
+            f"{moment_text(start, telemetry)}",
+            correlation,
+        )
+    if abs(ahead) > 0.5:
+        said += f"; the time of making in its file is {ahead:+.1f} s from there{reading(ahead, film)}"
+    return Lag(late_s=round(start, 3), correlation=correlation, message=said)
+
+
+def _near_told(
+    match: Match | None,
+    close: Match | None,
+    telemetry: Telemetry,
+    film: FilmTime,
+    told: float,
+    options: ClockOptions,
+) -> Lag:
+    """What a person tells: moved a little where movements are clear, refused where they clearly deny it."""
+    if match is not None:
+        far = best_beginning(match, options)
+        clear = far.lead >= options.margin and far.correlation >= options.min_correlation
+        if clear and abs(far.lag_s - told) > options.told_s:
+            return _refused(
+                f"--film-start says that {film.name} begins {at_text(told, telemetry)}; picture and receiver "
+                f"move alike only if it begins {at_text(far.lag_s, telemetry)} (correlation "
+                f"{far.correlation:.2f}). Give --film-start {moment_text(far.lag_s, telemetry)}, or "
+                "--telemetry-late 0 beside yours if you are sure of it",
+                far.correlation,
+            )
+    found = None if close is None else best_beginning(close, options)
+    if (
+        found is None
+        or found.lead < options.margin
+        or found.correlation < options.min_correlation
+        # At the edge of what was looked at the best is not yet found.
+        or abs(found.lag_s - told) > options.told_s - 0.5
+    ):
+        return Lag(
+            late_s=told,
+            correlation=float("nan"),
+            message=f"the film begins {at_text(told, telemetry)} of the log, as was told; the movements of "
+            "picture and receiver neither confirm nor deny it",
+        )
+    return Lag(
+        late_s=round(found.lag_s, 3),
+        correlation=found.correlation,
+        message=f"the film begins {at_text(found.lag_s, telemetry)} of the log, {found.lag_s - told:+.2f} s "
+        f"from what was told, by the movements of picture and receiver (correlation {found.correlation:.2f})",
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Beginning:
+    """The likeliest beginning of a film in a log, and the likeliest one elsewhere.
+
+    Attributes:
+        lag_s, rival_s: where they are.
+        correlation, rival_correlation: of speeds or turns, the better one.
+        lead: how much more evidence there is for the first than chance gives it.
+    """
+
+    lag_s: float
+    correlation: float
+    rival_s: float
+    rival_correlation: float
+    lead: float
+
+
+def best_beginning(match: Match, options: ClockOptions) -> Beginning:
+    """The likeliest lag, and its lead over those that are farther than `spread_s` from it."""
+    evidence = match.evidence
+    best = int(np.argmax(evidence))
+    away_s = np.abs(match.lags_s - match.lags_s[best])
+    # Beside the best the curves are nearly the same, and so is what chance does to them.
+    chance = np.where(away_s > options.repeat_s, options.deviations * match.luck(best), 0.0)
+    elsewhere = away_s > options.spread_s
+    behind = np.where(elsewhere, evidence[best] - evidence - chance, np.inf)
+    rival = int(np.argmin(behind)) if elsewhere.any() else best
+    better = np.nan_to_num(np.fmax(match.speed, match.turn))
+    return Beginning(
+        lag_s=float(match.lags_s[best]),
+        correlation=float(better[best]),
+        rival_s=float(match.lags_s[rival]),
+        rival_correlation=float(better[rival]),
+        lead=float(min(behind[rival], evidence[best])),
+    )
+
+
+def _refused(reason: str, correlation: float = float("nan")) -> Lag:
+    return Lag(late_s=None, correlation=correlation, message=reason)
