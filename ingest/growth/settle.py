@@ -35,7 +35,8 @@ from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
 
 # Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
 # their own localisation has elsewhere.
-LOOSE, WEAK_LINK, CONTRADICTS = "DRIFT_BUDGET", "WEAK_LINK", "CONTRADICTS"
+LOOSE, WEAK_LINK, CONTRADICTS, BLIND = "DRIFT_BUDGET", "WEAK_LINK", "CONTRADICTS", "NOT_VISIBLE"
+_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
 _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
 
 
@@ -121,9 +122,11 @@ def settle(
     assert placement.local_from_sfm is not None
     assert held.fit is not None
     rows = tuple(int(r) for r in model.rows)
-    outside = [rows.index(r) for r in placement.disagreeing]
-    weak = weak_photos(model, outside, [rows.index(r) for r in placement.agreeing], options.min_link)
+    outside = [rows.index(r) for r in (*placement.disagreeing, *placement.blind)]
+    holding = [rows.index(r) for r in placement.agreeing if r not in placement.blind]
+    weak = weak_photos(model, outside, holding, options.min_link)
     left_out = dict.fromkeys(placement.disagreeing, (CONTRADICTS, _ELSEWHERE))
+    left_out |= dict.fromkeys(placement.blind, (BLIND, _SHOWS_LITTLE))
     left_out |= {rows[k]: (WEAK_LINK, message) for k, message in weak.items()}
     outside += sorted(weak)
     for _ in range(options.max_rounds):

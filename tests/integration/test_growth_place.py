@@ -1,5 +1,6 @@
 """Growth on a small made-up world whose truth is known: placed, refined, refused."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
+from ingest.colmap_bridge import Model
 from ingest.growth.grow_photos import grow_photos
 from ingest.growth.grown_map import grow_component
 from ingest.growth.localised import (
@@ -196,14 +198,14 @@ def test_positions_that_lie(area: IndexedArea, liars: int, refused: bool) -> Non
         assert isinstance(grown, GrownMap), grown
 
 
-def test_photos_blind_for_what_they_should_show(
-    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
-) -> None:
-    """A reconstruction that shows a corner of the place where it should show all of it: behind a wall."""
-
-    kept: dict[int, LocalisedPhoto] = {}
+def _cornered(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], rows: Sequence[int]
+) -> tuple[Model, dict[int, LocalisedPhoto]]:
+    """These photos show a corner of the place where they should show all of it: behind a wall."""
+    kept = dict(localised)
     hidden = np.zeros(len(new.model.point_of), dtype=np.bool_)
-    for r, photo in localised.items():
+    for r in rows:
+        photo = localised[r]
         near = np.argsort(np.linalg.norm(photo.pixels - np.median(photo.pixels, axis=0), axis=1))[:40]
         kept[r] = replace(
             photo,
@@ -217,10 +219,32 @@ def test_photos_blind_for_what_they_should_show(
         of_old = np.flatnonzero(new.world_of[r] < len(WORLD))
         gone = np.setdiff1d(of_old, photo.feature_rows[near])
         hidden |= (new.model.photo_of == r) & np.isin(new.model.keypoint_of, gone)
-    bare = with_observations(new.model, ~hidden & (new.model.track_lengths()[new.model.point_of] >= 2))
+    views = np.bincount(new.model.point_of[~hidden], minlength=len(new.model.xyz))
+    return with_observations(new.model, ~hidden & (views[new.model.point_of] >= 2)), kept
+
+
+def test_photos_blind_for_what_they_should_show(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    bare, kept = _cornered(new, localised, list(localised))
     grown = grow_component(bare, new.photos, new.features_of, kept, [area], identity())
     assert isinstance(grown, Refused)
     assert "visibility" in {g.name for g in grown.gates if not g.passes}
+
+
+def test_a_single_blind_photo_is_left_out(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    bare, kept = _cornered(new, localised, [1])
+    grown = grow_component(bare, new.photos, new.features_of, kept, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert grown.placement.blind == (1,)
+    assert grown.left_out[1][0] == "NOT_VISIBLE"
+    assert 1 not in grown.model.rows
+    whole = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
+    assert isinstance(whole, GrownMap), whole
+    assert whole.placement.blind == ()
+    assert 1 in whole.model.rows
 
 
 def test_two_maps_that_differ_say_so(new: NewPhotos) -> None:
