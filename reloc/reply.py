@@ -1,9 +1,11 @@
-"""The wire's reply out of a localisation result."""
+"""Poses as the wire says them, and the reply out of a localisation result."""
 
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
+from featuredb.geo.geopose import GeoPose
+from featuredb.geometry.arrays import FloatArray
 from reloc.result import Inliers, LocalisedPose, LocaliseResult
 from reloc.wire import (
     Accuracy,
@@ -44,13 +46,13 @@ def reply_from_result(
         snapshot=result.snapshot,
         timings_ms=timings_ms,
         request_id=request_id,
-        body_axes=_BODY_AXES,
+        body_axes=BODY_AXES,
         **fields,
     )
 
 
 # The same words as featuredb.geo.geopose.BODY_AXES; a test compares them.
-_BODY_AXES: Literal["x forward, y left, z up"] = "x forward, y left, z up"
+BODY_AXES: Literal["x forward, y left, z up"] = "x forward, y left, z up"
 
 _NO_POSE: dict[str, Any] = {
     "position": None,
@@ -67,7 +69,25 @@ _NO_POSE: dict[str, Any] = {
 }
 
 
-def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
+class OnEarth(Protocol):
+    """What every pose on Earth has; conventions as in `reloc.result.LocalisedPose`."""
+
+    @property
+    def epsg(self) -> int: ...
+    @property
+    def utm(self) -> FloatArray: ...
+    @property
+    def cam_from_utm_xyzw(self) -> FloatArray: ...
+    @property
+    def geopose(self) -> GeoPose: ...
+    @property
+    def height_datum(self) -> str: ...
+    @property
+    def covariance(self) -> FloatArray: ...
+
+
+def place_fields(pose: OnEarth) -> dict[str, Any]:
+    """Position, orientation and covariance as members of a message."""
     x, y, z, w = (float(q) for q in pose.geopose.quaternion_xyzw)
     easting, northing, height = (float(v) for v in pose.utm)
     return {
@@ -84,6 +104,12 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
             cam_from_utm_xyzw=tuple(float(q) for q in pose.cam_from_utm_xyzw),
         ),
         "covariance": tuple(tuple(float(v) for v in row) for row in pose.covariance),
+    }
+
+
+def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
+    return {
+        **place_fields(pose),
         "accuracy": Accuracy(
             horizontal_68_m=pose.horizontal_68_m,
             vertical_68_m=pose.vertical_68_m,

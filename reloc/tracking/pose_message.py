@@ -1,18 +1,17 @@
 """Tracked frames as messages of a live session, and back."""
 
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from featuredb.geo.geopose import GeoPose
 from featuredb.geometry.camera import Camera
 from reloc.answer import radius_68
+from reloc.reply import BODY_AXES, place_fields
 from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
-from reloc.wire import Accuracy, Position, Quaternion, UtmPose
+from reloc.wire import Accuracy
 from reloc.wire_track import Intrinsics, TrackPose
 
-# The same words as featuredb.geo.geopose.BODY_AXES; a test compares them.
-_BODY_AXES: Literal["x forward, y left, z up"] = "x forward, y left, z up"
 _POSE_FIELDS = (
     *("position", "quaternion", "height_datum", "utm"),
     *("covariance", "accuracy", "camera", "map_id"),
@@ -46,7 +45,7 @@ def pose_message(
         time_s=point.time_s,
         state=point.state,
         detail=point.detail,
-        body_axes=_BODY_AXES,
+        body_axes=BODY_AXES,
         inliers=point.inliers,
         snapshot=snapshot,
         dropped=dropped,
@@ -70,22 +69,8 @@ def point_of_message(message: TrackPose) -> TrajectoryPoint:
 
 
 def _pose_fields(pose: EarthPose, camera: Camera) -> dict[str, Any]:
-    x, y, z, w = (float(q) for q in pose.geopose.quaternion_xyzw)
-    easting, northing, height = (float(v) for v in pose.utm)
     return {
-        "position": Position(
-            lat=pose.geopose.latitude_deg, lon=pose.geopose.longitude_deg, h=pose.geopose.height_m
-        ),
-        "quaternion": Quaternion(x=x, y=y, z=z, w=w),
-        "height_datum": pose.height_datum,
-        "utm": UtmPose(
-            epsg=pose.epsg,
-            easting=easting,
-            northing=northing,
-            height=height,
-            cam_from_utm_xyzw=tuple(float(q) for q in pose.cam_from_utm_xyzw),
-        ),
-        "covariance": tuple(tuple(float(v) for v in row) for row in pose.covariance),
+        **place_fields(pose),
         "accuracy": Accuracy(
             horizontal_68_m=radius_68(pose.covariance[3:5, 3:5]),
             vertical_68_m=radius_68(pose.covariance[5:, 5:]),
