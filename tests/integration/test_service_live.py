@@ -143,11 +143,13 @@ def test_a_flood_of_frames_is_dropped_and_not_queued() -> None:
         numbers = [p.sequence for p in poses]
         assert numbers == sorted(set(numbers))
         assert len(poses) < sent
-        for k, pose in enumerate(poses):
-            assert pose.dropped == pose.sequence - k
         counts = live_status(server).frames
+        # The network may have no room for a pose either: what the server looked at is counted there.
+        looked_at = [p.sequence + 1 - p.dropped for p in poses]
+        assert looked_at == sorted(set(looked_at))
+        assert looked_at[-1] == sum(counts.answered.values()) >= len(poses)
         # Whatever was neither answered nor dropped by the server was dropped by the network.
-        assert counts.received == len(poses) + counts.dropped
+        assert counts.received == looked_at[-1] + counts.dropped
         assert counts.received <= sent + 1
 
 
