@@ -15,8 +15,9 @@ from featuredb.store.candidates import list_candidates, refuse
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
-from ingest.growth.grow import GrowthOptions, GrowthPhotos, extractor_for, grow, no_photos
+from ingest.growth.grow import GrowthOptions, extractor_for, grow
 from ingest.growth.growth_report import GrowthReport, PhotoFate
+from ingest.growth.run_record import GrowthPhotos, no_photos
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
 

@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         figures: list[float] = []
         for shift in [np.zeros(3), *(m * d for d in (aside, up) for m in _MOVES_M)]:
             move = Sim3(scale=1.0, rotation=np.eye(3), translation=shift)
-            gate = scan_gate(database, move_map(feature_map, move), options)
+            gate, _ = scan_gate(database, move_map(feature_map, move), options)
             limit = limit if gate is None else gate.limit
             figures.append(float("nan") if gate is None else gate.figure)
         claim = 1.96 * float(np.sqrt(np.linalg.eigvalsh(spread)[-1]))

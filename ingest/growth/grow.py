@@ -7,35 +7,38 @@ Every step is a commit of its own and can be repeated: a run that was killed is 
 
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, Snapshot
 from featuredb.store.candidates import mark_used
 from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
 from ingest.growth.apart import AT_SEVERAL_PLACES, taken_apart
 from ingest.growth.budget import drift_gate, rows_within, with_drift
 from ingest.growth.grow_photos import GrowPhotosOptions, grow_photos
 from ingest.growth.grown_map import grow_component
-from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
+from ingest.growth.growth_report import GrowthReport
 from ingest.growth.localised import LocaliseEachOptions, localise_photos
-from ingest.growth.map_graph import growth_of, placed_maps
+from ingest.growth.map_graph import placed_maps
 from ingest.growth.not_found import NotFound, NotFoundRows
-from ingest.growth.promotion import Promotion, PromotionOptions, promote_confirmed
-from ingest.growth.replacing import Replacement, ReplaceOptions, replace_descendants
+from ingest.growth.promotion import PromotionOptions, promote_confirmed
+from ingest.growth.replacing import ReplaceOptions, replace_descendants
+from ingest.growth.run_record import (
+    GrowthPhotos,
+    Run,
+    fates_of,
+    grown_entry,
+    note_refusal,
+    split_reason,
+)
 from ingest.growth.scan_check import ScanCheckOptions, scan_gate, with_gate
-from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
+from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.growth.witnesses import NewPhotos
 from ingest.map_builder import MapIdentity
-from ingest.pairs import Pair
-from ingest.photo import Photo
 from ingest.submodel import keep_photos
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
@@ -83,50 +86,6 @@ class GrowthOptions:
         return replace(self, grow=replace(self.grow, grow=replace(growing, settle=settle)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GrowthPhotos:
-    """New photos, matched and reconstructed.
-
-    Attributes:
-        photos: rows of everything here.
-        features_of: of a row.
-        models: their reconstructions, called once a round; rows of a model are rows of `photos`.
-        candidate_ids: of contributed photos, by row.
-        overlaps: pairs of rows whose matches were verified; None: not known.
-    """
-
-    photos: Sequence[Photo]
-    features_of: FeaturesOf
-    models: Callable[[], Iterable[Model]]
-    candidate_ids: Mapping[int, str] = field(default_factory=dict)
-    overlaps: Collection[Pair] | None = None
-
-
-def no_photos() -> GrowthPhotos:
-    """Nothing new: old quarantined maps are examined, and new anchors looked for."""
-
-    def none(row: int) -> PhotoFeatures:
-        raise IndexError(f"there is no photo {row}")
-
-    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())
-
-
-@dataclass(slots=True, kw_only=True)
-class _Run:
-    """What a run has come to; rows of the new photos."""
-
-    map_of: dict[int, str] = field(default_factory=dict)
-    why: dict[int, tuple[str, str]] = field(default_factory=dict)
-    entries: dict[str, GrownEntry] = field(default_factory=dict)
-    refused: list[GrownEntry] = field(default_factory=list)
-    promotions: dict[str, Promotion] = field(default_factory=dict)
-    replacements: list[Replacement] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
-    lost: NotFoundRows
-    rounds: int = 0
-
-
 def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOptions:
     """The options whose descriptors fit the active maps': most maps decide whether they are upright."""
     active = [m for m in snapshot.maps() if m.status == "active"]
@@ -148,7 +107,7 @@ def grow(
     """
     options = (options or GrowthOptions()).with_budget()
     started, clock = datetime.now(UTC), time.perf_counter()
-    run, localiser = _Run(lost=NotFoundRows(new.photos, new.features_of, work, options.localise)), None
+    run, localiser = Run(lost=NotFoundRows(new.photos, new.features_of, work, options.localise)), None
     for _ in range(options.max_rounds):
         run.rounds += 1
         replaced = replace_descendants(database, work, options.replacing, budget_m=options.drift_budget_m)
@@ -164,7 +123,7 @@ def grow(
         seconds=time.perf_counter() - clock,
         rounds=run.rounds,
         version=database.poll_version(),
-        photos=_fates(new, run, database.snapshot()),
+        photos=fates_of(new, run, database.snapshot()),
         maps=(*run.entries.values(), *run.refused),
         promotions=tuple(run.promotions.values()),
         replacements=tuple(run.replacements),
@@ -173,12 +132,14 @@ def grow(
 
 
 def _round(
-    database: Database, new: GrowthPhotos, localiser: Localiser, run: _Run, options: GrowthOptions
+    database: Database, new: GrowthPhotos, localiser: Localiser, run: Run, options: GrowthOptions
 ) -> dict[int, LocalisedPhoto]:
     """Localise what is not in a map yet, place reconstructions and lone photos, commit what passes."""
     open_rows = [row for row in range(len(new.photos)) if row not in run.map_of]
     localised = _localise(database, new, open_rows, localiser, run, options)
-    run.why.update({row: _split(run.lost.known[row].reason) for row in open_rows if row not in localised})
+    run.why.update(
+        {row: split_reason(run.lost.known[row].reason) for row in open_rows if row not in localised}
+    )
     run.refused.clear()
     for model in new.models():
         part = keep_photos(model, [int(r) for r in model.rows if int(r) not in run.map_of])
@@ -192,8 +153,8 @@ def _round(
     for found in grown.maps:
         _take(database, found, new, run, options)
     for refused in grown.refused:
-        _note_refusal(refused, new, run)
-    run.why.update({row: _split(reason) for row, reason in grown.waiting.items()})
+        note_refusal(refused, new, run)
+    run.why.update({row: split_reason(reason) for row, reason in grown.waiting.items()})
     return localised
 
 
@@ -202,7 +163,7 @@ def _localise(
     new: GrowthPhotos,
     rows: Sequence[int],
     localiser: Localiser,
-    run: _Run,
+    run: Run,
     options: GrowthOptions,
 ) -> dict[int, LocalisedPhoto]:
     """What the active maps show; photos that they did not show before are looked for in new maps only."""
@@ -237,7 +198,7 @@ def _try_model(
     new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
-    run: _Run,
+    run: Run,
     options: GrowthOptions,
     links: Sequence[float] | None = None,
 ) -> None:
@@ -259,7 +220,7 @@ def _try_model(
         if isinstance(outcome, Refused):
             pieces = taken_apart(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
             if pieces is None:
-                _note_refusal(outcome, new, run)
+                note_refusal(outcome, new, run)
                 return
             level, parts = pieces
             _LOG.info(
@@ -270,7 +231,7 @@ def _try_model(
                     rest = [link for link in links if link > level]
                     _try_model(database, piece, new, localised, areas, run, options, rest)
                 else:
-                    _note_refusal(replace(outcome, rows=tuple(int(r) for r in piece.rows)), new, run)
+                    note_refusal(replace(outcome, rows=tuple(int(r) for r in piece.rows)), new, run)
             return
         within = _take(database, outcome, new, run, options)
         if within is None:
@@ -281,7 +242,7 @@ def _try_model(
 
 
 def _take(
-    database: Database, grown: GrownMap, new: GrowthPhotos, run: _Run, options: GrowthOptions
+    database: Database, grown: GrownMap, new: GrowthPhotos, run: Run, options: GrowthOptions
 ) -> list[int] | None:
     """Commit a grown map in quarantine if it is within the drift budget.
 
@@ -296,20 +257,21 @@ def _take(
     gate = drift_gate(drift, options.drift_budget_m)
     names = tuple(new.photos[r].name for r in rows)
     if not gate.passes:
-        run.refused.append(_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
+        run.refused.append(grown_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
         run.why.update(dict.fromkeys(rows, (gate.reason, gate.message)))
         return rows_within(feature_map, rows, relative, options.drift_budget_m)
-    scan = scan_gate(database, feature_map, options.scan)
+    scan, unasked = scan_gate(database, feature_map, options.scan)
+    run.notes += [unasked] if unasked and unasked not in run.notes else []
     if scan is not None:
         feature_map = with_gate(feature_map, scan)
         if not scan.passes:
-            run.refused.append(_entry(feature_map, grown, names, "refused", scan.reason, scan.message))
+            run.refused.append(grown_entry(feature_map, grown, names, "refused", scan.reason, scan.message))
             run.why.update(dict.fromkeys(rows, (scan.reason, scan.message)))
             return None
     known = {m.map_id: m for m in snapshot.maps(include_retired=True)}.get(feature_map.map_id)
     if known is not None and known.status == "retired":
         reason = f"map {known.map_id} of these photos was retired: {known.status_reason}"
-        run.refused.append(_entry(feature_map, grown, names, "refused", "RETIRED_MAP", reason))
+        run.refused.append(grown_entry(feature_map, grown, names, "refused", "RETIRED_MAP", reason))
         run.why.update(dict.fromkeys(rows, ("RETIRED_MAP", reason)))
         return None
     used = [new.candidate_ids[r] for r in rows if r in new.candidate_ids]
@@ -320,7 +282,7 @@ def _take(
     for row in rows:
         run.why.pop(row, None)
     run.why.update({row: why for row, why in grown.left_out.items() if row not in run.map_of})
-    run.entries[feature_map.map_id] = _entry(feature_map, grown, names, "quarantined", "", "")
+    run.entries[feature_map.map_id] = grown_entry(feature_map, grown, names, "quarantined", "", "")
     _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
     return None
 
@@ -330,7 +292,7 @@ def _promote(
     new: GrowthPhotos,
     localiser: Localiser,
     localised: dict[int, LocalisedPhoto],
-    run: _Run,
+    run: Run,
     options: GrowthOptions,
     work: Path,
 ) -> bool:
@@ -360,42 +322,6 @@ def _promote(
     return any(outcome.promoted for outcome in outcomes)
 
 
-def _note_refusal(refused: Refused, new: GrowthPhotos, run: _Run) -> None:
-    rows = [r for r in refused.rows if r < len(new.photos) and r not in run.map_of]
-    run.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
-    run.refused.append(
-        GrownEntry(
-            map_id="",
-            status="refused",
-            reason_code=refused.reason,
-            reason=refused.message,
-            photos=tuple(new.photos[r].name for r in rows),
-            gates=refused.figures(),
-        )
-    )
-
-
-def _entry(
-    feature_map: FeatureMap, grown: GrownMap, names: tuple[str, ...], status: str, code: str, reason: str
-) -> GrownEntry:
-    growth: dict[str, Any] = growth_of(feature_map.placement.evidence)
-    return GrownEntry(
-        map_id=feature_map.map_id,
-        status=status,
-        reason_code=code,
-        reason=reason,
-        photos=names,
-        points=len(feature_map.points),
-        parents=feature_map.parents,
-        generation=feature_map.generation,
-        steps=growth.get("steps"),
-        drift_m=growth.get("drift_m"),
-        budget_m=growth.get("budget_m"),
-        gates=growth.get("gates", {}),
-        agreements=tuple(str(a) for a in grown.agreements),
-    )
-
-
 def _identity_of(new: GrowthPhotos) -> Callable[[tuple[int, ...]], MapIdentity]:
     """The map of some photos is named by them: the same photos give the same map."""
 
@@ -412,29 +338,3 @@ def _identity_of(new: GrowthPhotos) -> Callable[[tuple[int, ...]], MapIdentity]:
         )
 
     return identity
-
-
-def _split(reason: str) -> tuple[str, str]:
-    code, _, text = reason.partition(": ")
-    return code, text or code
-
-
-def _fates(new: GrowthPhotos, run: _Run, snapshot: Snapshot) -> tuple[PhotoFate, ...]:
-    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
-    fates = []
-    for row, photo in enumerate(new.photos):
-        map_id = run.map_of.get(row, "")
-        code, reason = run.why.get(row, ("", ""))
-        if map_id and not code and map_id not in active and map_id in run.promotions:
-            code, reason = run.promotions[map_id].reason_code, run.promotions[map_id].reason
-        fates.append(
-            PhotoFate(
-                name=new.candidate_ids.get(row, photo.name),
-                owner=photo.owner,
-                outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
-                map_id=map_id,
-                reason_code=code,
-                reason=reason,
-            )
-        )
-    return tuple(fates)

@@ -73,29 +73,43 @@ class ScanCheckOptions:
     max_points: int = 8000
 
 
-def scan_gate(database: Database, feature_map: FeatureMap, options: ScanCheckOptions) -> Gate | None:
+def scan_gate(
+    database: Database, feature_map: FeatureMap, options: ScanCheckOptions
+) -> tuple[Gate | None, str]:
     """The gate, or None where no scan, or too little of one, says anything about the map.
 
     Args:
         feature_map: with the covariance of its placement on Earth.
 
+    Returns:
+        The gate, and why a scan that is there could not be compared, "" otherwise.
+
     Raises:
         StoreError: the scans cannot be read.
     """
     if not has_scans(database):
-        return None
+        return None, ""
     points = _points(feature_map, options)
     if len(points) < options.min_points:
-        return None
+        return None, ""
     low, high = points[:, :2].min(axis=0) - options.margin_m, points[:, :2].max(axis=0) + options.margin_m
     try:
         cloud = load_cloud(database, feature_map.frame, (*low.tolist(), *high.tolist()))
-        if cloud.height_datum != feature_map.height_datum or not len(cloud.xyz):
-            return None
-        return cloud_gate(cloud, points, feature_map.placement.covariance, options)
+        if not len(cloud.xyz):
+            return None, ""
+        if cloud.height_datum != feature_map.height_datum:
+            return None, _unasked(
+                feature_map, f"its heights are {feature_map.height_datum}, theirs {cloud.height_datum}"
+            )
+        return cloud_gate(cloud, points, feature_map.placement.covariance, options), ""
     except (MissingExtraError, ScanError) as error:  # no small_gicp; heights of several datums
-        _LOG.warning("map %s is not compared with the scans in store: %s", feature_map.map_id, error)
-        return None
+        return None, _unasked(feature_map, str(error))
+
+
+def _unasked(feature_map: FeatureMap, why: str) -> str:
+    note = f"map {feature_map.map_id} was not compared with the scans in store: {why}"
+    _LOG.warning("%s", note)
+    return note
 
 
 def cloud_gate(

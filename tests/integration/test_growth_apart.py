@@ -3,16 +3,21 @@
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import ingest.growth.grow as grow_module
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.store import Database
 from ingest.colmap_bridge import Model
-from ingest.growth.grow import GrowthOptions, GrowthPhotos, grow
+from ingest.growth.apart import AT_SEVERAL_PLACES
+from ingest.growth.grow import GrowthOptions, grow
 from ingest.growth.growth_report import GrowthReport
+from ingest.growth.run_record import GrowthPhotos
+from ingest.growth.values import Refused
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import looking_at
@@ -111,3 +116,22 @@ def test_geotags_say_so_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) ->
     assert "3 of 3 positions contradict" in apart[0]
     names = sorted((set(m.photos) for m in report.maps if m.map_id), key=len)
     assert names == [{f"north-new-{k}.jpg" for k in range(3)}, {f"new-{k}.jpg" for k in range(7)}]
+
+
+@pytest.mark.parametrize("reason", [*AT_SEVERAL_PLACES, "TOO_FEW_AGREE", "POORLY_HELD"])
+def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str
+) -> None:
+    """The first answer is that of a gate; the parts are placed as they are."""
+    real, asked = grow_module.grow_component, []
+
+    def refused_first(model: Model, *args: Any) -> Any:
+        asked.append(len(model.rows))
+        rows = tuple(int(r) for r in model.rows)
+        return Refused(reason=reason, message="as told", rows=rows) if len(asked) == 1 else real(model, *args)
+
+    monkeypatch.setattr(grow_module, "grow_component", refused_first)
+    report = _grown(_groups(5, 5), tmp_path, GrowthOptions())
+    assert asked == ([10, 5, 5] if reason in AT_SEVERAL_PLACES else [10])
+    maps = [len(m.photos) for m in report.maps if m.map_id]
+    assert maps == ([5, 5] if reason in AT_SEVERAL_PLACES else [10])  # lone photos form a group

@@ -1,0 +1,124 @@
+"""The new photos of a run of growth, and what has come of them so far: maps, refusals, reasons."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store import Snapshot
+from ingest.colmap_bridge import Model
+from ingest.extract import PhotoFeatures
+from ingest.growth.growth_report import GrownEntry, PhotoFate
+from ingest.growth.map_graph import growth_of
+from ingest.growth.not_found import NotFoundRows
+from ingest.growth.promotion import Promotion
+from ingest.growth.replacing import Replacement
+from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
+from ingest.pairs import Pair
+from ingest.photo import Photo
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GrowthPhotos:
+    """New photos, matched and reconstructed.
+
+    Attributes:
+        photos: rows of everything here.
+        features_of: of a row.
+        models: their reconstructions, called once a round; rows of a model are rows of `photos`.
+        candidate_ids: of contributed photos, by row.
+        overlaps: pairs of rows whose matches were verified; None: not known.
+    """
+
+    photos: Sequence[Photo]
+    features_of: FeaturesOf
+    models: Callable[[], Iterable[Model]]
+    candidate_ids: Mapping[int, str] = field(default_factory=dict)
+    overlaps: Collection[Pair] | None = None
+
+
+def no_photos() -> GrowthPhotos:
+    """Nothing new: old quarantined maps are examined, and new anchors looked for."""
+
+    def none(row: int) -> PhotoFeatures:
+        raise IndexError(f"there is no photo {row}")
+
+    return GrowthPhotos(photos=(), features_of=none, models=lambda: ())
+
+
+@dataclass(slots=True, kw_only=True)
+class Run:
+    """What a run has come to; rows of the new photos."""
+
+    map_of: dict[int, str] = field(default_factory=dict)
+    why: dict[int, tuple[str, str]] = field(default_factory=dict)
+    entries: dict[str, GrownEntry] = field(default_factory=dict)
+    refused: list[GrownEntry] = field(default_factory=list)
+    promotions: dict[str, Promotion] = field(default_factory=dict)
+    replacements: list[Replacement] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
+    lost: NotFoundRows
+    rounds: int = 0
+
+
+def note_refusal(refused: Refused, new: GrowthPhotos, run: Run) -> None:
+    rows = [r for r in refused.rows if r < len(new.photos) and r not in run.map_of]
+    run.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
+    run.refused.append(
+        GrownEntry(
+            map_id="",
+            status="refused",
+            reason_code=refused.reason,
+            reason=refused.message,
+            photos=tuple(new.photos[r].name for r in rows),
+            gates=refused.figures(),
+        )
+    )
+
+
+def grown_entry(
+    feature_map: FeatureMap, grown: GrownMap, names: tuple[str, ...], status: str, code: str, reason: str
+) -> GrownEntry:
+    growth: dict[str, Any] = growth_of(feature_map.placement.evidence)
+    return GrownEntry(
+        map_id=feature_map.map_id,
+        status=status,
+        reason_code=code,
+        reason=reason,
+        photos=names,
+        points=len(feature_map.points),
+        parents=feature_map.parents,
+        generation=feature_map.generation,
+        steps=growth.get("steps"),
+        drift_m=growth.get("drift_m"),
+        budget_m=growth.get("budget_m"),
+        gates=growth.get("gates", {}),
+        agreements=tuple(str(a) for a in grown.agreements),
+    )
+
+
+def fates_of(new: GrowthPhotos, run: Run, snapshot: Snapshot) -> tuple[PhotoFate, ...]:
+    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
+    fates = []
+    for row, photo in enumerate(new.photos):
+        map_id = run.map_of.get(row, "")
+        code, reason = run.why.get(row, ("", ""))
+        if map_id and not code and map_id not in active and map_id in run.promotions:
+            code, reason = run.promotions[map_id].reason_code, run.promotions[map_id].reason
+        fates.append(
+            PhotoFate(
+                name=new.candidate_ids.get(row, photo.name),
+                owner=photo.owner,
+                outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
+                map_id=map_id,
+                reason_code=code,
+                reason=reason,
+            )
+        )
+    return tuple(fates)
+
+
+def split_reason(reason: str) -> tuple[str, str]:
+    code, _, text = reason.partition(": ")
+    return code, text or code
