@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -186,3 +187,11 @@ def test_dask_workers_that_cannot_take_part_are_named(
     monkeypatch.setattr(dask_cluster, "_CONNECT_S", 0.5)
     with pytest.raises(IngestError, match="cannot be reached"):
         DaskExecutor("tcp://127.0.0.1:1", shared=[tmp_path])
+
+
+def test_without_dask_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from ingest.executor.dask_cluster import DaskExecutor
+
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(IngestError, match=r"pip install 'featuredb\[dask\]'"):
+        DaskExecutor("tcp://127.0.0.1:8786", shared=[tmp_path])
