@@ -57,6 +57,10 @@ class ConflictError(StoreError):
     """Concurrent writers collided more often than the bounded retries allow."""
 
 
+class ExportError(FeatureDbError):
+    """Nothing can be exported so, or what was exported cannot be read back."""
+
+
 class IngestError(FeatureDbError):
     """An ingest cannot go on: nothing usable in the folder, or a work folder of another job."""
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap, MapObservations, MapPoints
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.subset import only_points
 
 # The grid on which acceptance counts how much of a photo holds inliers.
 _GRID = 10
@@ -94,20 +95,7 @@ def with_descriptors(
         return replace(feature_map, observations=observations, provenance=noted)
     had, has = (_has_any(feature_map, which) for which in (seen.has_descriptor, kept))
     stays = has | ~had
-    rows = np.flatnonzero(stays[seen.point_index])
-    new_row = np.cumsum(stays) - 1
-    return replace(
-        feature_map,
-        points=_take_points(feature_map.points, stays),
-        observations=MapObservations(
-            point_index=new_row[seen.point_index[rows]],
-            **{
-                name: getattr(observations, name)[rows]
-                for name in ("image_id", "xy", "scale", "angle", "has_descriptor", "descriptors")
-            },
-        ),
-        provenance=noted,
-    )
+    return only_points(replace(feature_map, observations=observations, provenance=noted), stays)
 
 
 def k_cover(feature_map: FeatureMap, cover: int) -> NDArray[np.bool_]:
@@ -262,13 +250,3 @@ def _has_any(feature_map: FeatureMap, which: NDArray[np.bool_]) -> NDArray[np.bo
     found = np.zeros(len(feature_map.points), dtype=np.bool_)
     found[feature_map.observations.point_index[which]] = True
     return found
-
-
-def _take_points(points: MapPoints, rows: NDArray[np.bool_]) -> MapPoints:
-    return MapPoints(
-        utm=points.utm[rows],
-        rgb=points.rgb[rows],
-        track_length=points.track_length[rows],
-        error_px=points.error_px[rows],
-        covariance=points.covariance[rows],
-    )

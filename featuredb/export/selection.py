@@ -1,0 +1,166 @@
+"""Which maps of a snapshot are exported, and what of them: by id, status, place, SQL and licence."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from featuredb.errors import ExportError
+from featuredb.geo.utm import geodetic_from_utm
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapStatus
+from featuredb.maps.subset import only_images
+from featuredb.store.database import Database
+from featuredb.store.snapshot import MapSummary, Snapshot
+from featuredb.store.sql import SqlSession
+
+_VERSION = re.compile(r"-v?\d+(\.\d+)*$")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Selection:
+    """What is exported; the default is every active map, whole.
+
+    Attributes:
+        maps: ids of maps, whatever their status; empty: all with one of `statuses`.
+        statuses: of the maps.
+        bbox: west, south, east, north in WGS84 degrees; maps whose points' box touches it, whole. West may be
+            larger than east, across the antimeridian.
+        where: an SQL condition on the columns of the view `maps`, such as "images > 20"; "": none.
+        licences: of photos; None: whatever they are. Photos with others are left out with all that they
+            alone have contributed, see `licensed`.
+    """
+
+    maps: tuple[str, ...] = ()
+    statuses: tuple[MapStatus, ...] = ("active",)
+    bbox: tuple[float, float, float, float] | None = None
+    where: str = ""
+    licences: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.bbox is not None:
+            west, south, east, north = self.bbox
+            if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90):
+                raise ExportError(
+                    "bbox: expected west,south,east,north in degrees with south < north, found "
+                    f"{','.join(f'{v:g}' for v in self.bbox)}"
+                )
+        if self.licences is not None and not all(name.strip() for name in self.licences):
+            raise ExportError(
+                f"licences: expected names such as cc-by,cc0, found {','.join(self.licences)!r}"
+            )
+
+
+def selected_maps(database: Database, snapshot: Snapshot, selection: Selection) -> list[MapSummary]:
+    """The maps that are meant, oldest first.
+
+    Raises:
+        ExportError: no map is; which condition left none. StoreError: `where` is no condition.
+        MapNotFoundError: an id that the snapshot does not have.
+    """
+    if selection.maps:
+        wanted = {snapshot.get(map_id).map_id for map_id in selection.maps}
+        found = [m for m in snapshot.maps(include_retired=True) if m.map_id in wanted]
+    else:
+        found = [m for m in snapshot.maps(include_retired=True) if m.status in selection.statuses]
+        _some(found, f"maps that are {' or '.join(selection.statuses)}")
+    if selection.bbox is not None:
+        found = [m for m in found if _touches(m, selection.bbox)]
+        _some(found, f"maps in {','.join(f'{v:g}' for v in selection.bbox)} (west,south,east,north)")
+    if selection.where:
+        with SqlSession(snapshot, database) as session:
+            rows = session.query(f"SELECT map_id FROM maps WHERE ({selection.where}\n)").rows  # read-only
+            where = {row[0] for row in rows}
+        found = [m for m in found if m.map_id in where]
+        _some(found, f"maps with {selection.where}")
+    return found
+
+
+def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) -> Iterator[FeatureMap]:
+    """The maps as they are exported, oldest first, one in memory at a time.
+
+    Maps of which no photo has one of the licences are left out.
+
+    Raises:
+        ExportError: none is selected, or none is left by its licence.
+    """
+    left = False
+    for summary in selected_maps(database, snapshot, selection):
+        part = licensed(snapshot.load_map(summary.map_id), selection.licences)
+        if part is not None:
+            left = True
+            yield part
+    if not left:
+        raise ExportError(
+            f"expected photos with a licence of {', '.join(selection.licences or ())}, found none in the "
+            'selected maps; `featuredb sql DB "select licence, count(*) from images group by 1"` lists them'
+        )
+
+
+def licence_of(image: MapImage, feature_map: FeatureMap) -> str:
+    """The photo's licence, or that of its whole map; "" where nobody has said."""
+    return image.licence or feature_map.licence
+
+
+def licence_is(licence: str, wanted: str) -> bool:
+    """Whether a photo's licence is the wanted one: "cc-by" is also "CC BY 4.0", and not "CC-BY-SA-4.0"."""
+    mine, theirs = _spelled(licence), _spelled(wanted)
+    return bool(mine) and theirs in (mine, _VERSION.sub("", mine))
+
+
+def licensed(feature_map: FeatureMap, licences: tuple[str, ...] | None) -> FeatureMap | None:
+    """What the photos with these licences have contributed; None where that is nothing.
+
+    Photos with other licences, or without, are left out, with their observations and descriptors. A point
+    stays if two of the photos that are left see it: they could have made it alone.
+
+    Args:
+        licences: see `licence_is`; None: everything.
+    """
+    if licences is None:
+        return feature_map
+    kept = [
+        image.image_id
+        for image in feature_map.images
+        if any(licence_is(licence_of(image, feature_map), wanted) for wanted in licences)
+    ]
+    if not kept:
+        return None
+    left_out = len(feature_map.images) - len(kept)
+    if not left_out:
+        return feature_map
+    note = {"licences": sorted(licences), "photos_left_out": left_out}
+    part = only_images(feature_map, kept)
+    return replace(part, provenance=feature_map.provenance | {"exported_by_licence": note})
+
+
+def _spelled(licence: str) -> str:
+    return re.sub(r"[\s_-]+", "-", licence.strip().casefold())
+
+
+def _touches(summary: MapSummary, bbox: tuple[float, float, float, float]) -> bool:
+    """By the geographic box of the corners of the map's box in UTM."""
+    box = summary.box
+    if box is None:
+        return False
+    corners = [
+        (e, n, 0.0) for e in (box.min_easting, box.max_easting) for n in (box.min_northing, box.max_northing)
+    ]
+    lat_lon = geodetic_from_utm(corners, summary.epsg)
+    (s, w), (n, e) = lat_lon[:, :2].min(axis=0), lat_lon[:, :2].max(axis=0)
+    west, south, east, north = bbox
+    if e - w > 180:  # the map lies across the antimeridian
+        w, e = e, w
+    return bool(s <= north and south <= n and _meet((w, e), (west, east)))
+
+
+def _meet(a: tuple[float, float], b: tuple[float, float]) -> bool:
+    """Whether two intervals of longitude meet that may cross the antimeridian."""
+
+    def parts(west: float, east: float) -> list[tuple[float, float]]:
+        return [(west, east)] if west <= east else [(west, 180.0), (-180.0, east)]
+
+    return any(w <= e2 and w2 <= e for w, e in parts(*a) for w2, e2 in parts(*b))
+
+
+def _some(found: list[MapSummary], what: str) -> None:
+    if not found:
+        raise ExportError(f"expected {what}, found none; `featuredb maps DB --all` lists what there is")

@@ -1,0 +1,86 @@
+"""A part of a map that is a map itself: some of its images with what they see, some of its points."""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.maps.feature_map import FeatureMap, MapObservations, MapPoints
+
+_PER_OBSERVATION = ("image_id", "xy", "scale", "angle", "has_descriptor", "descriptors")
+
+
+def only_images(feature_map: FeatureMap, image_ids: Collection[int], min_views: int = 2) -> FeatureMap:
+    """The map with some of its images, their cameras, observations and points.
+
+    Image ids stay; cameras and points are numbered anew. Coordinates, covariances and reprojection errors of
+    points stay what all images have made of them; `track_length` counts the images that are left.
+
+    Args:
+        image_ids: of the images that stay. min_views: points that fewer of them see are left out.
+
+    Raises:
+        InvalidValueError: an id that the map does not have.
+    """
+    wanted = set(image_ids)
+    unknown = wanted - {image.image_id for image in feature_map.images}
+    if unknown:
+        raise InvalidValueError(
+            f"FeatureMap {feature_map.map_id}: expected ids of its images, found {sorted(unknown)[:5]}"
+        )
+    images = [image for image in feature_map.images if image.image_id in wanted]
+    if len(images) == len(feature_map.images):
+        return feature_map
+    cameras = sorted({image.camera_id for image in images})
+    seen = feature_map.observations
+    stays = np.isin(seen.image_id, np.array(sorted(wanted), dtype=np.int32))
+    views = _views(seen.point_index[stays], seen.image_id[stays], len(feature_map.points))
+    part = replace(
+        feature_map,
+        cameras=tuple(feature_map.cameras[c] for c in cameras),
+        camera_keys=tuple(feature_map.camera_keys[c] for c in cameras) if feature_map.camera_keys else (),
+        images=tuple(replace(image, camera_id=cameras.index(image.camera_id)) for image in images),
+        points=replace(feature_map.points, track_length=views),
+        observations=take_observations(seen, stays),
+    )
+    return only_points(part, views >= min_views)
+
+
+def only_points(feature_map: FeatureMap, stays: NDArray[np.bool_]) -> FeatureMap:
+    """The map with some of its points (n,) and their observations; points are numbered anew."""
+    if stays.all():
+        return feature_map
+    new_row = np.cumsum(stays) - 1
+    seen = take_observations(feature_map.observations, stays[feature_map.observations.point_index])
+    return replace(
+        feature_map,
+        points=take_points(feature_map.points, stays),
+        observations=replace(seen, point_index=new_row[seen.point_index]),
+    )
+
+
+def take_points(points: MapPoints, rows: NDArray[np.bool_]) -> MapPoints:
+    """Some rows (n,)."""
+    return MapPoints(
+        utm=points.utm[rows],
+        rgb=points.rgb[rows],
+        track_length=points.track_length[rows],
+        error_px=points.error_px[rows],
+        covariance=points.covariance[rows],
+    )
+
+
+def take_observations(observations: MapObservations, rows: NDArray[np.bool_]) -> MapObservations:
+    """Some rows (m,); `point_index` names the same points as before."""
+    return MapObservations(
+        point_index=observations.point_index[rows],
+        **{name: getattr(observations, name)[rows] for name in _PER_OBSERVATION},
+    )
+
+
+def _views(point_index: NDArray[np.int64], image_id: NDArray[np.int32], points: int) -> NDArray[np.int32]:
+    """How many images see each point (points,); an image that sees one twice counts once."""
+    pairs = np.unique(np.stack([point_index, image_id.astype(np.int64)], axis=1), axis=0)
+    return np.bincount(pairs[:, 0], minlength=points).astype(np.int32)
