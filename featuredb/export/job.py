@@ -1,0 +1,90 @@
+"""What every format is given and gives back, and an output that is there whole or not at all."""
+
+import shutil
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from featuredb.errors import ExportError
+from featuredb.export.selection import Selection, exported_maps, selected_maps
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.database import Database
+from featuredb.store.snapshot import MapSummary, Snapshot
+
+Told = Callable[[int, int], None]
+"""Called with the number of maps written and their total."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportJob:
+    """An export that is asked for.
+
+    Attributes:
+        out: the file or folder to be made, in a folder that exists.
+        selection: which maps, and what of them.
+        told: progress.
+    """
+
+    database: Database
+    snapshot: Snapshot
+    selection: Selection
+    out: Path
+    told: Told = field(default=lambda done, total: None)
+
+    def summaries(self) -> list[MapSummary]:
+        """Of the selected maps, before licences; see `selected_maps`."""
+        return selected_maps(self.database, self.snapshot, self.selection)
+
+    def maps(self) -> Iterator[FeatureMap]:
+        """One in memory at a time, oldest first, telling progress; see `exported_maps`."""
+        total = len(self.summaries())
+        for done, feature_map in enumerate(exported_maps(self.database, self.snapshot, self.selection)):
+            yield feature_map
+            self.told(done + 1, total)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Exported:
+    """What was written: numbers of maps, images, points and observations, and bytes of all files."""
+
+    maps: int
+    images: int
+    points: int
+    observations: int
+    bytes: int
+
+
+@contextmanager
+def whole_or_nothing(out: Path) -> Iterator[Path]:
+    """A path beside `out` to write a file or a folder to; it becomes `out` when the block ends well.
+
+    After an error, or a kill, nothing is at `out`; what a kill leaves is named `.OUT.part-…`.
+
+    Raises:
+        ExportError: there is something at `out`, or its folder is missing.
+    """
+    out = out.absolute()
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise ExportError(f"{out}: expected a name that is free, or an empty folder; nothing is overwritten")
+    if not out.parent.is_dir():
+        raise ExportError(f"{out}: expected a folder {out.parent} to write it to, found none; make it first")
+    part = out.with_name(f".{out.name}.part-{uuid.uuid4().hex[:8]}")
+    try:
+        yield part
+        if out.is_dir():
+            out.rmdir()
+        part.rename(out)
+    finally:
+        if part.is_dir():
+            shutil.rmtree(part)
+        else:
+            part.unlink(missing_ok=True)
+
+
+def size_of(path: Path) -> int:
+    """Bytes of a file, or of all files below a folder."""
+    if path.is_file():
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
