@@ -146,7 +146,7 @@ def anchors_behind(new: NewPhotos, anchors: Anchors) -> Anchors:
     for k, pose in enumerate(new.model.cam_from_sfm):
         camera = TRUTH.act_on_pose(pose)
         behind[anchors.photo_of == k] = camera.inverse().act(np.array([[0.0, 0.0, -1e3]]))
-    return replace(anchors, points=behind + [0.0, 0.0, 1e4])
+    return replace(anchors, points=behind + np.array([0.0, 0.0, 1e4]))
 
 
 def test_neighbours_factor_of_independent_scores_is_about_one() -> None:
