@@ -26,6 +26,7 @@ from ingest.precision import linearise
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991
+_OPEN = np.array([10.0] * 4 + [1e4] * 3)  # log scale, radians, metres: what nothing holds; gates refuse it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,7 +205,8 @@ def fit_similarity(
 
     Geman-McClure weights at the residuals' robust spread. The covariance is the inverse of the normal
     equations times the squared spread times how far neighbours err alike: photos share the model's bending,
-    places the existing map's.
+    places the existing map's. What no anchor holds (the scale, where all photos stand at one place) stays as
+    `start` has it, and has standard deviations of `_OPEN`.
     """
     chosen = anchors.take(np.flatnonzero(use))
     sim, covariance = start, np.eye(7)
@@ -217,7 +219,7 @@ def fit_similarity(
         weighted = weights[:, None, None] * (np.swapaxes(jacobian, 1, 2) @ information)
         normal = np.einsum("mai,mib->ab", weighted, jacobian)
         score = np.einsum("mai,mi->ma", weighted, residual)
-        inverse = np.linalg.inv(normal)
+        inverse = np.linalg.inv(normal + np.diag(1.0 / _OPEN**2))
         step = -inverse @ score.sum(axis=0)
         factor = neighbours_factor(score, inverse, chosen)
         covariance = inverse * (max(spread, 1.0) ** 2 if spread > 0 else 1.0) * factor

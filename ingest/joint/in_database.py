@@ -12,7 +12,8 @@ from featuredb.store import Database, MapSummary
 from ingest.growth.canaries import CanaryOptions
 from ingest.growth.map_graph import StoredEdge, growth_of, place_of
 from ingest.growth.replacing import ask_persons_canaries
-from ingest.joint.adjust import JointAdjustment, JointOptions, adjust_together
+from ingest.joint.adjust import adjust_together
+from ingest.joint.values import JointAdjustment, JointOptions
 
 # Their places were measured by more than photos.
 _MEASURED = ("lidar", "gcp")

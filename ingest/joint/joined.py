@@ -243,3 +243,12 @@ def _of_one_keypoint(
     next_same = (photo[1:] == photo[:-1]) & (keypoint[1:] == keypoint[:-1]) & (point[1:] != point[:-1])
     rows = np.flatnonzero(next_same)
     return point[rows], point[rows + 1]
+
+
+def observed_pixels(joined: Joined, model: Model) -> FloatArray:
+    """(m, 2) of the model's observations."""
+    pixels = np.zeros((len(model.point_of), 2))
+    for k, keypoints in enumerate(joined.keypoints):
+        mine = model.photo_of == k
+        pixels[mine] = keypoints[model.keypoint_of[mine]]
+    return pixels

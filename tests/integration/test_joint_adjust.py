@@ -16,10 +16,11 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapObservations
 from featuredb.store import Database
 from ingest.growth.map_graph import growth_of, place_of
-from ingest.joint.adjust import JointOptions, adjust_together
+from ingest.joint.adjust import adjust_together
 from ingest.joint.in_database import adjust_maps
 from ingest.joint.joined import join_maps
 from ingest.joint.links import Links
+from ingest.joint.values import JointOptions
 from ingest.register.gps import similarity_closed_form
 from tests.support.scene_strip import POINTS, east, grown, strip_map
 

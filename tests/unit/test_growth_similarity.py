@@ -123,6 +123,32 @@ def test_photos_that_are_bent_alike_widen_the_covariance() -> None:
     assert error @ np.linalg.solve(naive, error) > 24.3
 
 
+def test_what_no_anchor_holds_is_open_and_stays() -> None:
+    """One photo does not tell the scale; points behind all cameras tell nothing at all."""
+    new, points = world(6)
+    anchors = anchors_of(new, points)
+    fit = fit_similarity(new.model, TRUTH, anchors, anchors.photo_of == 0, OPTIONS)
+    assert np.linalg.eigvalsh(fit.covariance).min() > 0.0
+    assert np.sqrt(fit.covariance[0, 0]) > 1.0
+    center = new.model.cam_from_sfm[0].center
+    assert np.linalg.norm(fit.local_from_sfm.act(center) - TRUTH.act(center)) < 0.5
+    away = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e4])) @ TRUTH
+    down = fit_similarity(
+        new.model, away, anchors_behind(new, anchors), np.ones(len(anchors), np.bool_), OPTIONS
+    )
+    np.testing.assert_allclose(down.local_from_sfm.matrix(), away.matrix())
+    assert np.sqrt(np.diag(down.covariance)).min() > 1.0
+
+
+def anchors_behind(new: NewPhotos, anchors: Anchors) -> Anchors:
+    """The same pixels with points a kilometre behind their cameras, wherever these are moved."""
+    behind = np.empty_like(anchors.points)
+    for k, pose in enumerate(new.model.cam_from_sfm):
+        camera = TRUTH.act_on_pose(pose)
+        behind[anchors.photo_of == k] = camera.inverse().act(np.array([[0.0, 0.0, -1e3]]))
+    return replace(anchors, points=behind + np.array([0.0, 0.0, 1e4]))
+
+
 def test_neighbours_factor_of_independent_scores_is_about_one() -> None:
     new, points = world(4)
     anchors = anchors_of(new, points)
