@@ -114,7 +114,8 @@ def _caption(image: NDArray[np.uint8], place: list[MapEntry], middle: FloatArray
     cv2.rectangle(image, (_MARGIN_PX, y), (end, y + 4), _INK, -1)
     images, points = (sum(int(e.row[name]) for e in place) for name in ("images", "points"))
     longitude = (middle[0] + 180.0) % 360.0 - 180.0
-    text = f"{len(place)} maps, {images} images, {points:,} points at {middle[1]:.4f}, {longitude:.4f}"
+    maps = "1 map" if len(place) == 1 else f"{len(place)} maps"
+    text = f"{maps}, {images} images, {points:,} points at {middle[1]:.4f}, {longitude:.4f}"
     font = cv2.FONT_HERSHEY_SIMPLEX
     cv2.putText(image, f"{bar_m:g} m", (end + 8, y + 8), font, 0.42, _INK, 1, cv2.LINE_AA)
     cv2.putText(image, text, (_MARGIN_PX, y + 28), font, 0.42, _INK, 1, cv2.LINE_AA)
