@@ -89,6 +89,7 @@ def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) 
         if part is not None:
             left = True
             yield part
+        del part  # or there would be two maps in memory while the next one is loaded
     if not left:
         raise ExportError(
             f"expected photos with a licence of {', '.join(selection.licences or ())}, found none in the "

@@ -69,10 +69,10 @@ def import_dataset(
         map_id = row["map_id"]
         new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
         (created if new else present).append(map_id)
-        if new or dry_run:
-            feature_map = load_map(folder, row, listed)
-            if not dry_run:
-                _commit(database, feature_map, row["status_reason"], missing.get(map_id, ()))
+        if dry_run:
+            load_map(folder, row, listed)
+        elif new:
+            _commit(database, load_map(folder, row, listed), row["status_reason"], missing.get(map_id, ()))
         told(done + 1, len(rows))
     return Imported(
         created=tuple(created),

@@ -35,6 +35,7 @@ from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import Lineage
 from featuredb.store.encode import encode_map
+from featuredb.store.snapshot import MapSummary
 
 # Rows of maps.parquet and cameras.parquet that are kept before they are written.
 _ROWS_AT_ONCE = 256
@@ -85,19 +86,25 @@ def _write_maps(job: ExportJob, folder: Path) -> Contents:
         AttributionFile(folder / layout.ATTRIBUTION) as attribution,
     ):
         for feature_map in job.maps():
-            summary = job.snapshot.get(feature_map.map_id)
-            encoded = encode_map(feature_map, "", summary.created_at)
-            encoded.row["status_reason"] = summary.status_reason
-            encoded.row["lineage"] = _lineage_json(lineages[feature_map.map_id])
-            for table, path in files.write(feature_map, encoded).items():
-                encoded.row[f"{table}_file"] = path
-            entry = entry_of(feature_map, encoded.row)
+            row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
+            row["lineage"] = _lineage_json(lineages[feature_map.map_id])
+            entry = entry_of(feature_map, row)
             contents.maps.append(entry)
             maps.add(_area_columns(entry))
-            for row in _camera_rows(feature_map):
-                cameras.add(row)
+            for camera in _camera_rows(feature_map):
+                cameras.add(camera)
             attribution.add(feature_map)
+            del feature_map  # before the next one is loaded
     return contents
+
+
+def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
+    """The map's images, points and observations; returns its row of maps.parquet, in part."""
+    encoded = encode_map(feature_map, "", summary.created_at)
+    encoded.row["status_reason"] = summary.status_reason
+    for table, path in files.write(feature_map, encoded).items():
+        encoded.row[f"{table}_file"] = path
+    return encoded.row
 
 
 class _RowFile:
