@@ -238,6 +238,12 @@ def test_large_tables_are_cut_between_maps(tmp_path: Path, monkeypatch: pytest.M
 def test_without_pystac_it_says_which_extra(
     database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    import pystac
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pystac, "get_stac_version", lambda: "1.1.0")
+        with pytest.raises(MissingExtraError, match=r"writes STAC 1\.0\.0, found one that writes 1\.1\.0"):
+            export(database, tmp_path / "out", EVERYTHING)
     monkeypatch.setitem(sys.modules, "pystac", None)
     with pytest.raises(MissingExtraError, match=r"featuredb\[dataset\]"):
         export(database, tmp_path / "out", EVERYTHING)

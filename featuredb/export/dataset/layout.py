@@ -45,10 +45,13 @@ class Partition:
 def file_name(name: str) -> str:
     """A file name, without ending, for the id of a map or scan: itself where it can be one.
 
-    Other ids get a piece of their hash, so that two never share a name and none leads out of its folder.
+    Other ids, and those with capitals, get a piece of their hash, so that two never share a name, on no file
+    system, and none leads out of its folder.
     """
     safe = _UNSAFE.sub("_", name)[:_LONGEST_NAME]
-    return safe if safe == name else f"{safe}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+    return (
+        safe if name and safe.lower() == name else f"{safe}-{hashlib.sha256(name.encode()).hexdigest()[:12]}"
+    )
 
 
 def write_json(path: Path, document: Any) -> None:

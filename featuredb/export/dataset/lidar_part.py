@@ -56,7 +56,7 @@ def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[s
         ):
             continue
         tiles = []
-        for tile in sorted(_touched(scan, contents.maps)):
+        for tile in sorted(touched_tiles(scan, contents.maps)):
             name = f"{layout.LIDAR}/{layout.file_name(scan.scan_id)}/{tile}.laz"
             points = write_tile(job.database, scan, tile, folder / name)
             if points:
@@ -68,7 +68,7 @@ def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[s
     return written
 
 
-def _touched(scan: ScanSummary, maps: Iterable[MapEntry]) -> set[str]:
+def touched_tiles(scan: ScanSummary, maps: Iterable[MapEntry]) -> set[str]:
     """Names of the scan's tiles that a map touches."""
     own = set(scan.row["tiles"])
     found: set[str] = set()

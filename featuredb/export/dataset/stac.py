@@ -27,7 +27,7 @@ def check_stac() -> None:
     """Refuse early where the catalogue could not be made.
 
     Raises:
-        MissingExtraError: pystac is not installed.
+        MissingExtraError: pystac is not installed, or one that writes another version of STAC.
     """
     try:
         import pystac
@@ -35,7 +35,11 @@ def check_stac() -> None:
         raise MissingExtraError(
             "a dataset's catalogue needs pystac; install it by: pip install 'featuredb[dataset]'"
         ) from error
-    assert pystac.get_stac_version() == STAC_VERSION
+    if pystac.get_stac_version() != STAC_VERSION:
+        raise MissingExtraError(
+            f"expected a pystac that writes STAC {STAC_VERSION}, found one that writes {pystac.get_stac_version()}; "
+            "install it by: pip install 'featuredb[dataset]'"
+        )
 
 
 def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: Path) -> None:
