@@ -91,6 +91,8 @@ def test_duckdb_reads_all_of_it(database: Database, folder: Path) -> None:
         ).fetchall()
         expected = {m.map_id: getattr(m, table) for m in snapshot.maps(include_retired=True)}
         assert dict(rows) == {name: count for name, count in expected.items() if count}
+    rows = connection.sql(f"SELECT map_id, points, status FROM '{folder}/maps.parquet'").fetchall()
+    assert rows == [(m.map_id, m.points, m.status) for m in snapshot.maps(include_retired=True)]
     ((key,),) = connection.sql(
         f"SELECT value FROM parquet_kv_metadata('{folder}/points/32734-egm96-0000.parquet') WHERE key = 'geo'"
     ).fetchall()
@@ -132,6 +134,17 @@ def test_bbox_columns_hold_their_geometries(folder: Path) -> None:
         assert whole == [east.min(), north.min(), height.min(), east.max(), north.max(), height.max()]
 
 
+def test_a_row_group_has_rows_of_one_map(database: Database, folder: Path) -> None:
+    for path in [*folder.glob("points/*"), *folder.glob("observations/*")]:
+        file = pq.ParquetFile(path)
+        groups = [set(file.read_row_group(k)["map_id"].to_pylist()) for k in range(file.num_row_groups)]
+        assert all(len(group) == 1 for group in groups)
+    assert (
+        len(pq.ParquetFile(folder / "points/32632-unknown-0000.parquet").read(["map_id"])["map_id"].unique())
+        == 4
+    )
+
+
 def test_geopandas_reads_coordinates_and_crs(database: Database, folder: Path) -> None:
     geopandas = pytest.importorskip("geopandas")
     snapshot = database.snapshot()
@@ -171,6 +184,10 @@ def test_geopandas_reads_the_maps_areas(folder: Path) -> None:
             assert bounds == (west, south, east, north)
     here = geopandas.read_parquet(folder / "maps.parquet", bbox=(18.0, -34.0, 19.0, -33.0))
     assert list(here["map_id"]) == ["cape-town"]
+    there = geopandas.read_parquet(folder / "maps.parquet", bbox=(-180.0, -17.1, -179.999, -16.9))
+    assert list(there["map_id"]) == ["fiji"]
+    whole = geo_of(folder / "maps.parquet")["columns"]["geometry"]["bbox"]
+    assert whole == pytest.approx(list(maps.total_bounds))
 
 
 def test_poses_on_earth_say_the_same_in_every_way(database: Database, folder: Path) -> None:

@@ -1,6 +1,7 @@
 """A dataset is written whole, the same each time, and holds nothing that was not asked for."""
 
 import csv
+import gc
 import hashlib
 import json
 import os
@@ -18,8 +19,10 @@ from featuredb.errors import ExportError, MissingExtraError
 from featuredb.export.dataset import read_dataset, write_dataset
 from featuredb.export.job import size_of
 from featuredb.export.selection import Selection
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
+from featuredb.store.snapshot import Snapshot
 from tests.support.datasets import EVERYTHING, export, files_of, job_of, varied_database
 from tests.support.maps import assert_same_map, random_map
 
@@ -152,12 +155,31 @@ def read_plainly(folder: Path) -> dict[str, bytes]:
     return files
 
 
+def test_one_map_is_in_memory_at_a_time(
+    database: Database, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def maps() -> int:
+        gc.collect()
+        return sum(isinstance(thing, FeatureMap) for thing in gc.get_objects())
+
+    load, before, most = Snapshot.load_map, maps(), []
+
+    def counted(snapshot: Snapshot, map_id: str) -> FeatureMap:
+        most.append(maps() - before)
+        return load(snapshot, map_id)
+
+    monkeypatch.setattr(Snapshot, "load_map", counted)
+    export(database, tmp_path / "out")
+    assert most == [0] * 10  # nothing is left of one when the next is loaded
+
+
 def test_a_kill_in_the_middle_leaves_nothing(database: Database, tmp_path: Path) -> None:
     program = """
 import os, signal, sys
 from dataclasses import replace
 from pathlib import Path
 from featuredb.export.dataset import write_dataset
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tests.support.datasets import job_of
 job = job_of(Database.open(sys.argv[1]), Path(sys.argv[2]))

@@ -78,7 +78,7 @@ _MAPS_MEANING = {
     "images_file": "where its images are; null without any",
     "observations_file": "where its observations are; null without any",
     GEOMETRY: "hull of its points and cameras in plan, WGS84 longitude and latitude",
-    BBOX: "box around the geometry, degrees; xmin is larger than xmax across the antimeridian",
+    BBOX: "box around the geometry, degrees; from -180 to 180 where it crosses the antimeridian",
 }  # fmt: skip
 
 _CAMERAS_MEANING = {

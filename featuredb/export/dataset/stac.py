@@ -35,9 +35,10 @@ def check_stac() -> None:
         raise MissingExtraError(
             "a dataset's catalogue needs pystac; install it by: pip install 'featuredb[dataset]'"
         ) from error
-    if pystac.get_stac_version() != STAC_VERSION:
+    found = pystac.get_stac_version()
+    if found != STAC_VERSION:
         raise MissingExtraError(
-            f"expected a pystac that writes STAC {STAC_VERSION}, found one that writes {pystac.get_stac_version()}; "
+            f"expected a pystac that writes STAC {STAC_VERSION}, found one that writes {found}; "
             "install it by: pip install 'featuredb[dataset]'"
         )
 

@@ -140,6 +140,8 @@ class _RowFile:
 
 def _area_columns(entry: MapEntry) -> dict[str, Any]:
     west, south, east, north = entry.footprint.bbox
+    if west > east:  # readers compare numbers: a box that begins in the east would never be found
+        west, east = -180.0, 180.0
     return entry.row | {
         "geometry": wkb_of(entry.footprint.geometry),
         "kind": entry.footprint.geometry["type"],
