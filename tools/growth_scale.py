@@ -192,11 +192,11 @@ def watch(process: "subprocess.Popen[bytes]", spent: Spent, file: Path) -> None:
     """Add what a process and its descendants take until it ends, and keep the sum in `file` meanwhile."""
     before, start, ours = (spent.wall_s, spent.cpu_s), time.monotonic(), os.times()
     while process.poll() is None:
-        family = _family(process.pid)
-        spent.peak = max(spent.peak, sum(_memory(pid) for pid in family))
+        pids = family(process.pid)
+        spent.peak = max(spent.peak, sum(memory(pid) for pid in pids))
         spent.wall_s = before[0] + time.monotonic() - start
         # The time of a worker that is just ending is nobody's for a moment.
-        spent.cpu_s = max(spent.cpu_s, before[1] + sum(_processor_s(pid) for pid in family))
+        spent.cpu_s = max(spent.cpu_s, before[1] + sum(_processor_s(pid) for pid in pids))
         spent.write(file)
         time.sleep(_SAMPLE_S)
     spent.wall_s = before[0] + time.monotonic() - start
@@ -216,7 +216,8 @@ def _processor_s(pid: int) -> float:
     return sum(map(int, words[11:15])) / _TICKS
 
 
-def _family(pid: int) -> list[int]:
+def family(pid: int) -> list[int]:
+    """A process and its descendants."""
     found = [pid]
     for parent in found:
         for task in Path(f"/proc/{parent}/task").glob("*/children"):
@@ -227,7 +228,7 @@ def _family(pid: int) -> list[int]:
     return found
 
 
-def _memory(pid: int) -> int:
+def memory(pid: int) -> int:
     """Proportional set size: pages that processes share are counted once in all."""
     try:
         lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()

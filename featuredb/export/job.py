@@ -5,6 +5,7 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 
 from featuredb.errors import ExportError
@@ -39,10 +40,11 @@ class ExportJob:
 
     def maps(self) -> Iterator[FeatureMap]:
         """One in memory at a time, oldest first, telling progress; see `exported_maps`."""
-        total = len(self.summaries())
-        for done, feature_map in enumerate(exported_maps(self.database, self.snapshot, self.selection)):
+        total, done = len(self.summaries()), count(1)
+        for feature_map in exported_maps(self.database, self.snapshot, self.selection):
             yield feature_map
-            self.told(done + 1, total)
+            del feature_map  # or it would stay while the next one is loaded, as it would with `enumerate`
+            self.told(next(done), total)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

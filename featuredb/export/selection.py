@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from featuredb.errors import ExportError
+from featuredb.export.forget import forget, names_of
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapStatus
 from featuredb.maps.subset import only_images
@@ -88,6 +89,7 @@ def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) 
         if part is not None:
             left = True
             yield part
+        del part  # or there would be two maps in memory while the next one is loaded
     if not left:
         raise ExportError(
             f"expected photos with a licence of {', '.join(selection.licences or ())}, found none in the "
@@ -109,8 +111,9 @@ def licence_is(licence: str, wanted: str) -> bool:
 def licensed(feature_map: FeatureMap, licences: tuple[str, ...] | None) -> FeatureMap | None:
     """What the photos with these licences have contributed; None where that is nothing.
 
-    Photos with other licences, or without, are left out, with their observations and descriptors. A point
-    stays if two of the photos that are left see it: they could have made it alone.
+    Photos with other licences, or without, are left out, with their observations and descriptors, and with
+    what evidence and provenance say of them by name. A point stays if two of the photos that are left see it:
+    they could have made it alone.
 
     Args:
         licences: see `licence_is`; None: everything.
@@ -129,7 +132,13 @@ def licensed(feature_map: FeatureMap, licences: tuple[str, ...] | None) -> Featu
         return feature_map
     note = {"licences": sorted(licences), "photos_left_out": left_out}
     part = only_images(feature_map, kept)
-    return replace(part, provenance=feature_map.provenance | {"exported_by_licence": note})
+    gone = names_of(i for i in feature_map.images if i.image_id not in kept) - names_of(part.images)
+    evidence = forget(part.placement.evidence, gone)
+    return replace(
+        part,
+        placement=replace(part.placement, evidence=evidence),
+        provenance=forget(feature_map.provenance, gone) | {"exported_by_licence": note},
+    )
 
 
 def _spelled(licence: str) -> str:

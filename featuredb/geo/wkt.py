@@ -1,4 +1,6 @@
-"""UTM reference systems as text, for files that carry one: LAS 1.4 and GeoTIFF."""
+"""UTM reference systems as text, for files that carry one: LAS 1.4, GeoTIFF, GeoParquet, STAC."""
+
+from typing import Any
 
 from pyproj import CRS
 
@@ -30,3 +32,27 @@ def utm_wkt(epsg: int, height_datum: str) -> str:
     return (
         plane if datum == "unknown" else f'COMPD_CS["{zone.name} + Ellipsoid (metre)",{plane},{_ELLIPSOID}]'
     )
+
+
+def utm_projjson(epsg: int, height_datum: str) -> dict[str, Any]:
+    """PROJJSON of a UTM zone with what its heights are counted from, for GeoParquet and STAC.
+
+    A compound system with EGM96, EGM2008 or NAVD88; a projected 3D system for heights above the ellipsoid;
+    the zone alone, in which z has no reference, where the datum is unknown.
+
+    Args:
+        epsg: 326zz or 327zz.
+        height_datum: one of featuredb.geo.datum.HEIGHT_DATUMS.
+
+    Raises:
+        GeodesyError: not a UTM code.
+        InvalidValueError: not a datum's name.
+    """
+    zone_of(epsg)
+    datum = check_datum(height_datum)
+    if datum in _EPSG_OF_DATUM:
+        crs = CRS.from_user_input(f"EPSG:{epsg}+{_EPSG_OF_DATUM[datum]}")
+    else:
+        crs = CRS.from_epsg(epsg) if datum == "unknown" else CRS.from_epsg(epsg).to_3d()
+    document: dict[str, Any] = crs.to_json_dict()
+    return document

@@ -166,6 +166,7 @@ class Database:
         replaces: Sequence[str] = (),
         based_on: Mapping[str, str] | None = None,
         moves: bool = True,
+        reasons: Mapping[str, str] | None = None,
     ) -> list[CommitResult]:
         """Make maps visible, all in one commit.
 
@@ -178,17 +179,21 @@ class Database:
             based_on: write ids, by id, of the replaced maps that the new ones were made from.
             moves: False where the new maps are the old ones at the same place, thinned for example: what
                 they placed stands, and nothing is quarantined.
+            reasons: why maps have the status that they come with, by id.
 
         Raises:
             ConflictError: other writers were faster too many times, or a map of `based_on` has been placed
                 anew, retired or rolled back since it was read; nothing is visible.
             MapNotFoundError: a map to be replaced is not there.
-            StoreError: the store failed, map ids repeat, or a map is retired.
+            StoreError: the store failed, map ids repeat, or a map is retired without a reason.
         """
         ids = [feature_map.map_id for feature_map in feature_maps]
         if len(set(ids)) != len(ids):
             raise StoreError(f"commit_maps: expected different map ids, found {ids}")
-        if any(feature_map.status == RETIRED for feature_map in feature_maps):
+        why = reasons or {}
+        if any(
+            feature_map.status == RETIRED and not why.get(feature_map.map_id) for feature_map in feature_maps
+        ):
             raise StoreError("commit_maps: expected active or quarantined maps, found a retired one")
         started = datetime.now(UTC)
         encoded: dict[str, EncodedMap] = {}
@@ -204,6 +209,7 @@ class Database:
             for feature_map in pending:
                 if feature_map.map_id not in encoded:
                     encoded[feature_map.map_id] = self._write_children(feature_map)
+                    encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
             if datetime.now(UTC) - started > LONGEST_COMMIT:
                 raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
             version = maps.version

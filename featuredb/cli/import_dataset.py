@@ -1,0 +1,36 @@
+"""The command `import`: the maps of a dataset into a database."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from featuredb.cli.common import add_database_argument, open_database
+
+
+def register(subparsers: Any) -> None:
+    """Add `import` to the parser of `featuredb`."""
+    text = "bring the maps of an exported dataset into a database"
+    parser = subparsers.add_parser("import", help=text, description=f"{text}; see docs/export.md")
+    add_database_argument(parser)
+    parser.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="a dataset, as `featuredb export` makes it"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
+    parser.set_defaults(run=run_import)
+
+
+def run_import(args: argparse.Namespace) -> int:
+    """Import, and say what became of the maps."""
+    from featuredb.export.dataset import import_dataset
+
+    done = import_dataset(open_database(args), args.folder, dry_run=args.dry_run)
+    would = "would import" if done.dry_run else "imported"
+    lines = [f"{would} {len(done.created)} maps; {len(done.present)} were there already"]
+    for map_id, missing in done.quarantined.items():
+        needs = f"what placed it is neither in the dataset nor in the database: {', '.join(missing)}"
+        lines.append(f"{map_id}: in quarantine, {needs}")
+    if not done.dry_run:
+        lines.append(f"version {done.version}")
+    sys.stdout.write("\n".join(lines) + "\n")
+    return 0

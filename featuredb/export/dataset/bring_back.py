@@ -1,0 +1,151 @@
+"""A dataset back into a database: the same maps, with the status that they had."""
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from featuredb.errors import ExportError
+from featuredb.export.dataset.read import Row, load_map, open_dataset
+from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
+from featuredb.store.changes import ACTIVE, RETIRED, anchored
+from featuredb.store.database import Database
+
+Told = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Imported:
+    """What an import did, or would do.
+
+    Attributes:
+        created: ids of maps that are visible now and were not before.
+        present: ids of maps that the database had already, with the same content; they are left as they are.
+        quarantined: active maps of the dataset that came in quarantine, because maps that placed them are
+            neither in the dataset nor in the database; with the ids of those.
+        version: the database's newest version.
+        dry_run: nothing was written.
+    """
+
+    created: tuple[str, ...]
+    present: tuple[str, ...]
+    quarantined: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    version: int
+    dry_run: bool
+
+
+def import_dataset(
+    database: Database,
+    folder: Path,
+    *,
+    dry_run: bool = False,
+    told: Told = lambda done, total: None,
+) -> Imported:
+    """Commit the maps of a dataset, one after the other, parents before what they have placed.
+
+    All of it is compared with its checksums before the first commit. Importing again changes nothing; an
+    import that was killed goes on where it was. A map keeps its status, with one exception: the store lets a
+    map answer only if a chain of maps leads from it to an anchor. Where the dataset and the database lack
+    the maps that an active one stands on, it comes in quarantine; `featuredb lineage` shows it, and it can
+    be promoted when they are there. Scans of the dataset are left where they are: `featuredb lidar add`
+    takes LAZ.
+
+    Args:
+        dry_run: read and check everything, write nothing.
+        told: called with the number of maps done and their total.
+
+    Raises:
+        ExportError: the folder is no sound dataset, or the database has another map of the same id; nothing
+            has been committed. ConflictError, StoreError: the store failed; the import can be run again.
+    """
+    rows, listed = open_dataset(folder)
+    there = {m.map_id: m for m in database.snapshot().maps(include_retired=True)}
+    live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
+    _check_rows(folder, rows, {map_id: m.content_digest for map_id, m in live.items()})
+    missing = _missing_parents(rows, {map_id: m.parents for map_id, m in live.items()})
+    created: list[str] = []
+    present: list[str] = []
+    for done, row in enumerate(_parents_first(rows)):
+        map_id = row["map_id"]
+        new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
+        (created if new else present).append(map_id)
+        if dry_run:
+            load_map(folder, row, listed)
+        elif new:
+            _commit(database, load_map(folder, row, listed), row["status_reason"], missing.get(map_id, ()))
+        told(done + 1, len(rows))
+    return Imported(
+        created=tuple(created),
+        present=tuple(present),
+        quarantined={map_id: missing[map_id] for map_id in created if map_id in missing},
+        version=database.poll_version(),
+        dry_run=dry_run,
+    )
+
+
+def _commit(database: Database, feature_map: FeatureMap, reason: str, missing: Sequence[str]) -> None:
+    if missing:
+        feature_map = feature_map.with_status("quarantined")
+        reason = f"what placed it is not here: {', '.join(missing)}"
+    if feature_map.status == RETIRED and not reason:
+        reason = "it was retired where the dataset is from"
+    database.commit_maps([feature_map], reasons={feature_map.map_id: reason})
+
+
+def _check_rows(folder: Path, rows: Sequence[Row], digests: Mapping[str, str]) -> None:
+    """Refuse what cannot be imported whole; `digests` are those of the maps that live in the database."""
+    twice = sorted(map_id for map_id, count in Counter(row["map_id"] for row in rows).items() if count > 1)
+    if twice:
+        raise ExportError(f"{folder}: expected different map ids, found {', '.join(twice)} more than once")
+    wrong = sorted({row["status"] for row in rows} - set(MAP_STATUSES))
+    if wrong:
+        raise ExportError(
+            f"{folder}: expected a status of {', '.join(MAP_STATUSES)}, found {', '.join(wrong)}"
+        )
+    others = [
+        r["map_id"] for r in rows if digests.get(r["map_id"], r["content_digest"]) != r["content_digest"]
+    ]
+    if others:
+        raise ExportError(
+            f"{folder}: the database has other maps of the ids {', '.join(others)} (placed anew, thinned, or "
+            "exported in part, by licence); nothing was imported; use an empty database, or retire those"
+        )
+
+
+def _missing_parents(rows: Sequence[Row], live: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, ...]]:
+    """Active maps of the dataset without a chain to an anchor, and the maps that they would need for one.
+
+    Args:
+        live: parents of the maps that live in the database, by id.
+    """
+    parents = dict(live) | {row["map_id"]: tuple(row["parents"]) for row in rows}
+    known = [{"map_id": m, "parents": p, "status": ACTIVE} for m, p in parents.items()]
+    standing = anchored(known)
+    found = {}
+    for row in rows:
+        if row["status"] == ACTIVE and row["map_id"] not in standing:
+            above, queue = set(), list(row["parents"])
+            while queue:
+                if (name := queue.pop()) not in above:
+                    above.add(name)
+                    queue += parents.get(name, ())
+            found[row["map_id"]] = tuple(sorted(above - parents.keys()))
+    return found
+
+
+def _parents_first(rows: Sequence[Row]) -> list[Row]:
+    """In the dataset's order, but for maps that come before their parents there."""
+    known = {row["map_id"]: row for row in rows}
+    ordered: dict[str, Row] = {}
+    for row in rows:
+        waiting = [row]
+        seen = set()
+        while waiting:
+            top = waiting[-1]
+            seen.add(top["map_id"])
+            before = [p for p in top["parents"] if p in known and p not in ordered and p not in seen]
+            if before:
+                waiting.append(known[before[0]])
+            else:
+                ordered.setdefault(top["map_id"], waiting.pop())
+    return list(ordered.values())

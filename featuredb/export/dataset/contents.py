@@ -1,0 +1,117 @@
+"""What has come into a dataset, gathered while its maps pass by one after the other."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Any
+
+import numpy as np
+
+from featuredb.export.dataset.footprint import Footprint, footprint_of
+from featuredb.export.dataset.layout import Partition
+from featuredb.export.selection import licence_of
+from featuredb.geo.utm import geodetic_from_utm
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap
+
+# Of each map, for the picture; more would not show.
+_DRAWN_POINTS = 1500
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapEntry:
+    """One map of the dataset, as its catalogue and its picture need it.
+
+    Attributes:
+        row: its columns in maps.parquet, but for the geometry.
+        licences: of its photos, by number of them; "" where nobody has said.
+        taken: when its first and its last photo were taken; None where no photo says so. Times without a zone
+            are taken for UTC.
+        points_lon_lat, cameras_lon_lat: (n, 2) WGS84 degrees, some of the points and all of the images.
+    """
+
+    row: dict[str, Any]
+    footprint: Footprint
+    partition: Partition
+    licences: Counter[str]
+    taken: tuple[datetime, datetime] | None
+    points_lon_lat: FloatArray
+    cameras_lon_lat: FloatArray
+
+    @property
+    def map_id(self) -> str:
+        return str(self.row["map_id"])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contents:
+    """All maps of the dataset, in its order, and the scans beside them (see `lidar_part`)."""
+
+    maps: list[MapEntry] = field(default_factory=list)
+    scans: list[dict[str, Any]] = field(default_factory=list)
+
+    def total(self, column: str) -> int:
+        """Sum of `images`, `points`, `observations` or `descriptors`."""
+        return sum(int(entry.row[column]) for entry in self.maps)
+
+    def count(self, column: str) -> Counter[str]:
+        """How many maps have each value of a column."""
+        return Counter(str(entry.row[column]) for entry in self.maps)
+
+    def licences(self) -> Counter[str]:
+        """How many photos have each licence."""
+        return sum((entry.licences for entry in self.maps), Counter[str]())
+
+    def partitions(self) -> list[Partition]:
+        return sorted({entry.partition for entry in self.maps})
+
+    def bbox(self) -> tuple[float, float, float, float]:
+        """West, south, east, north in degrees of everything: the narrowest way around the Earth."""
+        boxes = np.array([entry.footprint.bbox for entry in self.maps])
+        south, north = float(boxes[:, 1].min()), float(boxes[:, 3].max())
+        west, east = _around(boxes[:, 0], boxes[:, 2])
+        return west, south, east, north
+
+    def taken(self) -> tuple[datetime, datetime] | None:
+        """The first and the last time of all photos."""
+        known = [entry.taken for entry in self.maps if entry.taken is not None]
+        return (min(first for first, _ in known), max(last for _, last in known)) if known else None
+
+
+def entry_of(feature_map: FeatureMap, row: dict[str, Any]) -> MapEntry:
+    """What is kept of a map when it has passed."""
+    step = max(1, len(feature_map.points) // _DRAWN_POINTS)
+    centers = np.array([i.cam_from_local.center for i in feature_map.images], np.float64).reshape(-1, 3)
+    times = [_aware(i.capture_time) for i in feature_map.images if i.capture_time is not None]
+    return MapEntry(
+        row=row,
+        footprint=footprint_of(feature_map),
+        partition=Partition(feature_map.epsg, feature_map.height_datum),
+        licences=Counter(licence_of(image, feature_map) for image in feature_map.images),
+        taken=(min(times), max(times)) if times else None,
+        points_lon_lat=_lon_lat(geodetic_from_utm(feature_map.points.utm[::step], feature_map.epsg)),
+        cameras_lon_lat=_lon_lat(feature_map.frame.geodetic_from_enu(centers)),
+    )
+
+
+def _lon_lat(lat_lon_h: FloatArray) -> FloatArray:
+    return np.ascontiguousarray(lat_lon_h[:, 1::-1])
+
+
+def _aware(time: datetime) -> datetime:
+    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+
+
+def _around(west: FloatArray, east: FloatArray) -> tuple[float, float]:
+    """The shortest interval of longitude that holds all of these, which may cross the antimeridian."""
+    order = np.argsort(west, kind="stable")
+    starts = west[order]
+    ends = np.where(east[order] < starts, east[order] + 360.0, east[order])
+    reach = np.maximum.accumulate(ends)
+    # The largest gap between one interval's reach and the next one's start is what is left out.
+    gaps = np.append(starts[1:], starts[0] + 360.0) - reach
+    start = float(starts[(int(np.argmax(gaps)) + 1) % len(starts)])
+    width = float(((starts - start) % 360.0 + (ends - starts)).max())
+    if width >= 360.0:
+        return -180.0, 180.0
+    return start, start + width - (360.0 if start + width > 180.0 else 0.0)

@@ -1,0 +1,240 @@
+"""README.md of a dataset: every figure in it is computed from what was written."""
+
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from featuredb.export.dataset import columns, layout
+from featuredb.export.dataset.contents import Contents
+from featuredb.export.dataset.picture import places_of
+from featuredb.export.dataset.sums import SUMS
+from featuredb.geo.wkt import utm_projjson
+
+_WIDTH = 110
+_LONGEST_LIST = 200  # maps; maps.parquet has all of them
+_METHODS = {
+    "gps": "by the photos' GPS",
+    "lidar": "on a LiDAR scan",
+    "gcp": "by ground control points",
+    "map": "by other maps",
+}
+_TABLES = {
+    f"{layout.MAPS}: a row for each map": columns.MAPS,
+    f"{layout.CAMERAS}: a row for each camera of a map": columns.CAMERAS,
+    f"{layout.IMAGES}/*.parquet: a row for each image": columns.IMAGES,
+    f"{layout.POINTS}/*.parquet: a row for each 3D point": columns.POINTS,
+    f"{layout.OBSERVATIONS}/*.parquet: a row for each keypoint of a point": columns.OBSERVATIONS,
+}
+
+
+def write_datasheet(contents: Contents, description: Mapping[str, Any], folder: Path) -> None:
+    """Write README.md into the folder, whose data files are there already."""
+    sections = [
+        _title(contents, description),
+        _places(contents),
+        _licences(contents),
+        _made(contents, description),
+        _files(folder, contents),
+        _reading(contents),
+        *([_scans(contents)] if contents.scans else []),
+        "## Columns\n" + "\n".join(_columns(title, table) for title, table in _TABLES.items()),
+    ]
+    (folder / layout.DATASHEET).write_text("\n".join(sections), encoding="utf-8")
+
+
+def _title(contents: Contents, description: Mapping[str, Any]) -> str:
+    taken = contents.taken()
+    west, south, east, north = contents.bbox()
+    rows = [
+        ("maps", f"{len(contents.maps):,}"),
+        *(
+            (name, f"{contents.total(name):,}")
+            for name in ("images", "points", "observations", "descriptors")
+        ),
+        ("status of the maps", _counts(contents.count("status"))),
+        ("west, south, east, north", f"{west:.6f}, {south:.6f}, {east:.6f}, {north:.6f} (WGS84 degrees)"),
+        (
+            "photos taken",
+            "not known" if taken is None else f"{taken[0].isoformat()} to {taken[1].isoformat()}",
+        ),
+        ("snapshot", f"{description['snapshot']} of the database, {description['snapshot_time']}"),
+    ]
+    about = _prose(
+        "Sparse 3D maps made of photos, each placed on Earth, with the pose of every photo and SIFT "
+        f"descriptors to localise others by. Written by featuredb {description['featuredb']}, "
+        f"format {description['format']} {description['format_version']}."
+    )
+    title = f"# {_plain(description['name'])}\n\n{about}\n"
+    return f"{title}{_table(('', ''), rows)}\n![coverage]({layout.PICTURE})\n"
+
+
+def _places(contents: Contents) -> str:
+    rows = []
+    for partition in contents.partitions():
+        here = [e for e in contents.maps if e.partition == partition]
+        name = utm_projjson(partition.epsg, partition.height_datum)["name"]
+        counts = [f"{sum(int(e.row[c]) for e in here):,}" for c in ("images", "points")]
+        rows.append((f"EPSG:{partition.epsg}", partition.height_datum, name, f"{len(here):,}", *counts))
+    shown = contents.maps[:_LONGEST_LIST]
+    maps = [
+        (
+            *(_plain(e.map_id), _plain(e.row["name"]), e.row["status"], e.row["method"]),
+            *(f"EPSG:{e.partition.epsg}", e.partition.height_datum),
+            *(f"{e.row[c]:,}" for c in ("images", "points")),
+            ", ".join(f"{v:.5f}" for v in e.footprint.bbox),
+        )
+        for e in shown
+    ]
+    more = len(contents.maps) - len(shown)
+    return (
+        "## Where\n"
+        + _prose(
+            f"Places: {len(places_of(contents))}. Coordinates are UTM on WGS84, in metres; heights are "
+            "counted from what is named here, and nothing has been converted."
+        )
+        + "\n"
+        + _table(("zone", "heights", "CRS of the files", "maps", "images", "points"), rows)
+        + "\n"
+        + _table(
+            (
+                "map",
+                "name",
+                "status",
+                "placed",
+                "zone",
+                "heights",
+                "images",
+                "points",
+                "west, south, east, north",
+            ),
+            maps,
+        )
+        + (f"\nand {more:,} more, in `{layout.MAPS}`.\n" if more else "")
+    )
+
+
+def _licences(contents: Contents) -> str:
+    rows = [
+        (_plain(name) or "not stated", f"{count:,}") for name, count in sorted(contents.licences().items())
+    ]
+    return (
+        "## Licences\n"
+        + _prose(
+            "Of the photos that the maps were made of; owner, licence and capture time of each are in "
+            f"`{layout.ATTRIBUTION}`. The photos themselves are not part of the dataset."
+        )
+        + "\n"
+        + _table(("licence", "photos"), rows)
+    )
+
+
+def _made(contents: Contents, description: Mapping[str, Any]) -> str:
+    methods = [(_METHODS[name], f"{count:,}") for name, count in sorted(contents.count("method").items())]
+    extractors = [
+        (f"`{_plain(name)}`", f"{count:,}")
+        for name, count in sorted(contents.count("extractor_fingerprint").items())
+    ]
+    chosen = "; ".join(f"{k}: {_words(v)}" for k, v in description["selection"].items() if v)
+    return (
+        "## How it was made\n"
+        + _prose(
+            "SIFT keypoints were matched between photos, reconstructed by structure from motion and placed "
+            "on Earth. What was placed by other maps hangs on them (`parents`, `lineage`). Options, versions "
+            f"and the figures behind each placement are in `{layout.MAPS}` (`provenance`, "
+            "`placement_evidence`)."
+        )
+        + "\n"
+        + _table(("placed", "maps"), methods)
+        + "\n"
+        + _table(("descriptors of", "maps"), extractors)
+        + f"\nSelected of the snapshot: {chosen}.\n"
+    )
+
+
+def _files(folder: Path, contents: Contents) -> str:
+    def row(name: str, what: str) -> tuple[str, str, str]:
+        found = sorted(folder.glob(name))
+        return f"`{name}`", f"{sum(f.stat().st_size for f in found):,}", what
+
+    rows = [
+        row(layout.MAPS, "maps; GeoParquet 1.1, OGC:CRS84"),
+        row(layout.CAMERAS, "their cameras; Parquet"),
+        row(f"{layout.IMAGES}/*.parquet", "images, poses, covariances; GeoParquet 1.1"),
+        row(f"{layout.POINTS}/*.parquet", "3D points; GeoParquet 1.1"),
+        row(f"{layout.OBSERVATIONS}/*.parquet", "keypoints and descriptors; Parquet"),
+        *([row(f"{layout.LIDAR}/**/*.laz", "LiDAR tiles; LAZ 1.4")] if contents.scans else []),
+        row(layout.ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
+    ]
+    return (
+        "## Files\n"
+        + _table(("file", "bytes", "what"), rows)
+        + "\n"
+        + _prose(
+            f"`{layout.STAC}/collection.json` is a STAC 1.0 catalogue with an item for each map, "
+            f"`{layout.DESCRIPTION}` says what this is for programs, `{SUMS}` lists every file: "
+            f"`sha256sum --check {SUMS}`."
+        )
+        + "\n"
+        + _prose(
+            "Files of points and images are named by zone, height datum and number, since a GeoParquet "
+            "column has one reference system. A map is in one file of each table, which its row in "
+            f"`{layout.MAPS}` names."
+        )
+    )
+
+
+def _reading(contents: Contents) -> str:
+    example = next((e.row["points_file"] for e in contents.maps if e.row["points_file"]), None)
+    lines = ["## Reading it\n```\nfeaturedb import DB .              # back into a database, bit for bit"]
+    if example is not None:
+        lines.append(f"duckdb -c \"select map_id, count(*) from '{layout.POINTS}/*.parquet' group by 1\"")
+        lines.append(f"python -c \"import geopandas; print(geopandas.read_parquet('{example}'))\"")
+    return "\n".join(lines) + "\n```\n"
+
+
+def _scans(contents: Contents) -> str:
+    rows = [
+        (
+            *(_plain(s["scan_id"]), _plain(s["name"]), _plain(s["licence"]) or "not stated"),
+            *(f"EPSG:{s['epsg']}", s["height_datum"], f"{len(s['tiles']):,}"),
+            f"{sum(t['points'] for t in s['tiles']):,}",
+        )
+        for s in contents.scans
+    ]
+    return (
+        "## LiDAR\n"
+        + _prose(
+            "The tiles of 512 m that touch the maps, with coordinates rounded to a millimetre; "
+            f"`{layout.LIDAR}/scans.json` has all that is known of the scans."
+        )
+        + "\n"
+        + _table(("scan", "name", "licence", "zone", "heights", "tiles", "points"), rows)
+    )
+
+
+def _columns(title: str, table: columns.Columns) -> str:
+    rows = [(f"`{f.name}`", str(f.type), table.meaning[f.name]) for f in table.schema]
+    return f"\n### {title}\n" + _table(("column", "type", "what"), rows)
+
+
+def _prose(text: str) -> str:
+    return textwrap.fill(text, _WIDTH, break_long_words=False, break_on_hyphens=False) + "\n"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count:,} {name}" for name, count in sorted(counts.items()))
+
+
+def _words(value: Any) -> str:
+    return _plain(", ".join(map(str, value)) if isinstance(value, list) else str(value))
+
+
+def _plain(text: str) -> str:
+    """Names that people have given, so that they do not break a table."""
+    return " ".join(text.replace("|", "/").replace("`", "'").replace("<", "(").replace(">", ")").split())

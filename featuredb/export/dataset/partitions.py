@@ -1,0 +1,86 @@
+"""The files that hold the rows of all maps: by zone and height datum, cut before they grow too large."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from featuredb.export.dataset import columns
+from featuredb.export.dataset.frames import on_earth
+from featuredb.export.dataset.geoparquet import GeoFile, TableFile, point_columns
+from featuredb.export.dataset.layout import IMAGES, OBSERVATIONS, POINTS, Partition
+from featuredb.geo.wkt import utm_projjson
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.encode import EncodedMap
+
+COLUMNS = {POINTS: columns.POINTS, IMAGES: columns.IMAGES, OBSERVATIONS: columns.OBSERVATIONS}
+
+# Half a gigabyte of observations: few files, and none that a viewer or an upload chokes on.
+LARGEST_ROWS = 4_000_000
+
+
+class PartitionFiles:
+    """Writes maps one after the other; use it in a `with` block.
+
+    A file holds maps of one zone and height datum. A map is in one file of each table, and a row group has
+    rows of one map only, so that reading a map reads nothing else.
+    """
+
+    def __init__(self, folder: Path, largest_rows: int = LARGEST_ROWS) -> None:
+        """
+        Args:
+            largest_rows: a map after which a file has more begins the next one.
+        """
+        self._folder, self._largest_rows = folder, largest_rows
+        self._open: dict[tuple[str, Partition], TableFile] = {}
+        self._number: dict[tuple[str, Partition], int] = {}
+
+    def write(self, feature_map: FeatureMap, encoded: EncodedMap) -> dict[str, str | None]:
+        """Add a map's rows; the path in the folder of each table's file, None for a table without rows."""
+        partition = Partition(feature_map.epsg, feature_map.height_datum)
+        files: dict[str, str | None] = {}
+        for table in COLUMNS:
+            stored = encoded.children[table]
+            files[table] = self._append(table, partition, feature_map, stored) if len(stored) else None
+        return files
+
+    def _append(self, table: str, partition: Partition, feature_map: FeatureMap, stored: pa.Table) -> str:
+        key = (table, partition)
+        file = self._open.get(key)
+        if file is not None and file.rows >= self._largest_rows:
+            file.close()
+            file = None
+        if file is None:
+            number = self._number[key] = self._number.get(key, -1) + 1
+            file = self._open[key] = self._begin(table, partition, number)
+        more: dict[str, pa.Array] = {}
+        if isinstance(file, GeoFile):
+            utm = np.stack([stored[name].to_numpy() for name in ("easting", "northing", "height")], axis=1)
+            more["geometry"], more["bbox"] = point_columns(utm)
+            file.covers(["Point Z"], utm.min(axis=0), utm.max(axis=0))
+        if table == IMAGES:
+            more |= _on_earth(feature_map)
+        schema = COLUMNS[table].schema
+        arrays = [more[f.name] if f.name in more else stored[f.name].cast(f.type) for f in schema]
+        file.write(pa.Table.from_arrays(arrays, schema=schema))
+        return partition.file(table, self._number[key])
+
+    def _begin(self, table: str, partition: Partition, number: int) -> TableFile:
+        path, what = self._folder / partition.file(table, number), COLUMNS[table]
+        if table == OBSERVATIONS:
+            return TableFile(path, what.schema, what.repeating)
+        crs = utm_projjson(partition.epsg, partition.height_datum)
+        return GeoFile(path, what.schema, what.repeating, crs)
+
+    def __enter__(self) -> "PartitionFiles":
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        for file in self._open.values():
+            file.close()
+
+
+def _on_earth(feature_map: FeatureMap) -> dict[str, pa.Array]:
+    found = [on_earth(feature_map, image) for image in feature_map.images]
+    schema = columns.IMAGES.schema
+    return {name: pa.array([row[name] for row in found], type=schema.field(name).type) for name in found[0]}

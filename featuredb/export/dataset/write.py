@@ -1,0 +1,207 @@
+"""A selection of maps as one self-describing folder, made to be published.
+
+Coordinates are in GeoParquet 1.1, whose columns have one reference system each. Maps of a database may lie in
+several UTM zones and have heights of several datums, so the rows of points and images are parted by both,
+and a file says so in its name: `points/32632-egm2008-0000.parquet`. Its CRS is the compound of the two where
+the datum is known, the zone in three dimensions for ellipsoidal heights, and the plain zone for unknown
+ones. Nothing is
+transformed: easting, northing and height are the stored float64. `maps.parquet`, with an area for each map,
+is in longitude and latitude.
+
+The same maps, selection and libraries give the same bytes: times are those of the snapshot and the photos,
+and names follow from ids.
+"""
+
+import json
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from featuredb.export.dataset import layout
+from featuredb.export.dataset.attribution import AttributionFile
+from featuredb.export.dataset.columns import CAMERAS, MAPS
+from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
+from featuredb.export.dataset.datasheet import write_datasheet
+from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
+from featuredb.export.dataset.lidar_part import check_lidar, write_scans
+from featuredb.export.dataset.partitions import PartitionFiles
+from featuredb.export.dataset.picture import write_picture
+from featuredb.export.dataset.stac import check_stac, write_catalogue
+from featuredb.export.dataset.sums import write_sums
+from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import Lineage
+from featuredb.store.encode import encode_map
+from featuredb.store.snapshot import MapSummary
+
+# Rows of maps.parquet and cameras.parquet that are kept before they are written.
+_ROWS_AT_ONCE = 256
+
+
+def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
+    """Write the job's maps as a dataset to the folder `job.out`; whole, or nothing is there.
+
+    Args:
+        with_lidar: also the tiles of scans that touch the maps, as LAZ.
+
+    Raises:
+        ExportError: nothing is selected, or `job.out` is not free.
+        MissingExtraError: pystac (extra `dataset`) or, with `with_lidar`, laspy (extra `lidar`) is missing.
+        StoreError: the database cannot be read.
+    """
+    check_stac()
+    if with_lidar:
+        check_lidar()
+    with whole_or_nothing(job.out) as folder:
+        folder.mkdir()
+        contents = _write_maps(job, folder)
+        if with_lidar:
+            contents.scans.extend(write_scans(job, contents, folder))
+        description = _description(job, contents)
+        layout.write_json(folder / layout.DESCRIPTION, description)
+        write_picture(contents, folder / layout.PICTURE)
+        write_datasheet(contents, description, folder)
+        write_catalogue(contents, description, folder)
+        write_sums(folder)
+        size = size_of(folder)
+    return Exported(
+        maps=len(contents.maps),
+        images=contents.total("images"),
+        points=contents.total("points"),
+        observations=contents.total("observations"),
+        bytes=size,
+    )
+
+
+def _write_maps(job: ExportJob, folder: Path) -> Contents:
+    """All tables and the attribution, with one map in memory at a time."""
+    contents, lineages = Contents(), job.snapshot.lineages()
+    with (
+        PartitionFiles(folder) as files,
+        _RowFile(GeoFile(folder / layout.MAPS, MAPS.schema, MAPS.repeating, None), MAPS.schema) as maps,
+        _RowFile(TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()), CAMERAS.schema) as cameras,
+        AttributionFile(folder / layout.ATTRIBUTION) as attribution,
+    ):
+        for feature_map in job.maps():
+            row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
+            row["lineage"] = _lineage_json(lineages[feature_map.map_id])
+            entry = entry_of(feature_map, row)
+            contents.maps.append(entry)
+            maps.add(_area_columns(entry))
+            for camera in _camera_rows(feature_map):
+                cameras.add(camera)
+            attribution.add(feature_map)
+            del feature_map  # before the next one is loaded
+    return contents
+
+
+def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
+    """The map's images, points and observations; returns its row of maps.parquet, in part."""
+    encoded = encode_map(feature_map, "", summary.created_at)
+    encoded.row["status_reason"] = summary.status_reason
+    for table, path in files.write(feature_map, encoded).items():
+        encoded.row[f"{table}_file"] = path
+    return encoded.row
+
+
+class _RowFile:
+    """Rows one by one into a table's file, some hundred at a time."""
+
+    def __init__(self, file: TableFile, schema: pa.Schema) -> None:
+        self._file, self._schema = file, schema
+        self._rows: list[dict[str, Any]] = []
+
+    def add(self, row: dict[str, Any]) -> None:
+        self._rows.append(row)
+        if len(self._rows) == _ROWS_AT_ONCE:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._rows:
+            return
+        if isinstance(self._file, GeoFile):
+            boxes = np.array([list(row["bbox"].values()) for row in self._rows])
+            kinds = {row.pop("kind") for row in self._rows}
+            self._file.covers(kinds, boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0))
+        self._file.write(pa.Table.from_pylist(self._rows, schema=self._schema))
+        self._rows.clear()
+
+    def __enter__(self) -> "_RowFile":
+        return self
+
+    def __exit__(self, failed: object, *more: object) -> None:
+        if failed is None:
+            self._flush()
+        self._file.close()
+
+
+def _area_columns(entry: MapEntry) -> dict[str, Any]:
+    west, south, east, north = entry.footprint.bbox
+    if west > east:  # readers compare numbers: a box that begins in the east would never be found
+        west, east = -180.0, 180.0
+    return entry.row | {
+        "geometry": wkb_of(entry.footprint.geometry),
+        "kind": entry.footprint.geometry["type"],
+        "bbox": {"xmin": west, "ymin": south, "xmax": east, "ymax": north},
+    }
+
+
+def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
+    keys = feature_map.camera_keys or (None,) * len(feature_map.cameras)
+    return [
+        {
+            "map_id": feature_map.map_id,
+            "camera_id": number,
+            "model": camera.model,
+            "width": camera.width,
+            "height": camera.height,
+            "params": list(camera.params),
+            "key": key,
+        }
+        for number, (camera, key) in enumerate(zip(feature_map.cameras, keys, strict=True))
+    ]
+
+
+def _lineage_json(lineage: Lineage) -> str:
+    document = {
+        "chain": list(lineage.chain),
+        "anchors": list(lineage.anchors),
+        "steps": lineage.steps,
+        "drift_m": lineage.drift_m,
+        "budget_m": lineage.budget_m,
+    }
+    return json.dumps(document, sort_keys=True)
+
+
+def _description(job: ExportJob, contents: Contents) -> dict[str, Any]:
+    """What `dataset.json` says, and the datasheet and the catalogue are made of."""
+    chosen = job.selection
+    return {
+        "format": layout.FORMAT,
+        "format_version": layout.FORMAT_VERSION,
+        "name": job.database.name,
+        "snapshot": job.snapshot.version,
+        "snapshot_time": job.snapshot.timestamp.isoformat(),
+        "featuredb": _own_version(),
+        "selection": {
+            "maps": list(chosen.maps),
+            "statuses": list(chosen.statuses),
+            "bbox": None if chosen.bbox is None else list(chosen.bbox),
+            "where": chosen.where,
+            "licences": None if chosen.licences is None else list(chosen.licences),
+        },
+        **{name: contents.total(name) for name in ("images", "points", "observations", "descriptors")},
+        "maps": len(contents.maps),
+        "scans": len(contents.scans),
+        "bbox": list(contents.bbox()),
+    }
+
+
+def _own_version() -> str:
+    try:
+        return version("featuredb")
+    except PackageNotFoundError:
+        return "unknown"
