@@ -1,0 +1,56 @@
+"""Whose photos an export is made of: a table that goes with every export, as licences ask."""
+
+import csv
+import io
+from dataclasses import dataclass
+from urllib.parse import quote
+
+from featuredb.export.selection import licence_of
+from featuredb.maps.feature_map import FeatureMap
+
+ATTRIBUTION = "attribution.csv"
+_COLUMNS = ("map_id", "image", "sha256", "owner", "licence", "capture_time", "source")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attribution:
+    """One photo: who made it, under which licence it was given ("" where nobody has said)."""
+
+    map_id: str
+    image: str
+    sha256: str
+    owner: str
+    licence: str
+    capture_time: str
+    source: str
+
+
+def attribution_of(feature_map: FeatureMap) -> list[Attribution]:
+    """A row for every photo of the map, in the map's order."""
+    return [
+        Attribution(
+            map_id=feature_map.map_id,
+            image=image.name,
+            sha256=image.sha256,
+            owner=image.owner,
+            licence=licence_of(image, feature_map),
+            capture_time="" if image.capture_time is None else image.capture_time.isoformat(),
+            source=feature_map.source,
+        )
+        for image in feature_map.images
+    ]
+
+
+def attribution_csv(rows: list[Attribution]) -> str:
+    """The rows as CSV with a header."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    writer.writerows([getattr(row, name) for name in _COLUMNS] for row in rows)
+    return out.getvalue()
+
+
+def folder_name(map_id: str) -> str:
+    """A map's id as the name of a folder or file: what file systems may not like is percent-encoded."""
+    name = quote(map_id, safe=" +@,=")
+    return name.replace(".", "%2E", 1) if name.startswith(".") else name
