@@ -41,8 +41,23 @@ def _colmap(job: "ExportJob", args: argparse.Namespace) -> "Exported":
     return write_colmap(job, text=args.text)
 
 
+def _las(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.las import write_las_files
+
+    return write_las_files(job, compressed=args.format == "laz")
+
+
+def _ply(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.ply import write_ply_files
+
+    return write_ply_files(job)
+
+
 FORMATS: dict[str, Format] = {
     "colmap": Format(text="a folder for each map: model, database, place", write=_colmap, options=("text",)),
+    "las": Format(text="points, a LAS 1.4 file for each UTM zone and height datum", write=_las),
+    "laz": Format(text="the same, compressed", write=_las),
+    "ply": Format(text="points, a binary PLY file for each UTM zone and height datum", write=_ply),
 }
 # Options that belong to some formats only, with what they are when they are not given.
 _OWN: dict[str, Any] = {"text": False}
