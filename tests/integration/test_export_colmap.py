@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -171,6 +172,29 @@ def test_a_photo_is_localised_by_colmap_alone(tmp_path: Path, field_map: Feature
     assert np.linalg.norm(theirs.center - ours_center) < 0.02
     assert np.linalg.norm(theirs.center - truth.center) < 0.03
     assert theirs.angle_to_deg(ours.pose.cam_from_local @ here_from_area.inverse()) < 0.05
+
+
+def test_colmap_finds_its_own_features_in_the_exported_database(
+    tmp_path: Path, field_map: FeatureMap
+) -> None:
+    """The whole of it by COLMAP, SIFT and matching included: the stored descriptors are what it expects."""
+    write_colmap(job_of(tmp_path, field_map))
+    truth = field.view(-5.0, 3.0, 43.0, 7.0, 15.0)
+    photo = field.render(field.field_texture(1), truth, seed=78)
+    cv2.imwrite(str(tmp_path / "new.png"), photo)
+    program = Path(__file__).resolve().parents[2] / "tools" / "colmap_localise.py"
+    done = subprocess.run(
+        [sys.executable, "-I", str(program), str(tmp_path / "out" / "field%2F1"), str(tmp_path / "new.png")],
+        capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    theirs = Rigid3.from_matrix(json.loads(done.stdout)["cam_from_world"])
+    ours = localise(photo, LocaliseRequest(camera=field.CAMERA), [indexed(field_map)])
+    assert ours.pose is not None
+    map_from_area = field_map.frame.enu_from(ours.pose.frame)
+    center = map_from_area.act(ours.pose.cam_from_local.center)
+    assert np.linalg.norm(theirs.center - center) < 0.05
+    assert np.linalg.norm(theirs.center - truth.center) < 0.05
 
 
 def localised_by_colmap(folder: Path, xy: np.ndarray, descriptors: np.ndarray, camera: Any) -> Rigid3:
