@@ -53,11 +53,39 @@ def _ply(job: "ExportJob", args: argparse.Namespace) -> "Exported":
     return write_ply_files(job)
 
 
+def _geojson(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.geojson import write_geojson
+
+    return write_geojson(job)
+
+
+def _kml(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.kml import write_kml
+
+    return write_kml(job)
+
+
+def _geopose(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.geopose import write_geopose
+
+    return write_geopose(job)
+
+
+def _opensfm(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.opensfm import write_opensfm
+
+    return write_opensfm(job)
+
+
 FORMATS: dict[str, Format] = {
     "colmap": Format(text="a folder for each map: model, database, place", write=_colmap, options=("text",)),
     "las": Format(text="points, a LAS 1.4 file for each UTM zone and height datum", write=_las),
     "laz": Format(text="the same, compressed", write=_las),
     "ply": Format(text="points, a binary PLY file for each UTM zone and height datum", write=_ply),
+    "geojson": Format(text="positions and angles of photos, one file", write=_geojson),
+    "kml": Format(text="photos in space for Google Earth, one file", write=_kml),
+    "geopose": Format(text="OGC GeoPose, a file for each photo", write=_geopose),
+    "opensfm": Format(text="a folder for each map as OpenSfM and OpenDroneMap have it", write=_opensfm),
 }
 # Options that belong to some formats only, with what they are when they are not given.
 _OWN: dict[str, Any] = {"text": False}
