@@ -77,6 +77,14 @@ def _opensfm(job: "ExportJob", args: argparse.Namespace) -> "Exported":
     return write_opensfm(job)
 
 
+def _exif(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.exif import write_exif
+
+    if args.photos is None:
+        raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")
+    return write_exif(job, args.photos)
+
+
 FORMATS: dict[str, Format] = {
     "colmap": Format(text="a folder for each map: model, database, place", write=_colmap, options=("text",)),
     "las": Format(text="points, a LAS 1.4 file for each UTM zone and height datum", write=_las),
@@ -86,9 +94,12 @@ FORMATS: dict[str, Format] = {
     "kml": Format(text="photos in space for Google Earth, one file", write=_kml),
     "geopose": Format(text="OGC GeoPose, a file for each photo", write=_geopose),
     "opensfm": Format(text="a folder for each map as OpenSfM and OpenDroneMap have it", write=_opensfm),
+    "exif": Format(
+        text="copies of the photos with their pose in EXIF and XMP", write=_exif, options=("photos",)
+    ),
 }
 # Options that belong to some formats only, with what they are when they are not given.
-_OWN: dict[str, Any] = {"text": False}
+_OWN: dict[str, Any] = {"text": False, "photos": None}
 
 
 def register(subparsers: Any) -> None:
@@ -107,6 +118,9 @@ def register(subparsers: Any) -> None:
     add_selection_arguments(parser)
     add_as_of_argument(parser)
     parser.add_argument("--text", action="store_true", help="colmap: text files instead of binary ones")
+    parser.add_argument(
+        "--photos", type=Path, default=None, metavar="FOLDER", help="exif: where the originals are; only read"
+    )
     parser.add_argument("--json", action="store_true", help="the summary as JSON")
     parser.set_defaults(run=run_export)
 

@@ -4,9 +4,8 @@ import math
 from xml.sax.saxutils import escape
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.shots import Shot, shots_of
+from featuredb.export.shots import Shot, altitude_of, shots_of
 from featuredb.export.tally import Tally
-from featuredb.geo.datum import ellipsoidal_height
 from featuredb.maps.feature_map import FeatureMap
 
 _NEAR_M = 10.0  # where the picture hangs ahead of the camera
@@ -93,16 +92,6 @@ def field_of_view_deg(shot: Shot) -> tuple[float, float, float, float]:
     edges = (-cx / fx, (camera.width - cx) / fx, -(camera.height - cy) / fy, cy / fy)
     left, right, bottom, top = (math.degrees(math.atan(edge)) for edge in edges)
     return left, right, bottom, top
-
-
-def altitude_of(shot: Shot) -> tuple[float, str]:
-    """Altitude above sea level in metres, and what it is counted from."""
-    if shot.map_height_datum != "ellipsoidal":
-        return shot.map_height_m, shot.map_height_datum
-    geoid = ellipsoidal_height(shot.geopose.latitude_deg, shot.geopose.longitude_deg, 0.0, "egm96")
-    if geoid.height_m is None:
-        return shot.map_height_m, "ellipsoidal, the grid of EGM96 is not installed"
-    return shot.map_height_m - geoid.height_m, "egm96"
 
 
 def _told(feature_map: FeatureMap, shots: list[Shot]) -> str:

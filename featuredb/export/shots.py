@@ -86,6 +86,16 @@ def shots_of(feature_map: FeatureMap) -> Iterator[Shot]:
         )
 
 
+def altitude_of(shot: Shot) -> tuple[float, str]:
+    """Altitude above sea level in metres, and what it is counted from."""
+    if shot.map_height_datum != "ellipsoidal":
+        return shot.map_height_m, shot.map_height_datum
+    geoid = ellipsoidal_height(shot.geopose.latitude_deg, shot.geopose.longitude_deg, 0.0, "egm96")
+    if geoid.height_m is None:
+        return shot.map_height_m, "ellipsoidal, the grid of EGM96 is not installed"
+    return shot.map_height_m - geoid.height_m, "egm96"
+
+
 def pose_covariance(feature_map: FeatureMap, image: MapImage) -> FloatArray:
     """(6, 6) of a photo's pose on Earth, axes true east, north, up at the camera.
 
