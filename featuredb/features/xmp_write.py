@@ -43,7 +43,9 @@ def with_properties(xmp: bytes, properties: Mapping[str, str], stale: tuple[str,
 
 def _without(packet: bytes, name: bytes) -> bytes:
     name = re.escape(name)
-    packet = re.sub(rb"\s+" + name + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", b"", packet)
+    # One blank, not a run of them: packets are padded by kilobytes of blanks, and a search for a run would
+    # begin anew at each of them.
+    packet = re.sub(rb"\s" + name + rb"\s*=\s*(\"[^\"]*\"|'[^']*')", b"", packet)
     return re.sub(rb"<" + name + rb"(\s[^<>]*)?(/>|>[^<]*</" + name + rb"\s*>)\s*", b"", packet)
 
 
