@@ -71,6 +71,11 @@ def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
     document = read_georeference(folder)
     photos = photos_of_model(colmap, document, options)
     place = place_of(colmap, document, photos, options)
+    if place.height_datum is not None and options.height_datum not in ("unknown", place.height_datum):
+        raise IngestError(
+            f"--height-datum {options.height_datum}: {GEOREFERENCE} says that heights are "
+            f"{place.height_datum}"
+        )
     database = options.colmap_database or folder / DATABASE
     fingerprint = ExtractorOptions().fingerprint
     ours = document is not None and document["map"].get("extractor_fingerprint")

@@ -265,6 +265,8 @@ class TestRefusals:
 
     def test_a_broken_georeference(self, tmp_path: Path, field_map: FeatureMap) -> None:
         write_map(tmp_path / "a", field_map)
+        with pytest.raises(IngestError, match="says that heights are ellipsoidal"):
+            map_of_model(tmp_path / "a", ModelOptions(height_datum="egm96"))
         path = tmp_path / "a" / "georeference.json"
         document = json.loads(path.read_text())
         for change, message in (
