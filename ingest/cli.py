@@ -41,6 +41,22 @@ def register(subparsers: Any) -> None:
     _add_running(photos)
     photos.set_defaults(run=run_photos)
     _register_video(kinds)
+    _register_model(kinds)
+
+
+def _register_model(kinds: Any) -> None:
+    from featuredb.cli.common import add_database_argument
+    from ingest.models_in.command import add_model_arguments, run_model
+
+    model = kinds.add_parser(
+        "model",
+        help="a COLMAP model, geo-referenced or of photos with GPS",
+        description="Import a COLMAP model (binary or text) as a map: as `featuredb export --format colmap` "
+        "wrote it, aligned to a known place, or of photos with GPS.",
+    )
+    add_database_argument(model)
+    add_model_arguments(model)
+    model.set_defaults(run=run_model)
 
 
 def _register_video(kinds: Any) -> None:

@@ -260,7 +260,15 @@ def read_models(output: Path) -> list[Model]:
 
 def read_model(folder: Path) -> Model:
     """One model folder in COLMAP's binary format."""
-    reconstruction = pycolmap.Reconstruction(str(folder))
+    return model_of(pycolmap.Reconstruction(str(folder)))
+
+
+def model_of(reconstruction: Any) -> Model:
+    """The registered images and the points of a pycolmap.Reconstruction.
+
+    Raises:
+        InvalidValueError: a lens that maps do not have.
+    """
     image_ids = sorted(reconstruction.reg_image_ids())
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
     index_of_image = {image_id: k for k, image_id in enumerate(image_ids)}

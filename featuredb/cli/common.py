@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, date, datetime
 from decimal import Decimal
 from typing import Any
@@ -80,6 +80,20 @@ def hours(text: str) -> float:
     if not 0 <= value < 1e6:
         raise argparse.ArgumentTypeError(f"expected 0 <= hours < 1000000, found {text}")
     return value
+
+
+def progress_of_maps() -> Callable[[int, int], None]:
+    """Says on stderr how many maps are done, where a person looks on."""
+    return _on_terminal if sys.stderr.isatty() else _silent
+
+
+def _on_terminal(done: int, total: int) -> None:
+    sys.stderr.write(f"\r{done} of {total} maps" + ("\n" if done == total else ""))
+    sys.stderr.flush()
+
+
+def _silent(done: int, total: int) -> None:
+    pass
 
 
 def format_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

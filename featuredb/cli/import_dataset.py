@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from featuredb.cli.common import add_database_argument, open_database
+from featuredb.cli.common import add_database_argument, open_database, progress_of_maps
 
 
 def register(subparsers: Any) -> None:
@@ -24,7 +24,7 @@ def run_import(args: argparse.Namespace) -> int:
     """Import, and say what became of the maps."""
     from featuredb.export.dataset import import_dataset
 
-    done = import_dataset(open_database(args), args.folder, dry_run=args.dry_run)
+    done = import_dataset(open_database(args), args.folder, dry_run=args.dry_run, told=progress_of_maps())
     would = "would import" if done.dry_run else "imported"
     lines = [f"{would} {len(done.created)} maps; {len(done.present)} were there already"]
     for map_id, missing in done.quarantined.items():

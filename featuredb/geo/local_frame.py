@@ -116,6 +116,11 @@ class LocalFrame:
             translation=this_rotation @ (other_origin - this_origin),
         )
 
+    def ecef_from_enu(self) -> Rigid3:
+        """The transform from this frame to geocentric X, Y, Z of WGS84 in metres (EPSG:4978)."""
+        origin, enu_from_ecef = _origin_and_axes(self)
+        return Rigid3(rotation=enu_from_ecef.T, translation=origin)
+
     def true_enu_from_enu(self, point_enu: ArrayLike) -> FloatArray:
         """Rotation (3, 3) from this frame's axes to true east, north, up at a point (3,) of this frame.
 

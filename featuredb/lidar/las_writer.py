@@ -1,6 +1,5 @@
 """Writes points as LAS 1.4 or LAZ, with their reference system as WKT."""
 
-from datetime import date
 from pathlib import Path
 
 import laspy
@@ -49,49 +48,3 @@ def write_las(
         las.red, las.green, las.blue = rgb.T.astype(np.uint16) * _TO_16_BIT
     path.parent.mkdir(parents=True, exist_ok=True)
     las.write(path)
-
-
-class LasStream:
-    """A LAS 1.4 or LAZ file that is written piece by piece; use it in a `with` block.
-
-    A file without points is not left behind. The same points give the same bytes.
-    """
-
-    def __init__(self, path: Path, wkt: str, offset: FloatArray, *, rgb: bool, time: date) -> None:
-        """
-        Args:
-            path: a name in .laz is compressed.
-            offset: (3,) from which coordinates are counted in the file, near the points.
-            rgb: points have colours.
-            time: the file's day of creation, which LAS wants to know.
-        """
-        header = laspy.LasHeader(point_format=7 if rgb else 6, version="1.4")
-        header.scales, header.offsets = np.full(3, _STEP_M), offset
-        header.vlrs.append(WktCoordinateSystemVlr(wkt))
-        header.global_encoding.wkt = True
-        header.creation_date, header.generating_software = time, "featuredb"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._header = path, header
-        self._written = False
-        # One thread, since others would hand over their chunks as they come.
-        backend = laspy.LazBackend.Lazrs if path.suffix == ".laz" else None
-        self._writer = laspy.open(path, mode="w", header=header, laz_backend=backend)
-
-    def write(self, xyz: FloatArray, columns: Columns, rgb: NDArray[np.uint8] | None = None) -> None:
-        """Add points (n, 3), n > 0, with columns by laspy's names and colours (n, 3)."""
-        record = laspy.ScaleAwarePointRecord.zeros(len(xyz), header=self._header)
-        record.x, record.y, record.z = xyz.T
-        for name, value in columns.items():
-            record[name] = value
-        if rgb is not None:
-            record.red, record.green, record.blue = rgb.T.astype(np.uint16) * _TO_16_BIT
-        self._writer.write_points(record)
-        self._written = True
-
-    def __enter__(self) -> "LasStream":
-        return self
-
-    def __exit__(self, *failed: object) -> None:
-        self._writer.close()
-        if not self._written:
-            self._path.unlink()

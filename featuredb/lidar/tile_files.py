@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.geo.tiles import tile_bounds
 from featuredb.geo.wkt import utm_wkt
-from featuredb.lidar.las_writer import LasStream
+from featuredb.lidar.las_stream import LasStream
 from featuredb.store.database import Database
 from featuredb.store.scans import ScanSummary, count_points, scan_points
 
@@ -16,6 +16,7 @@ _UTM = ("easting", "northing", "height")
 _RGB = ("red", "green", "blue")
 # Read at once; some 60 bytes each.
 _LARGEST_PIECE = 2_000_000
+_STEP_M = 0.001  # what surveyors read off
 _SMALLEST_SIDE_M = 1.0  # a square metre is not cut further, however many points it has
 
 Box = tuple[float, float, float, float]
@@ -40,7 +41,8 @@ def write_tile(database: Database, scan: ScanSummary, tile: str, path: Path) -> 
     e0, n0, e1, n1 = tile_bounds(tile)
     offset = np.array([e0, n0, np.floor(scan.box.min_height)])
     written = 0
-    with LasStream(path, wkt, offset, rgb=bool(scan.colour), time=scan.created_at.date()) as stream:
+    day, colours = scan.created_at.date(), bool(scan.colour)
+    with LasStream(path, wkt, offset=offset, step_m=_STEP_M, day=day, rgb=colours) as stream:
         for level in range(len(scan.level_points)):
             for piece in _pieces(database, scan, level, (e0, n0, e1, n1)):
                 utm, columns, rgb = _points(database, scan, level, piece)

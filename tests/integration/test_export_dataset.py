@@ -107,10 +107,13 @@ def test_checksums_cover_every_file(folder: Path) -> None:
 def test_every_photo_is_attributed(database: Database, folder: Path) -> None:
     with (folder / "attribution.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["map_id", "image", "sha256", "owner", "licence", "capture_time"]
+    assert list(rows[0]) == ["map_id", "image", "sha256", "owner", "licence", "capture_time", "source"]
     snapshot = database.snapshot()
     expected = [
-        (m.map_id, i.name, i.sha256, i.owner, i.licence, i.capture_time.isoformat() if i.capture_time else "")
+        (
+            *(m.map_id, i.name, i.sha256, i.owner, i.licence),
+            *(i.capture_time.isoformat() if i.capture_time else "", m.source),
+        )
         for m in map(snapshot.load_map, (s.map_id for s in snapshot.maps(include_retired=True)))
         for i in m.images
     ]

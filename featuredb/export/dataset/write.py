@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from featuredb.export.attribution import AttributionFile
 from featuredb.export.dataset import layout
-from featuredb.export.dataset.attribution import AttributionFile
 from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet

@@ -1,0 +1,51 @@
+"""COLMAP: a folder for each map with the model, the database and the place on Earth."""
+
+from pathlib import Path
+
+from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
+from featuredb.export.colmap_model import (
+    image_names,
+    keypoint_rows,
+    reconstruction_of,
+    write_colmap_database,
+)
+from featuredb.export.georeference import GEOREFERENCE, georeference_text
+from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.tally import Tally
+from featuredb.maps.feature_map import FeatureMap
+
+MODEL_FOLDER = "sparse"
+DATABASE = "database.db"
+
+
+def write_colmap(job: ExportJob, *, text: bool = False) -> Exported:
+    """Write every selected map to `job.out`/<map>: sparse/, database.db, georeference.json, attribution.csv.
+
+    Args:
+        text: the model as COLMAP's text files instead of binary ones.
+
+    Raises:
+        ExportError: nothing is selected, or there is something at `job.out`.
+    """
+    tally = Tally()
+    with whole_or_nothing(job.out) as part:
+        part.mkdir()
+        for feature_map in job.maps():
+            write_map(part / folder_name(feature_map.map_id), feature_map, text=text)
+            tally.add(feature_map)
+        return tally.exported(part)
+
+
+def write_map(folder: Path, feature_map: FeatureMap, *, text: bool = False) -> None:
+    """One map to a new folder; see `write_colmap`."""
+    model = folder / MODEL_FOLDER
+    model.mkdir(parents=True)
+    keypoints, names = keypoint_rows(feature_map), image_names(feature_map)
+    reconstruction = reconstruction_of(feature_map, keypoints, names)
+    if text:
+        reconstruction.write_text(str(model))
+    else:
+        reconstruction.write_binary(str(model))
+    write_colmap_database(folder / DATABASE, feature_map, keypoints, names)
+    (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
+    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")

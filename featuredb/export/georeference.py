@@ -1,0 +1,132 @@
+"""Where a model in a local frame lies on Earth, as JSON that other programs, and the import, can use."""
+
+import json
+from typing import Any
+
+from featuredb.export.selection import licence_of
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import meridian_convergence_deg, point_scale, zone_of
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage
+
+GEOREFERENCE = "georeference.json"
+FORMAT = "featuredb georeference 1"
+
+_HOW = (
+    "Exactly: x_ecef = ecef_from_local (x, y, z, 1), or PROJ's utm.pipeline on x, y, z. Not by adding the "
+    "origin's easting and northing: grid north differs from true north by utm.meridian_convergence_deg, and "
+    "the grid's scale is utm.point_scale."
+)
+_HEIGHTS = (
+    "Heights enter the geometry as if they were ellipsoidal, and come out of the pipeline in the map's own "
+    "datum, crs.height_datum."
+)
+
+
+def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
+    """The place of a map's local frame, and what of the map a COLMAP model has no room for.
+
+    Args:
+        names: of the images as the model has them, in the map's order.
+    """
+    frame, epsg = feature_map.frame, feature_map.epsg
+    easting, northing, height = frame.utm_from_enu((0.0, 0.0, 0.0), epsg)
+    placement = feature_map.placement
+    return {
+        "format": FORMAT,
+        "frame": {
+            "axes": "x east, y north, z up at the origin; metres",
+            "origin": {
+                "latitude_deg": frame.latitude_deg,
+                "longitude_deg": frame.longitude_deg,
+                "height_m": frame.height_m,
+            },
+            "ecef_from_local": frame.ecef_from_enu().matrix().tolist(),
+        },
+        "crs": {
+            "geodetic_datum": "WGS84",
+            "ecef": "EPSG:4978",
+            "utm": f"EPSG:{epsg}",
+            "height_datum": feature_map.height_datum,
+            "heights": _HEIGHTS,
+        },
+        "utm": {
+            "epsg": epsg,
+            "origin": [float(easting), float(northing), float(height)],
+            "meridian_convergence_deg": meridian_convergence_deg(
+                frame.latitude_deg, frame.longitude_deg, epsg
+            ),
+            "point_scale": point_scale(frame.latitude_deg, frame.longitude_deg, epsg),
+            "pipeline": utm_pipeline(frame, epsg),
+            "how": _HOW,
+        },
+        "map": {
+            "id": feature_map.map_id,
+            "name": feature_map.name,
+            "status": feature_map.status,
+            "generation": feature_map.generation,
+            "parents": list(feature_map.parents),
+            "source": feature_map.source,
+            "licence": feature_map.licence,
+            "extractor_fingerprint": feature_map.extractor_fingerprint,
+            "camera_keys": list(feature_map.camera_keys),
+        },
+        "placement": {
+            "method": placement.method,
+            "residual_rms_m": placement.residual_rms_m,
+            "covariance": placement.covariance.tolist(),
+            "covariance_of": "left perturbation (log scale, rotation rad, translation m) in the local frame",
+        },
+        "images": [
+            _image(image, feature_map, name, seen)
+            for (image, seen), name in zip(_with_descriptors(feature_map), names, strict=True)
+        ],
+    }
+
+
+def georeference_text(feature_map: FeatureMap, names: list[str]) -> str:
+    """`georeference` as the text of its file."""
+    return json.dumps(georeference(feature_map, names), indent=1, allow_nan=False) + "\n"
+
+
+def utm_pipeline(frame: LocalFrame, epsg: int) -> str:
+    """PROJ's pipeline from the local frame's x, y, z to easting, northing, height."""
+    zone, hemisphere = zone_of(epsg)
+    south = " +south" if hemisphere == "south" else ""
+    return (
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={frame.longitude_deg!r} "
+        f"+lat_0={frame.latitude_deg!r} +h_0={frame.height_m!r} +step +inv +proj=cart +ellps=WGS84 "
+        f"+step +proj=utm +zone={zone}{south} +ellps=WGS84"
+    )
+
+
+def _with_descriptors(feature_map: FeatureMap) -> list[tuple[MapImage, int]]:
+    """Every image with how many of its keypoints carry a descriptor."""
+    seen = feature_map.observations
+    counts: dict[int, int] = {}
+    for image_id in seen.image_id[seen.has_descriptor].tolist():
+        counts[image_id] = counts.get(image_id, 0) + 1
+    return [(image, counts.get(image.image_id, 0)) for image in feature_map.images]
+
+
+def _image(image: MapImage, feature_map: FeatureMap, name: str, descriptors: int) -> dict[str, Any]:
+    return {
+        "image_id": image.image_id + 1,
+        "name": name,
+        "original_name": image.name,
+        "sha256": image.sha256,
+        "owner": image.owner,
+        "licence": licence_of(image, feature_map),
+        "capture_time": None if image.capture_time is None else image.capture_time.isoformat(),
+        "gps": None if image.gps is None else _gps(image.gps),
+        "descriptors": descriptors,
+    }
+
+
+def _gps(gps: GeoPrior) -> dict[str, Any]:
+    return {
+        "latitude_deg": gps.latitude_deg,
+        "longitude_deg": gps.longitude_deg,
+        "height_m": gps.height_m,
+        "sigma_horizontal_m": gps.sigma_horizontal_m,
+        "sigma_vertical_m": gps.sigma_vertical_m,
+    }

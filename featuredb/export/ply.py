@@ -1,0 +1,92 @@
+"""PLY: the maps' points, binary, a file for each UTM zone and height datum, in UTM with double precision."""
+
+import shutil
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.export.attribution import attribution_of
+from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.point_files import MapList, Zone, sigma_m, zones_of
+from featuredb.export.tally import Tally
+from featuredb.maps.feature_map import MapPoints
+
+ROW = np.dtype(
+    [
+        *((name, "<f8") for name in ("x", "y", "z")),
+        *((name, "u1") for name in ("red", "green", "blue")),
+        ("map_index", "<u4"),
+        ("track_length", "<i4"),
+        ("error_px", "<f4"),
+        ("sigma_m", "<f4"),
+    ]
+)
+_TYPES = {"<f8": "double", "<f4": "float", "|u1": "uchar", "<u4": "uint", "<i4": "int"}
+
+
+def write_ply_files(job: ExportJob) -> Exported:
+    """Write the points to `job.out`/epsgNNNNN_DATUM.ply, its .wkt beside it, maps.csv and attribution.csv.
+
+    Raises:
+        ExportError: nothing is selected, no points, or there is something at `job.out`.
+    """
+    zones, tally, maps = zones_of(job.summaries()), Tally(), MapList()
+    with whole_or_nothing(job.out) as part:
+        part.mkdir()
+        counts: dict[tuple[int, str], int] = {}
+        with ExitStack() as stack:
+            bodies: dict[tuple[int, str], IO[bytes]] = {}
+            for feature_map in job.maps():
+                key = feature_map.epsg, feature_map.height_datum
+                file = f"{zones[key].name}.ply" if key in zones else ""
+                index = maps.add(feature_map, attribution_of(feature_map), file)
+                tally.add(feature_map)
+                if not len(feature_map.points):
+                    continue
+                if key not in bodies:
+                    bodies[key] = stack.enter_context(_body(part, zones[key]).open("wb"))
+                counts[key] = counts.get(key, 0) + len(feature_map.points)
+                bodies[key].write(_rows(feature_map.points, index).tobytes())
+        for key, count in counts.items():
+            _finish(part, zones[key], count)
+        maps.write(part)
+        return tally.exported(part)
+
+
+def _body(folder: Path, zone: Zone) -> Path:
+    return folder / f"{zone.name}.body"
+
+
+def _rows(points: MapPoints, index: int) -> NDArray[np.void]:
+    rows = np.empty(len(points), dtype=ROW)
+    for column, name in enumerate(("x", "y", "z")):
+        rows[name] = points.utm[:, column]
+    for column, name in enumerate(("red", "green", "blue")):
+        rows[name] = points.rgb[:, column]
+    rows["map_index"], rows["track_length"] = index, points.track_length
+    rows["error_px"], rows["sigma_m"] = points.error_px, sigma_m(points)
+    return rows
+
+
+def _finish(folder: Path, zone: Zone, count: int) -> None:
+    """The header needs the number of points, which is known at the end: header, then body."""
+    properties = [f"property {_TYPES[ROW[name].str]} {name}" for name in ROW.names or ()]
+    header = "\n".join(
+        [
+            "ply",
+            "format binary_little_endian 1.0",
+            f"comment EPSG:{zone.epsg}: x easting, y northing; z height, {zone.height_datum}; metres",
+            f"element vertex {count}",
+            *properties,
+            "end_header\n",
+        ]
+    )
+    body = _body(folder, zone)
+    with (folder / f"{zone.name}.ply").open("wb") as out, body.open("rb") as rows:
+        out.write(header.encode("ascii"))
+        shutil.copyfileobj(rows, out)
+    body.unlink()
+    (folder / f"{zone.name}.wkt").write_text(zone.wkt + "\n", encoding="utf-8")

@@ -1,0 +1,111 @@
+"""What files of points have in common: one for each zone and height datum, and a list of the maps."""
+
+import csv
+import io
+from collections import defaultdict
+from dataclasses import dataclass
+from datetime import UTC, date
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ExportError
+from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_csv
+from featuredb.geo.wkt import utm_wkt
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap, MapPoints
+from featuredb.store.snapshot import MapSummary
+
+MAPS_TABLE = "maps.csv"
+_MAP_COLUMNS = ("map_index", "map_id", "name", "file", "epsg", "height_datum", "points", "licence")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Zone:
+    """The points that share a file: those of one UTM zone and one height datum.
+
+    Attributes:
+        low, high: corners of a box around all of them, easting, northing, height in metres.
+        day: when the newest of the maps was made.
+    """
+
+    epsg: int
+    height_datum: str
+    low: FloatArray
+    high: FloatArray
+    day: date
+
+    @property
+    def name(self) -> str:
+        """Of its file, without the ending."""
+        return f"epsg{self.epsg}_{self.height_datum}"
+
+    @property
+    def wkt(self) -> str:
+        """Its reference system."""
+        return utm_wkt(self.epsg, self.height_datum)
+
+
+def zones_of(maps: list[MapSummary]) -> dict[tuple[int, str], Zone]:
+    """The zones of maps that have points, by EPSG code and datum.
+
+    Raises:
+        ExportError: none of them has points.
+    """
+    groups: dict[tuple[int, str], list[MapSummary]] = defaultdict(list)
+    for summary in maps:
+        if summary.box is not None:
+            groups[summary.epsg, summary.height_datum].append(summary)
+    if not groups:
+        raise ExportError("expected maps with points, found none with any among those selected")
+    zones = {}
+    for (epsg, datum), members in sorted(groups.items()):
+        boxes = [m.box for m in members if m.box is not None]
+        zones[epsg, datum] = Zone(
+            epsg=epsg,
+            height_datum=datum,
+            low=np.min([(b.min_easting, b.min_northing, b.min_height) for b in boxes], axis=0),
+            high=np.max([(b.max_easting, b.max_northing, b.max_height) for b in boxes], axis=0),
+            day=max(m.created_at for m in members).astimezone(UTC).date(),
+        )
+    return zones
+
+
+def sigma_m(points: MapPoints) -> NDArray[np.float32]:
+    """(n,) standard deviation of each point in its worst direction, metres, relative to the map's gauge."""
+    c = points.covariance.astype(np.float64)
+    matrices = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    largest = np.linalg.eigvalsh(matrices)[:, -1] if len(c) else np.zeros(0)
+    return np.sqrt(np.maximum(largest, 0.0)).astype(np.float32)
+
+
+class MapList:
+    """The tables beside the points: which number is which map, and whose photos they are made of."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[object, ...]] = []
+        self._photos: list[Attribution] = []
+
+    def add(self, feature_map: FeatureMap, attribution: list[Attribution], file: str) -> int:
+        """The map's number, which its points carry."""
+        index = len(self._rows)
+        licences = "; ".join(sorted({row.licence for row in attribution if row.licence}))
+        points = len(feature_map.points)
+        self._rows.append(
+            (
+                *(index, feature_map.map_id, feature_map.name, file if points else ""),
+                *(feature_map.epsg, feature_map.height_datum, points, licences),
+            )
+        )
+        self._photos.extend(attribution)
+        return index
+
+    def write(self, folder: Path) -> None:
+        """Both tables as CSV."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(_MAP_COLUMNS)
+        writer.writerows(self._rows)
+        (folder / MAPS_TABLE).write_text(out.getvalue(), encoding="utf-8")
+        (folder / ATTRIBUTION).write_text(attribution_csv(self._photos), encoding="utf-8")

@@ -1,0 +1,68 @@
+"""Descriptors at keypoints that another program has found: this extractor's, in its own scale space."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError
+from featuredb.features.extractor import ExtractorOptions, rootsift_8bit
+
+_OCTAVE_LAYERS, _SIGMA = 3, 1.6  # of the extractor
+# The smallest diameter that the extractor finds: half a layer below the first, in the doubled image.
+_FINEST_PX = 0.999 * 2.0 * _SIGMA * 2.0 ** (0.5 / _OCTAVE_LAYERS - 1.0)
+
+
+def describe_at(
+    gray: NDArray[np.uint8],
+    xy: NDArray[np.float32],
+    scale: NDArray[np.float32],
+    angle: NDArray[np.float32],
+    options: ExtractorOptions | None = None,
+) -> NDArray[np.uint8]:
+    """RootSIFT (n, 128) at given keypoints.
+
+    The photo is shrunk as for extraction, unless a keypoint is finer than what then is left of it. A diameter
+    says in which octave and layer of the scale space the extractor would have found the keypoint; one that
+    lies between two layers may get the other one.
+
+    Args:
+        gray: (h, w) uint8.
+        xy: (n, 2) full-size pixels, centre of the top-left pixel (0.5, 0.5). scale: (n,) diameters in pixels.
+        angle: (n,) degrees clockwise from the x axis.
+
+    Raises:
+        ImageError: OpenCV does not describe all of them.
+    """
+    options = options or ExtractorOptions()
+    if not len(xy):
+        return np.zeros((0, 128), np.uint8)
+    height, width = gray.shape
+    factor = min(1.0, options.max_side_px / max(height, width))
+    if float(scale.min()) * factor < _FINEST_PX:
+        factor = 1.0
+    size = (max(1, round(width * factor)), max(1, round(height * factor)))
+    small = gray if factor == 1.0 else np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+    ratio = np.array([small.shape[1] / width, small.shape[0] / height])
+    places = xy.astype(np.float64) * ratio - 0.5
+    keypoints = [
+        cv2.KeyPoint(x, y, diameter, float(turn), 1.0, _octave(diameter), row)
+        for row, ((x, y), diameter, turn) in enumerate(
+            zip(places.tolist(), (scale.astype(np.float64) * ratio.mean()).tolist(), angle, strict=True)
+        )
+    ]
+    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
+    sift = create(nOctaveLayers=_OCTAVE_LAYERS, sigma=_SIGMA, enable_precise_upscale=True)
+    kept, raw = sift.compute(small, keypoints)
+    if [k.class_id for k in kept] != list(range(len(xy))):
+        raise ImageError(f"expected descriptors of {len(xy)} keypoints, OpenCV gives {len(kept)}")
+    return rootsift_8bit(raw)
+
+
+def _octave(diameter: float) -> int:
+    """OpenCV's packed octave and layer of a keypoint's diameter in pixels of the image that is described."""
+    step = round(_OCTAVE_LAYERS * float(np.log2(diameter / (2.0 * _SIGMA))))
+    octave = max((step - 1) // _OCTAVE_LAYERS, -1)  # -1 is the doubled image
+    layer = max(step - _OCTAVE_LAYERS * octave, 0)
+    return (octave & 255) | (layer << 8)

@@ -1,0 +1,1 @@
+"""Reconstructions of other programs become maps: read, placed, described, built; docs/export-formats.md."""

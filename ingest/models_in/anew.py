@@ -1,0 +1,38 @@
+"""Descriptors made anew of the photos, at the keypoints that the model was made of."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import overload
+
+from featuredb.errors import ImageError, IngestError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.features.describe import describe_at
+from ingest.extract import PhotoFeatures
+from ingest.models_in.colmap_database import ColmapFeatures
+
+
+class DescribedAnew(Sequence[PhotoFeatures]):
+    """Features of the model's images with this extractor's own descriptors; one photo in memory at a time."""
+
+    def __init__(self, stored: ColmapFeatures, photos: Sequence[Path]) -> None:
+        self._stored, self._photos = stored, tuple(photos)
+
+    @overload
+    def __getitem__(self, index: int) -> PhotoFeatures: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Sequence[PhotoFeatures]": ...
+
+    def __getitem__(self, index: int | slice) -> "PhotoFeatures | Sequence[PhotoFeatures]":
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        keypoints = self._stored.keypoints(index, with_descriptors=False)
+        try:
+            gray = decode_gray(self._photos[index].read_bytes(), INGEST_LIMITS)
+            descriptors = describe_at(gray, keypoints.xy, keypoints.scale, keypoints.angle)
+        except (ImageError, OSError) as error:
+            raise IngestError(f"{self._photos[index]}: cannot be described anew: {error}") from error
+        return self._stored.features(index, keypoints, descriptors, gray.shape)
+
+    def __len__(self) -> int:
+        return len(self._stored)

@@ -1,0 +1,138 @@
+"""`featuredb ingest model DB FOLDER`: a COLMAP model with its place on Earth as a map."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ingest.models_in.place import Stated
+
+
+def add_model_arguments(parser: argparse.ArgumentParser) -> None:
+    """What of the model is where."""
+    parser.add_argument(
+        "folder", metavar="FOLDER", type=Path, help="with the model itself, or with sparse/ or sparse/0"
+    )
+    parser.add_argument(
+        "--photos",
+        type=Path,
+        default=None,
+        metavar="FOLDER",
+        help="the model's photos under its names; needed unless georeference.json names them",
+    )
+    parser.add_argument(
+        "--database", type=Path, default=None, metavar="FILE", help="COLMAP's; default: FOLDER/database.db"
+    )
+    parser.add_argument(
+        "--descriptors",
+        choices=("stored", "photos"),
+        default=None,
+        help="those of COLMAP's database (default), or made anew of the photos at its keypoints",
+    )
+    place = parser.add_argument_group(
+        "where it lies; without these as georeference.json says, or by the GPS of its photos"
+    )
+    place.add_argument("--epsg", type=int, default=None, help="UTM zone, 326zz or 327zz")
+    place.add_argument(
+        "--origin",
+        type=_three,
+        default=None,
+        metavar="E,N,H",
+        help="of the model's coordinates in that zone, metres",
+    )
+    place.add_argument(
+        "--axes",
+        choices=("enu", "utm", "ecef"),
+        default="enu",
+        help="of the model: true east, north, up at the origin (default); UTM less the origin; geocentric",
+    )
+    place.add_argument(
+        "--sigma",
+        type=_two,
+        default=None,
+        metavar="M[,M]",
+        help="how well that is known, horizontally and vertically: one standard deviation in metres",
+    )
+    place.add_argument(
+        "--height-datum", default="unknown", help="ellipsoidal, egm96, egm2008, navd88 or unknown (default)"
+    )
+    parser.add_argument("--min-track-length", type=int, default=2, metavar="N", help="default: 2")
+    parser.add_argument("--name", default="", help="of the map; default: as it was called, or the folder's")
+    parser.add_argument("--owner", default="", help="of photos that do not name their own")
+    parser.add_argument("--licence", default="", help="of the photos, e.g. CC-BY-4.0")
+
+
+def run_model(args: argparse.Namespace) -> int:
+    """Import, commit, and say in a line what came of it."""
+    from featuredb.cli.common import storage_options
+    from featuredb.store import Database
+    from ingest.models_in.model_map import ModelOptions, map_of_model
+
+    options = ModelOptions(
+        photos=args.photos,
+        stated=_stated(args),
+        colmap_database=args.database,
+        descriptors=args.descriptors,
+        height_datum=args.height_datum,
+        min_track_length=args.min_track_length,
+        name=args.name,
+        owner=args.owner,
+        licence=args.licence,
+    )
+    made = map_of_model(args.folder, options)
+    database = Database.create(args.db, storage_options=storage_options(args))
+    result = database.commit_map(made)
+    state = "committed" if result.created else "there already"
+    if made.status != "active":
+        state += f", {made.status}: it was placed by maps that this database may not have"
+    sys.stdout.write(
+        f"map {made.map_id} ({made.name}): {state}, {len(made.images)} photos, {len(made.points)} points, "
+        f"{int(made.observations.has_descriptor.sum())} descriptors, EPSG:{made.epsg}, placed by "
+        f"{made.placement.method}, residual {made.placement.residual_rms_m:.2f} m\n"
+    )
+    return 0
+
+
+def _stated(args: argparse.Namespace) -> "Stated | None":
+    from featuredb.errors import InvalidValueError
+    from ingest.models_in.place import Stated
+
+    if args.epsg is None and args.origin is None and args.sigma is None and args.axes == "enu":
+        return None
+    origin = args.origin
+    if args.axes == "ecef":
+        if origin is not None:
+            raise InvalidValueError("--origin: geocentric coordinates (--axes ecef) have none; leave it out")
+        origin = (0.0, 0.0, 0.0)
+    missing = [
+        name
+        for name, value in (("--epsg", args.epsg), ("--origin", origin), ("--sigma", args.sigma))
+        if value is None
+    ]
+    if missing:
+        raise InvalidValueError(
+            f"expected --epsg, --origin and --sigma together, found no {' and no '.join(missing)}: a place "
+            "without its accuracy is no place for a map"
+        )
+    return Stated(axes=args.axes, epsg=args.epsg, origin=origin, sigma_m=args.sigma)
+
+
+def _three(text: str) -> tuple[float, float, float]:
+    try:
+        easting, northing, height = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(
+            f"expected easting,northing,height in metres, found {text!r}"
+        ) from error
+    return easting, northing, height
+
+
+def _two(text: str) -> tuple[float, float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected metres such as 0.1 or 0.1,0.2, found {text!r}") from error
+    if len(values) not in (1, 2) or not all(0 < v < 1e6 for v in values):
+        raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
+    return values[0], values[-1]

@@ -1,0 +1,217 @@
+"""Where a model lies on Earth: as its geo-reference says, as a person says, or by its photos' GPS."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from featuredb.errors import FeatureDbError, IngestError
+from featuredb.export.georeference import FORMAT, GEOREFERENCE
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geo.utm import utm_epsg, zone_of
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
+from ingest.colmap_bridge import Model
+from ingest.photo import Photo
+from ingest.reconstruction import gps_priors, local_frame_of
+from ingest.register.gps import GpsOptions, place_by_gps, similarity_closed_form
+
+Axes = Literal["enu", "utm", "ecef"]
+AXES: tuple[Axes, ...] = ("enu", "utm", "ecef")
+# A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the
+# best similarity leaves of that is below a thousandth of the model's size; more means that it is no UTM.
+_MOST_MISFIT = 1e-3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stated:
+    """What a person says of the model's coordinates.
+
+    Attributes:
+        axes: "enu": east, north, up in metres at `origin`; "utm": easting, northing, height, `origin` to be
+            added; "ecef": geocentric X, Y, Z.
+        epsg: UTM zone of `origin`, and of the map.
+        origin: (easting, northing, height) in metres.
+        sigma_m: how well the place is known, horizontally and vertically, one standard deviation.
+    """
+
+    axes: Axes
+    epsg: int
+    origin: tuple[float, float, float]
+    sigma_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Place:
+    """A model's place.
+
+    Attributes:
+        frame: local frame of the map. placement: leads there from the model's coordinates.
+        epsg: zone of the points.
+        height_datum: of all heights; None: whoever imports says.
+        status: quarantined where nothing in this database vouches for the place.
+    """
+
+    frame: LocalFrame
+    placement: Placement
+    epsg: int
+    height_datum: str | None = None
+    status: MapStatus = "active"
+
+
+def place_of_georeference(document: Mapping[str, Any]) -> Place:
+    """As our own export says. A map that other maps had placed comes in quarantine: they may not be here.
+
+    Raises:
+        IngestError: not such a document.
+    """
+    if document.get("format") != FORMAT:
+        raise IngestError(
+            f"{GEOREFERENCE}: expected the format {FORMAT!r}, found {document.get('format')!r}; move it "
+            "away and give --epsg, --origin and --sigma"
+        )
+    try:
+        origin, placed = document["frame"]["origin"], document["placement"]
+        method = placed["method"]
+        if method not in MAP_METHODS:
+            raise IngestError(
+                f"{GEOREFERENCE}: expected a method of {', '.join(MAP_METHODS)}, found {method!r}"
+            )
+        return Place(
+            frame=LocalFrame(
+                latitude_deg=origin["latitude_deg"],
+                longitude_deg=origin["longitude_deg"],
+                height_m=origin["height_m"],
+            ),
+            placement=Placement(
+                method=method,
+                local_from_sfm=Sim3.identity(),
+                covariance=np.array(placed["covariance"], dtype=np.float64),
+                residual_rms_m=float(placed["residual_rms_m"]),
+                evidence={"imported": GEOREFERENCE, "map_id": document["map"]["id"]},
+            ),
+            epsg=int(document["utm"]["epsg"]),
+            height_datum=str(document["crs"]["height_datum"]),
+            status="quarantined" if method == "map" else "active",
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, FeatureDbError):
+            raise
+        raise IngestError(f"{GEOREFERENCE}: broken or incomplete: {error!r}") from error
+
+
+def place_as_stated(model: Model, stated: Stated) -> Place:
+    """As a person says; the covariance is that of `sigma_m` over the cameras' spread.
+
+    Raises:
+        IngestError: coordinates that cannot be what they are said to be.
+        GeodesyError: no UTM zone, or an origin that is nowhere in it.
+    """
+    zone_of(stated.epsg)
+    centers = model.centers()
+    own_from_model, frame, residual_m = _to_local(model, centers, stated)
+    horizontal, vertical = stated.sigma_m
+    placed = own_from_model.act(centers)
+    radius = max(float(np.sqrt(((placed - placed.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
+    relative = horizontal / radius
+    covariance = np.diag([relative**2] * 4 + [horizontal**2, horizontal**2, vertical**2])
+    evidence = {"imported": f"axes {stated.axes}, EPSG:{stated.epsg}, origin {list(stated.origin)}"}
+    evidence["sigma_m"] = str(list(stated.sigma_m))
+    return Place(
+        frame=frame,
+        placement=Placement(
+            method="gcp",  # a person answers for it
+            local_from_sfm=own_from_model,
+            covariance=covariance,
+            residual_rms_m=residual_m,
+            evidence=evidence,
+        ),
+        epsg=stated.epsg,
+    )
+
+
+def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place:
+    """By the GPS of the photos, with the gates of an ordinary ingest.
+
+    Raises:
+        IngestError: the placement is refused, for the reason that it says.
+    """
+    frame = local_frame_of(photos)
+    positions, sigmas = gps_priors(photos, frame)
+    known = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
+    placed = place_by_gps(model.centers()[known], positions[known], sigmas[known], GpsOptions())
+    if (
+        placed.reason is not None
+        or placed.local_from_sfm is None
+        or placed.covariance is None
+        or frame is None
+    ):
+        raise IngestError(
+            f"the model cannot be placed by its photos' GPS: {placed.reason}: {placed.message}; give --epsg, "
+            "--origin and --sigma if its coordinates are known"
+        )
+    return Place(
+        frame=frame,
+        placement=Placement(
+            method="gps",
+            local_from_sfm=placed.local_from_sfm,
+            covariance=placed.covariance,
+            residual_rms_m=placed.residual_rms_m,
+            evidence=placed.figures,
+        ),
+        epsg=utm_epsg(frame.latitude_deg, frame.longitude_deg),
+    )
+
+
+def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, LocalFrame, float]:
+    """The similarity from the model to a local frame near its cameras, and what it leaves, metres RMS."""
+    middle = np.median(centers, axis=0)
+    if stated.axes == "enu":
+        there = _at(np.array(stated.origin), stated.epsg)
+        frame = _rounded(there.geodetic_from_enu(middle))
+        return _rigid(frame.enu_from(there).matrix()), frame, 0.0
+    if stated.axes == "ecef":
+        radius_km = float(np.linalg.norm(middle)) / 1000.0
+        if not 6300.0 < radius_km < 6400.0:
+            raise IngestError(
+                f"--axes ecef: expected cameras some 6,370 km from the Earth's centre, found {radius_km:.1f}"
+            )
+        somewhere = LocalFrame(latitude_deg=0.0, longitude_deg=0.0, height_m=0.0)
+        from_ecef = somewhere.ecef_from_enu().inverse()
+        frame = _rounded(somewhere.geodetic_from_enu(from_ecef.act(middle)))
+        return _rigid(frame.ecef_from_enu().inverse().matrix()), frame, 0.0
+    utm = np.concatenate([centers, model.xyz]) + stated.origin
+    frame = _rounded(_at(middle + stated.origin, stated.epsg))
+    enu = frame.enu_from_utm(utm, stated.epsg)
+    fitted = similarity_closed_form(utm - stated.origin, enu)
+    if fitted is None:
+        raise IngestError("--axes utm: the model's cameras and points coincide")
+    residual = np.sqrt(((fitted.act(utm - stated.origin) - enu) ** 2).sum(axis=1).mean())
+    size = float(np.sqrt(((enu - enu.mean(axis=0)) ** 2).sum(axis=1).mean()))
+    if residual > _MOST_MISFIT * max(size, 1.0):
+        raise IngestError(
+            f"--axes utm: with origin {stated.origin} the coordinates are no UTM of EPSG:{stated.epsg}: "
+            f"{residual:.2f} m are left over {size:.0f} m"
+        )
+    return fitted, frame, float(residual)
+
+
+def _at(utm: FloatArray, epsg: int) -> LocalFrame:
+    easting, northing, height = (float(v) for v in utm)
+    return LocalFrame.from_utm(easting, northing, height, epsg)
+
+
+def _rigid(matrix: FloatArray) -> Sim3:
+    return Sim3(scale=1.0, rotation=matrix[:3, :3], translation=matrix[:3, 3])
+
+
+def _rounded(lat_lon_h: Any) -> LocalFrame:
+    """A frame whose origin does not hang on the last digit."""
+    if isinstance(lat_lon_h, LocalFrame):
+        lat_lon_h = (lat_lon_h.latitude_deg, lat_lon_h.longitude_deg, lat_lon_h.height_m)
+    latitude, longitude, height = (float(v) for v in lat_lon_h)
+    return LocalFrame(
+        latitude_deg=round(latitude, 5), longitude_deg=round(longitude, 5), height_m=round(height)
+    )
