@@ -107,18 +107,29 @@ def test_both_places_become_maps(
     assert sorted(names, key=min) == sorted((south, north), key=min)
 
 
-def test_geotags_say_so_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Three of ten photos may see themselves elsewhere; that their geotags are there as well is enough."""
+def test_geotags_that_contradict_are_not_cut_away(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Three of ten photos say that they are elsewhere: the others are not taken as what is left of it.
+
+    What is left are photos that are localised one by one, and stand where each of them is.
+    """
+    real, reasons = grow_module.grow_component, []
+
+    def noted(*args: Any) -> Any:
+        outcome = real(*args)
+        reasons.append(outcome.reason if isinstance(outcome, Refused) else None)
+        return outcome
+
+    monkeypatch.setattr(grow_module, "grow_component", noted)
     with caplog.at_level(logging.INFO, "ingest.growth"):
         report = _grown(_groups(7, 3, tagged=True), tmp_path, GrowthOptions())
-    apart = [r.message for r in caplog.records if "at several places" in r.message]
-    assert len(apart) == 1
-    assert "3 of 3 positions contradict" in apart[0]
-    names = sorted((set(m.photos) for m in report.maps if m.map_id), key=len)
-    assert names == [{f"north-new-{k}.jpg" for k in range(3)}, {f"new-{k}.jpg" for k in range(7)}]
+    assert reasons == ["CONTRADICTS_GPS"]
+    assert not [r for r in caplog.records if "at several places" in r.message]
+    assert [len(m.photos) for m in report.maps if m.map_id] == [10]
 
 
-@pytest.mark.parametrize("reason", [*AT_SEVERAL_PLACES, "TOO_FEW_AGREE", "POORLY_HELD"])
+@pytest.mark.parametrize("reason", [*AT_SEVERAL_PLACES, "CONTRADICTS_GPS", "TOO_FEW_AGREE", "POORLY_HELD"])
 def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
