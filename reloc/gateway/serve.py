@@ -1,0 +1,67 @@
+"""Run the gateway until told to stop."""
+
+import logging
+import socket
+from collections.abc import Callable
+
+import uvicorn
+
+from featuredb.errors import FeatureDbError
+from reloc.gateway.app import create_app
+from reloc.gateway.options import GatewayOptions
+
+_BACKLOG = 128
+# Connections, idle ones with them; who needs more stands behind a proxy that holds them.
+_MAX_CONNECTIONS = 512
+_KEEP_ALIVE_S = 10
+
+
+class GatewayStartError(FeatureDbError):
+    """The gateway cannot listen."""
+
+
+def listen(options: GatewayOptions) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        GatewayStartError: the port is taken, or the host is not this machine's.
+    """
+    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+    try:
+        return socket.create_server((options.host, options.port), family=family, backlog=_BACKLOG)
+    except OSError as error:
+        raise GatewayStartError(
+            f"cannot listen on {options.host}:{options.port}: {error.strerror or error}; choose another with "
+            "--host and --port"
+        ) from error
+
+
+def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
+    """The server of the application, not yet running; `run(sockets=[listen(options)])` runs it."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            create_app(options),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            ws="none",
+            lifespan="on",
+            limit_concurrency=_MAX_CONNECTIONS,
+            timeout_keep_alive=_KEEP_ALIVE_S,
+            # What is in hand is answered first, and it takes no longer than this.
+            timeout_graceful_shutdown=int(options.timeout_s) + 1,
+        )
+    )
+
+
+def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url: None) -> None:
+    """Serve until SIGINT or SIGTERM; call from the main thread.
+
+    Raises:
+        GatewayStartError: cannot listen.
+    """
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    with listen(options) as bound:
+        host, port = bound.getsockname()[:2]
+        on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
+        uvicorn_server(options).run(sockets=[bound])
