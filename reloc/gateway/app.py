@@ -14,6 +14,7 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from featuredb.errors import InvalidValueError, ServiceError
@@ -184,7 +185,10 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
 
     @app.get(f"{prefix}/health", **openapi.HEALTH)
     async def health() -> Response:
-        status = await gateway.status()
+        try:
+            status = await gateway.status()
+        except ServiceError as error:  # whatever is wrong: who balances load must not send anybody here
+            return _json(ErrorBody(code=error.code, message=error.message), 503)
         return _json(openapi.Health(database=status.database, snapshot=status.snapshot, maps=status.maps))
 
     @app.get(f"{prefix}/metrics", **openapi.METRICS)
@@ -258,8 +262,6 @@ def _json(
 ) -> Response:
     if isinstance(content, BaseModel):
         return Response(content.model_dump_json(), status, headers, "application/json")
-    from starlette.responses import JSONResponse
-
     return JSONResponse(content, status, headers)
 
 

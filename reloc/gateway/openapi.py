@@ -178,7 +178,10 @@ MAPS: dict[str, Any] = {
 }
 HEALTH: dict[str, Any] = {
     "summary": "200 only if a server answers over Zenoh",
-    "responses": {200: {"model": Health}, **_responses(502, 503, 504)},
+    "responses": {
+        200: {"model": Health},
+        503: {"model": ErrorBody, "description": "NO_SERVER or any other code: none answers, and why"},
+    },
 }
 METRICS: dict[str, Any] = {
     "summary": "Prometheus' text format",

@@ -1,8 +1,10 @@
 """Run the gateway until told to stop."""
 
 import logging
+import signal
 import socket
 from collections.abc import Callable
+from types import FrameType
 
 import uvicorn
 
@@ -61,7 +63,17 @@ def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url:
         GatewayStartError: cannot listen.
     """
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    with listen(options) as bound:
-        host, port = bound.getsockname()[:2]
-        on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
-        uvicorn_server(options).run(sockets=[bound])
+    # uvicorn stops in good order on these, and then raises them again for whoever had them before.
+    before = {number: signal.signal(number, _stopped) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with listen(options) as bound:
+            host, port = bound.getsockname()[:2]
+            on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
+            uvicorn_server(options).run(sockets=[bound])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stopped(number: int, frame: FrameType | None) -> None:
+    """The end of the command is no failure of it."""

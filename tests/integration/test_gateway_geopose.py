@@ -201,7 +201,7 @@ def test_an_unknown_lens_is_none(served, params):
 
 
 def test_the_request_as_the_reference_client_makes_it_is_answered(served):
-    """Python's demo client: fractional time, RGBA32 for a JPEG, every sensor's list, empty optional fields."""
+    """Python's demo client: fractional time, RGBA32 for a JPEG, every sensor's list, empty fields."""
     request = geopose_request(
         photo(),
         imageFormat="RGBA32",
