@@ -2,6 +2,7 @@
 
 import re
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -163,10 +164,10 @@ def test_web_pages_may_ask_where_their_origin_is_allowed():
         assert "access-control-allow-origin" not in answer.headers
 
 
-def server_at(endpoint: str, snapshot: int) -> Server:
+def server_at(endpoint: str, snapshot: int, name: str = "town") -> Server:
     """A server at an endpoint that may have been another's a moment ago."""
     source = MemorySource(area_of(ScriptedLocaliser(snapshot)))
-    return Server.start(source, ServeOptions(listen=(endpoint,)), "town")
+    return Server.start(source, ServeOptions(listen=(endpoint,)), name)
 
 
 def test_a_server_that_restarts_is_found_again():
@@ -186,6 +187,28 @@ def test_a_server_that_restarts_is_found_again():
                     time.sleep(0.05)
                 assert gateway.get("/health").json()["snapshot"] == 2
                 assert gateway.post("/geopose", json=geopose_request(photo())).status_code == 200
+
+
+def test_a_server_that_comes_back_under_another_name_is_found_too():
+    """Who names no database asks the one that is there, and not the one that was."""
+    with running_server(ScriptedLocaliser(1), name="old") as first:
+        endpoint = first.endpoints[0]
+        with running_gateway(endpoint, connect_timeout_s=1.0) as gateway:
+            assert gateway.get("/health").json()["database"] == "old"
+            first.close()
+            assert gateway.get("/health").status_code == 503
+            with server_at(endpoint, 2, "new"):
+                end = time.monotonic() + 20.0
+                while gateway.get("/health").status_code != 200:
+                    assert time.monotonic() < end, "the gateway does not find the server again"
+                    time.sleep(0.05)
+                assert gateway.get("/health").json()["database"] == "new"
+                assert gateway.post("/geopose", json=geopose_request(photo())).status_code == 200
+
+
+def test_answers_do_not_wait_for_acknowledgements():
+    with listen(GatewayOptions(port=0)) as bound:
+        assert bound.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
 def test_photos_sent_while_the_server_restarts_are_answered_or_refused():
