@@ -12,10 +12,6 @@ from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayErr
 from reloc.gateway.options import GatewayOptions
 from reloc.wire import ErrorCode
 
-# Who sends too much hears so only if the connection is not reset while it still sends. So long the rest is
-# read and thrown away.
-_DRAIN_S = 2.0
-
 
 class Intake:
     """Admits requests with a body; all of its state belongs to the event loop."""
@@ -42,9 +38,7 @@ class Intake:
         self.in_flight += 1
         try:
             declared = request.headers.get("content-length", "")
-            if declared.isdigit() and int(declared) > self._options.max_body_bytes:
-                if "expect" not in request.headers:
-                    await body.drain()
+            if declared.isdecimal() and int(declared) > self._options.max_body_bytes:
                 raise body.too_large()
             yield Request(request.scope, body.receive)
         finally:
@@ -81,10 +75,8 @@ class _MeteredBody:
         message = await self._next()
         size = len(message.get("body", b""))
         if self.held_bytes + size > self._options.max_body_bytes:
-            await self.drain()
             raise self.too_large()
         if self._intake.buffered_bytes + size > self._options.max_buffered_bytes:
-            await self.drain()
             raise GatewayError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
         self.held_bytes += size
         self._intake.buffered_bytes += size
@@ -95,15 +87,6 @@ class _MeteredBody:
             ErrorCode.TOO_LARGE,
             f"body: expected at most {self._options.max_body_bytes} bytes; send a smaller picture",
         )
-
-    async def drain(self) -> None:
-        """Throw away what still comes, for a moment."""
-        try:
-            async with asyncio.timeout(_DRAIN_S):
-                while (await self._receive()).get("more_body", False):
-                    pass
-        except TimeoutError:
-            return
 
     async def _next(self) -> Message:
         try:

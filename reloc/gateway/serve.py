@@ -31,8 +31,8 @@ def listen(options: GatewayOptions) -> socket.socket:
     family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
     try:
         bound = socket.create_server((options.host, options.port), family=family, backlog=_BACKLOG)
-        # asyncio does so only for sockets that it makes itself. Without it the body of an answer waits for the
-        # acknowledgement of its head: 40 ms on a connection that is kept.
+        # asyncio does so only for sockets that it makes itself. Without it the body of an answer waits for
+        # the acknowledgement of its head: 40 ms on a connection that is kept.
         bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return bound
     except OSError as error:
@@ -51,6 +51,9 @@ def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
             access_log=False,
             server_header=False,
             ws="none",
+            # Who sends too much is answered at once; this one then reads on and throws away until the
+            # keep-alive is over, so that the answer is not lost by a reset.
+            http="h11",
             lifespan="on",
             limit_concurrency=_MAX_CONNECTIONS,
             timeout_keep_alive=_KEEP_ALIVE_S,
