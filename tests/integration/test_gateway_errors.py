@@ -295,13 +295,14 @@ def test_no_answer_in_time_is_504():
     with (
         running_server(ScriptedLocaliser(1, held)) as server,
         running_gateway(server.endpoints[0], timeout_s=0.6) as gateway,
+        running_gateway(server.endpoints[0], timeout_s=9.0) as patient,
     ):
         check(gateway.post("/geopose", json=geopose_request(photo())), 504, "DEADLINE")
         form = {"image": ("p.jpg", photo())}
         start = time.monotonic()
-        response = gateway.post("/localise", files=form, data={"options": '{"deadline_ms": 50}'})
+        response = patient.post("/localise", files=form, data={"options": '{"deadline_ms": 50}'})
         assert response.status_code == 504
-        assert time.monotonic() - start < 0.5
+        assert time.monotonic() - start < 7.0  # neither the gateway's 9 s nor the server's 8 s
         gate.open()
 
 
