@@ -1,0 +1,1 @@
+"""HTTP in front of a relocalisation server: OSCP GeoPoseProtocol and plain multipart, asked over Zenoh."""

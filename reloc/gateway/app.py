@@ -1,0 +1,308 @@
+"""The HTTP application: routes over a link to the server."""
+
+import asyncio
+import logging
+import time
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from typing import Any, TypeVar
+
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
+from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from featuredb.errors import InvalidValueError, ServiceError
+from reloc.client import Client
+from reloc.gateway import openapi
+from reloc.gateway.failures import (
+    METHOD_NOT_ALLOWED,
+    NOT_FOUND,
+    RETRY_AFTER_S,
+    ErrorBody,
+    status_of,
+)
+from reloc.gateway.geopose import NotLocalisedError, check_version, parse, question_of, response_of
+from reloc.gateway.intake import Intake
+from reloc.gateway.link import Link
+from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
+from reloc.gateway.metrics import Metrics
+from reloc.gateway.multipart import LocaliseForm, read_form
+from reloc.gateway.options import GatewayOptions
+from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
+from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
+from reloc.gateway.protocol import GeoPoseResp
+from reloc.wire import ErrorCode, LocaliseReply
+from reloc.wire_server import MapsReply, StatusReply
+
+logger = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+_STATUS_TIMEOUT_S = 2.0  # what a health check or a scrape may take; the server answers in a millisecond
+# The client gives up so much later than it tells the server to, so that the server's word arrives.
+_DEADLINE_MARGIN_S = 0.2
+# Of a client that has gone; nobody reads it, but the count of requests shows it (nginx's custom).
+_CLIENT_GONE = 499
+
+
+class Gateway:
+    """What the routes share: the link to the server, threads to wait in, limits and counters."""
+
+    def __init__(self, options: GatewayOptions) -> None:
+        self.options = options
+        self.link = Link(options)
+        self.intake = Intake(options)
+        self.metrics = Metrics()
+        self._photos = ThreadPoolExecutor(options.workers, thread_name_prefix="gateway-photo")
+        # Of their own, so that a server that is overrun still says how it is.
+        self._figures = ThreadPoolExecutor(2, thread_name_prefix="gateway-figures")
+
+    async def in_thread(self, work: Callable[[], _T]) -> _T:
+        """Run blocking work on a photo."""
+        return await asyncio.get_running_loop().run_in_executor(self._photos, work)
+
+    async def figures(self, question: Callable[[Client], _T]) -> _T:
+        """Ask the server for figures."""
+        return await asyncio.get_running_loop().run_in_executor(
+            self._figures, lambda: self.link.ask(question)
+        )
+
+    async def status(self) -> StatusReply:
+        return await self.figures(lambda client: client.status(timeout_s=_STATUS_TIMEOUT_S))
+
+    def close(self) -> None:
+        self._photos.shutdown(wait=True, cancel_futures=True)
+        self._figures.shutdown(wait=True, cancel_futures=True)
+        self.link.close()
+
+    def geopose(self, body: bytes) -> tuple[GeoPoseResp, str, str]:
+        """The answer, the datum of its height, the request id."""
+        request = parse(body)
+        asked = question_of(request, self.options)
+        reply = self.link.ask(
+            lambda client: client.localise(
+                asked.image,
+                asked.prior,
+                asked.camera,
+                timeout_s=self.options.timeout_s,
+                request_id=asked.request_id,
+            )
+        )
+        return *response_of(request, reply), reply.request_id
+
+    def localise(self, form: LocaliseForm) -> LocaliseReply:
+        """The server's reply as it is."""
+        timeout_s = self.options.timeout_s
+        if form.options.deadline_ms is not None:
+            deadline_s = form.options.deadline_ms / 1e3
+            timeout_s = min(timeout_s, deadline_s + min(deadline_s, _DEADLINE_MARGIN_S))
+        return self.link.ask(
+            lambda client: client.localise(
+                form.image,
+                form.prior,
+                form.camera,
+                timeout_s=timeout_s,
+                request_id=form.request_id,
+                inliers=form.options.inliers,
+                exif_prior=form.options.exif_prior,
+                maps=form.options.maps,
+            )
+        )
+
+
+def create_app(options: GatewayOptions) -> FastAPI:
+    """The application; it connects with the first question and closes with its lifespan."""
+    gateway = Gateway(options)
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        yield
+        await asyncio.get_running_loop().run_in_executor(None, gateway.close)
+
+    # Pages of documentation would load scripts from elsewhere; /openapi.json is what tools read.
+    app = FastAPI(
+        title="featuredb gateway",
+        version=GEOPOSE_VERSION,
+        description=openapi.DESCRIPTION,
+        docs_url=None,
+        redoc_url=None,
+        openapi_url=f"{options.prefix}/openapi.json",
+        lifespan=lifespan,
+    )
+    app.state.gateway = gateway
+    paths = _add_routes(app, gateway)
+    _add_failures(app)
+    if options.cors_origins:
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=list(options.cors_origins),
+            allow_methods=["GET", "POST"],
+            allow_headers=["*"],
+            expose_headers=["Featuredb-Height-Datum", "Featuredb-Request-Id", "Retry-After"],
+        )
+    app.add_middleware(_Observed, metrics=gateway.metrics, paths=paths)
+    openapi.install(app)
+    return app
+
+
+def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
+    """The routes; returns their paths."""
+    prefix = gateway.options.prefix
+
+    @app.post(f"{prefix}/geopose", **openapi.GEOPOSE)
+    async def geopose(request: Request) -> Response:
+        versioned = check_version(request.headers.get("accept", ""))
+        async with gateway.intake.admitted(request, "application/json") as bounded:
+            body = await bounded.body()
+            answer, datum, request_id = await gateway.in_thread(lambda: gateway.geopose(body))
+        return Response(
+            answer.model_dump_json(),
+            media_type=f"{GEOPOSE_TYPE}; version={GEOPOSE_VERSION}" if versioned else "application/json",
+            headers={"Featuredb-Height-Datum": datum, "Featuredb-Request-Id": request_id},
+        )
+
+    @app.get(f"{prefix}/geopose", **openapi.RUNNING)
+    async def running() -> Response:
+        return _json({"status": "running"})  # as the protocol's reference servers answer
+
+    @app.post(f"{prefix}/localise", **openapi.LOCALISE)
+    async def localise(request: Request) -> Response:
+        async with gateway.intake.admitted(request, "multipart/form-data") as bounded:
+            form = await read_form(bounded, gateway.options)
+            reply = await gateway.in_thread(lambda: gateway.localise(form))
+        return _json(reply)
+
+    @app.get(f"{prefix}/maps", **openapi.MAPS)
+    async def maps() -> Response:
+        answer: MapsReply = await gateway.figures(lambda client: client.maps(timeout_s=_STATUS_TIMEOUT_S))
+        return _json(answer)
+
+    @app.get(f"{prefix}/health", **openapi.HEALTH)
+    async def health() -> Response:
+        try:
+            status = await gateway.status()
+        except ServiceError as error:  # whatever is wrong: who balances load must not send anybody here
+            return _json(ErrorBody(code=error.code, message=error.message), 503)
+        return _json(openapi.Health(database=status.database, snapshot=status.snapshot, maps=status.maps))
+
+    @app.get(f"{prefix}/metrics", **openapi.METRICS)
+    async def metrics() -> Response:
+        status: StatusReply | None = None
+        try:
+            status = await gateway.status()
+        except ServiceError as error:
+            logger.info("no figures of the server: %s", error)
+        text = gateway.metrics.text(gateway.intake.in_flight, gateway.link.sessions, status)
+        return Response(text, media_type=METRICS_TYPE)
+
+    return frozenset(f"{prefix}/{leaf}" for leaf in ("geopose", "localise", "maps", "health", "metrics"))
+
+
+def _add_failures(app: FastAPI) -> None:
+    """Every way to fail ends in an ErrorBody; what went wrong inside stays in the log."""
+
+    @app.exception_handler(NotLocalisedError)
+    async def not_localised(request: Request, error: NotLocalisedError) -> Response:
+        return _failed(
+            ErrorBody(
+                code=error.code,
+                message=error.message,
+                request_id=error.request_id,
+                reason=error.reply.reason,
+                id=error.geopose_id,
+            )
+        )
+
+    @app.exception_handler(ServiceError)
+    async def service_error(request: Request, error: ServiceError) -> Response:
+        return _failed(ErrorBody(code=error.code, message=error.message, request_id=error.request_id))
+
+    @app.exception_handler(InvalidValueError)
+    async def invalid(request: Request, error: InvalidValueError) -> Response:
+        return _failed(ErrorBody(code=ErrorCode.BAD_REQUEST, message=str(error)))
+
+    @app.exception_handler(RequestValidationError)
+    async def unreadable(request: Request, error: RequestValidationError) -> Response:
+        return _failed(ErrorBody(code=ErrorCode.BAD_REQUEST, message="the request cannot be read"))
+
+    @app.exception_handler(HTTPException)
+    async def http_error(request: Request, error: HTTPException) -> Response:
+        code = {404: NOT_FOUND, 405: METHOD_NOT_ALLOWED}.get(error.status_code, ErrorCode.BAD_REQUEST.value)
+        body = ErrorBody(code=code, message=f"{request.method} {request.url.path[:200]}: {error.detail}")
+        return _failed(body, dict(error.headers or {}))
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> Response:
+        return Response(status_code=_CLIENT_GONE)
+
+    @app.exception_handler(Exception)
+    async def defect(request: Request, error: Exception) -> Response:
+        # Starlette raises it again after this answer, so that uvicorn's log has the trace.
+        body = ErrorBody(
+            code=ErrorCode.INTERNAL, message="the gateway failed on this request; its log says why"
+        )
+        return Response(body.model_dump_json(), 500, media_type="application/json")
+
+
+def _failed(body: ErrorBody, headers: dict[str, str] | None = None) -> Response:
+    headers = headers or {}
+    if body.code in RETRY_AFTER_S:
+        headers["Retry-After"] = str(RETRY_AFTER_S[body.code])
+    return _json(body, status_of(body.code), headers)
+
+
+def _json(
+    content: BaseModel | dict[str, Any], status: int = 200, headers: dict[str, str] | None = None
+) -> Response:
+    if isinstance(content, BaseModel):
+        return Response(content.model_dump_json(), status, headers, "application/json")
+    return JSONResponse(content, status, headers)
+
+
+class _Observed:
+    """Counts what every request was answered with, and how long it took."""
+
+    def __init__(self, app: ASGIApp, metrics: Metrics, paths: frozenset[str]) -> None:
+        self._app = app
+        self._metrics = metrics
+        self._paths = paths
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        start, status = time.perf_counter(), 500
+
+        async def note(message: Message) -> None:
+            nonlocal status
+            if message["type"] == "http.response.start":
+                status = message["status"]
+            await send(message)
+
+        try:
+            await self._app(scope, receive, note)
+        finally:
+            # Paths that do not exist are one: who asks for many cannot make many counters.
+            path = scope["path"] if scope["path"] in self._paths else "other"
+            seconds = time.perf_counter() - start
+            self._metrics.observe(path, status, seconds)
+            logger.info(
+                "%s %s %s",
+                scope["method"],
+                path,
+                status,
+                extra={
+                    "fields": {
+                        "event": "http",
+                        "route": path,
+                        "status": status,
+                        "ms": round(seconds * 1e3, 1),
+                    }
+                },
+            )

@@ -1,0 +1,93 @@
+"""Subcommand `gateway`; what it needs is imported when it runs."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from featuredb.errors import MissingExtraError
+
+_MODULES = ("fastapi", "uvicorn", "python_multipart")
+
+
+def register(subparsers: Any) -> None:
+    """Add the subcommand to the parser of `featuredb`."""
+    gateway = subparsers.add_parser(
+        "gateway",
+        help="answer HTTP by asking a server over Zenoh",
+        description="OSCP GeoPoseProtocol v2 and plain multipart over HTTP, answered by `featuredb serve`.",
+    )
+    gateway.add_argument(
+        "--connect",
+        default="tcp/127.0.0.1:7447",
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of the server; default tcp/127.0.0.1:7447",
+    )
+    gateway.add_argument(
+        "--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect"
+    )
+    gateway.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    gateway.add_argument("--host", default="127.0.0.1", help="address to listen on; default 127.0.0.1")
+    gateway.add_argument("--port", type=int, default=8080, help="default 8080; 0 takes a free one")
+    gateway.add_argument(
+        "--prefix", default="", metavar="/PATH", help="stands before every path, such as /vps"
+    )
+    gateway.add_argument(
+        "--timeout", type=float, default=10.0, metavar="SECONDS", help="per photo; default 10"
+    )
+    gateway.add_argument(
+        "--max-in-flight", type=int, default=16, metavar="N", help="photos in hand at a time; default 16"
+    )
+    gateway.add_argument(
+        "--cors-origin",
+        action="append",
+        default=[],
+        metavar="ORIGIN",
+        help="web pages of this origin may ask; may be repeated; * is all",
+    )
+    gateway.set_defaults(run=_run)
+
+
+def require_extra() -> None:
+    """Refuse early where the extra is not installed.
+
+    Raises:
+        MissingExtraError: with the name of the extra.
+    """
+    import importlib
+
+    for name in _MODULES:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            raise MissingExtraError(
+                f"the HTTP gateway needs the package {name}, which is not installed: "
+                "pip install 'featuredb[http]'"
+            ) from error
+
+
+def _run(args: argparse.Namespace) -> int:
+    require_extra()
+    from reloc.gateway.options import GatewayOptions
+    from reloc.gateway.serve import serve
+    from reloc.service.logs import log_to
+
+    options = GatewayOptions(
+        connect=args.connect,
+        config_path=args.config,
+        database=args.database,
+        host=args.host,
+        port=args.port,
+        prefix=args.prefix,
+        timeout_s=args.timeout,
+        max_in_flight=args.max_in_flight,
+        cors_origins=tuple(args.cors_origin),
+    )
+    log_to(sys.stderr)
+
+    def announce(url: str) -> None:
+        sys.stdout.write(f"listening on {url}, asking {args.config or args.connect}; stop with Ctrl-C\n")
+        sys.stdout.flush()
+
+    serve(options, on_ready=announce)
+    return 0

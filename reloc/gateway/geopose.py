@@ -1,0 +1,257 @@
+"""From a GeoPoseReq to a question for the server, and from its answer to a GeoPoseResp.
+
+The answer's body axes are those of this project's GeoPose, x forward, y left, z up, so that a level camera
+looking true east has the identity. The protocol's text names none; its reference server (OpenVPS) and its web
+client (spARcl, `convertAugmentedCityCam2WebQuat`) use these.
+"""
+
+import base64
+import binascii
+import io
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+from pydantic import ValidationError
+
+from featuredb.geo.datum import HEIGHT_DATUMS, ellipsoidal_height
+from reloc.gateway.failures import NOT_ACCEPTABLE, NOT_LOCALISED, GatewayError
+from reloc.gateway.options import GatewayOptions
+from reloc.gateway.protocol import (
+    MEDIA_TYPE,
+    CameraReading,
+    GeolocationReading,
+    GeoPose,
+    GeoPoseAccuracy,
+    GeoPoseReq,
+    GeoPoseResp,
+    Position,
+    Quaternion,
+)
+from reloc.wire import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
+
+# The W3C's accuracy holds 95 % of the errors; so many sigmas of one axis does a circle that holds them have.
+_SIGMAS_OF_95 = math.sqrt(-2.0 * math.log(0.05))
+# A camera may have moved since a prior pose: by car in a town. After five minutes it says nothing of use.
+_PRIOR_POSE_SPEED_M_S = 15.0
+_PRIOR_POSE_AGE_S = 300.0
+_CHANNELS = {"RGBA32": 4, "GRAY8": 1}
+_FILE_BEGINNINGS = (b"\xff\xd8\xff", b"\x89PNG\r\n", b"RIFF", b"II*\x00", b"MM\x00*", b"BM")
+_VERSION = re.compile(r";\s*version\s*=\s*\"?(\d{1,4})")
+
+
+class NotLocalisedError(GatewayError):
+    """The photo's place is not known: `reply` says why."""
+
+    def __init__(self, reply: LocaliseReply, geopose_id: str) -> None:
+        super().__init__(NOT_LOCALISED, f"{reply.reason}: {reply.detail}", reply.request_id)
+        self.reply = reply
+        self.geopose_id = geopose_id
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What the server is asked: `reloc.client.Client.localise`'s arguments."""
+
+    image: bytes
+    prior: PriorRequest | None
+    camera: CameraRequest | None
+    request_id: str | None
+
+
+def parse(body: bytes) -> GeoPoseReq:
+    """Read a request.
+
+    Raises:
+        GatewayError: BAD_REQUEST with the fields.
+    """
+    try:
+        return GeoPoseReq.model_validate_json(body)
+    except ValidationError as error:
+        # Without the values found: a missing id would print the whole request with its picture.
+        items = error.errors(include_url=False, include_input=False, include_context=False)[:3]
+        said = "; ".join(f"{'.'.join(map(str, item['loc'])) or 'body'}: {item['msg']}" for item in items)
+        raise GatewayError(ErrorCode.BAD_REQUEST, said) from error
+
+
+def check_version(accept: str) -> bool:
+    """Whether the client asks for the protocol's media type; the header is that of HTTP, "" without one.
+
+    Raises:
+        GatewayError: NOT_ACCEPTABLE, for another version than 2.
+    """
+    found = [part for part in accept.lower().split(",") if part.strip().startswith(MEDIA_TYPE)]
+    for part in found:
+        version = _VERSION.search(part)
+        if version is None or int(version[1]) == 2:
+            return True
+    if found:
+        raise GatewayError(
+            NOT_ACCEPTABLE, f"Accept: expected {MEDIA_TYPE}; version=2.0, found {accept[:100]!r}"
+        )
+    return False
+
+
+def question_of(request: GeoPoseReq, options: GatewayOptions) -> Question:
+    """What to ask the server.
+
+    Raises:
+        GatewayError: BAD_REQUEST, BAD_IMAGE, TOO_LARGE.
+    """
+    readings = request.sensorReadings.cameraReadings
+    pictures = [reading for reading in readings if reading.imageFormat.upper() != "DEPTH"]
+    if not pictures:
+        raise GatewayError(
+            ErrorCode.BAD_REQUEST,
+            "sensorReadings.cameraReadings: expected a picture that is no depth image, found none",
+        )
+    picture = pictures[0]
+    if picture.imageOrientation is not None and picture.imageOrientation.mirrored:
+        raise GatewayError(
+            ErrorCode.BAD_REQUEST,
+            "imageOrientation.mirrored: expected false; mirror the picture back, since no camera sees it so",
+        )
+    size = _size(picture)
+    return Question(
+        image=_image_file(_decoded(picture.imageBytes, options.max_image_bytes), picture, size),
+        prior=_prior(request, picture, options),
+        camera=_camera(picture, size),
+        request_id=_wire_id(request.id),
+    )
+
+
+def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp, str]:
+    """The answer, and the datum of its height: `ellipsoidal` as GeoPose wants it wherever it can be had.
+
+    Raises:
+        NotLocalisedError: it is none.
+    """
+    if reply.position is None or reply.quaternion is None or reply.covariance is None:
+        raise NotLocalisedError(reply, request.id)
+    position, turn = reply.position, reply.quaternion
+    height, datum = position.h, reply.height_datum or "unknown"
+    if datum in HEIGHT_DATUMS:
+        # Without the geoid's grid the height stays what it is, and the answer says so.
+        converted = ellipsoidal_height(position.lat, position.lon, height, datum).height_m
+        if converted is not None:
+            height, datum = converted, "ellipsoidal"
+    sigmas = np.sqrt(np.diag(np.array(reply.covariance)))
+    response = GeoPoseResp(
+        id=request.id,
+        timestamp=request.timestamp,
+        accuracy=GeoPoseAccuracy(
+            position=float(np.mean(sigmas[3:])), orientation=float(np.degrees(np.mean(sigmas[:3])))
+        ),
+        geopose=GeoPose(
+            position=Position(lon=position.lon, lat=position.lat, h=height),
+            quaternion=Quaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
+        ),
+    )
+    return response, datum
+
+
+def _decoded(text: str, max_bytes: int) -> bytes:
+    if len(text) // 4 * 3 > max_bytes + 2:
+        raise GatewayError(
+            ErrorCode.TOO_LARGE,
+            f"imageBytes: expected at most {max_bytes} bytes, found {len(text) // 4 * 3}; send a "
+            "smaller picture",
+        )
+    try:
+        data = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise GatewayError(
+            ErrorCode.BAD_REQUEST, f"imageBytes: expected base64 without prefix or line breaks ({error})"
+        ) from error
+    if not data:
+        raise GatewayError(ErrorCode.BAD_IMAGE, "imageBytes: expected an image file, found none")
+    return data
+
+
+def _size(picture: CameraReading) -> tuple[int, int] | None:
+    """Width and height; None where the client does not say."""
+    if len(picture.size) != 2 or not any(picture.size):
+        return None
+    width, height = picture.size
+    if not all(side.is_integer() and 1 <= side <= 65_535 for side in (width, height)):
+        raise GatewayError(
+            ErrorCode.BAD_REQUEST, f"size: expected [width, height] in pixels, found {picture.size}"
+        )
+    return int(width), int(height)
+
+
+def _image_file(data: bytes, picture: CameraReading, size: tuple[int, int] | None) -> bytes:
+    """The picture as a file. Clients call files RGBA32, too, so the bytes decide and not `imageFormat`."""
+    channels = _CHANNELS.get(picture.imageFormat.upper())
+    if channels is None or data.startswith(_FILE_BEGINNINGS):
+        return data
+    if size is None or len(data) != size[0] * size[1] * channels:
+        raise GatewayError(
+            ErrorCode.BAD_IMAGE,
+            f"imageBytes: expected an image file, or width x height x {channels} bytes of "
+            f"{picture.imageFormat} of size {size}, found {len(data)} bytes",
+        )
+    mode = "L" if channels == 1 else "RGBA"
+    out = io.BytesIO()
+    Image.frombytes(mode, size, data).convert("L" if mode == "L" else "RGB").save(
+        out, "PNG", compress_level=1
+    )
+    return out.getvalue()
+
+
+def _camera(picture: CameraReading, size: tuple[int, int] | None) -> CameraRequest | None:
+    params = picture.params
+    if params is None or not params.modelParams or not params.model:
+        return None
+    model = params.model.upper()
+    if model.startswith("UNKNOWN"):
+        return None
+    if size is None:
+        raise GatewayError(ErrorCode.BAD_REQUEST, "size: expected [width, height], to which params belong")
+    try:
+        return CameraRequest(model=model, width=size[0], height=size[1], params=params.modelParams)
+    except ValidationError as error:
+        said = error.errors(include_url=False, include_input=False, include_context=False)[0]
+        raise GatewayError(
+            ErrorCode.BAD_REQUEST, f"params.{'.'.join(map(str, said['loc']))}: {said['msg']}"
+        ) from error
+
+
+def _prior(request: GeoPoseReq, picture: CameraReading, options: GatewayOptions) -> PriorRequest | None:
+    """The position nearest in time to the picture; else the latest of the prior poses; else none."""
+    taken = request.timestamp if picture.timestamp is None else picture.timestamp
+    places = [place for place in request.sensorReadings.geolocationReadings if not _is_unset(place)]
+    if places:
+        place = min(places, key=lambda p: 0.0 if p.timestamp is None else abs(p.timestamp - taken))
+        sigma_m = options.prior_unknown_m
+        if place.accuracy is not None and place.accuracy > 0:
+            sigma_m = place.accuracy / _SIGMAS_OF_95
+        return _prior_request(place.latitude, place.longitude, sigma_m, options)
+    poses = request.priorPoses or ()
+    if not poses:
+        return None
+    pose = max(poses, key=lambda p: p.timestamp)
+    age_s = abs(request.timestamp - pose.timestamp) / 1e3
+    if age_s > _PRIOR_POSE_AGE_S:
+        return None
+    sigma_m = max(pose.accuracy.position, 0.0) + _PRIOR_POSE_SPEED_M_S * age_s
+    return _prior_request(pose.geopose.position.lat, pose.geopose.position.lon, sigma_m, options)
+
+
+def _prior_request(lat: float, lon: float, sigma_m: float, options: GatewayOptions) -> PriorRequest:
+    return PriorRequest(lat=lat, lon=lon, sigma_m=min(max(sigma_m, options.prior_floor_m), 1e6))
+
+
+def _is_unset(place: GeolocationReading) -> bool:
+    """The reference clients' reading as they make it, before anybody has filled it in."""
+    return place.latitude == 0 and place.longitude == 0 and not place.accuracy
+
+
+def _wire_id(text: str) -> str | None:
+    """The id as the wire's request id, if it can be one."""
+    try:
+        return LocaliseWireRequest(request_id=text).request_id
+    except ValidationError:
+        return None

@@ -1,0 +1,101 @@
+"""Bodies as they arrive: counted while they stream, bounded in size, number, memory and time."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from starlette.requests import ClientDisconnect, Request
+from starlette.types import Message, Receive
+
+from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError
+from reloc.gateway.options import GatewayOptions
+from reloc.wire import ErrorCode
+
+
+class Intake:
+    """Admits requests with a body; all of its state belongs to the event loop."""
+
+    def __init__(self, options: GatewayOptions) -> None:
+        self._options = options
+        self.in_flight = 0
+        self.buffered_bytes = 0
+
+    @asynccontextmanager
+    async def admitted(self, request: Request, media_type: str) -> AsyncIterator[Request]:
+        """Within the block, the request with a body that ends in a GatewayError where it breaks a limit.
+
+        Raises:
+            GatewayError: BUSY, TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also SLOW_BODY.
+        """
+        _check_headers(request, media_type)
+        if self.in_flight >= self._options.max_in_flight:
+            raise GatewayError(
+                ErrorCode.BUSY,
+                f"{self.in_flight} photos are in hand, which is as many as are taken; try again in a second",
+            )
+        body = _MeteredBody(self, request.receive, self._options)
+        self.in_flight += 1
+        try:
+            declared = request.headers.get("content-length", "")
+            if declared.isdecimal() and int(declared) > self._options.max_body_bytes:
+                raise body.too_large()
+            yield Request(request.scope, body.receive)
+        finally:
+            self.in_flight -= 1
+            self.buffered_bytes -= body.held_bytes
+
+
+def _check_headers(request: Request, media_type: str) -> None:
+    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    wanted = (media_type, "application/vnd.oscp+json") if media_type == "application/json" else (media_type,)
+    if found not in wanted:
+        raise GatewayError(
+            UNSUPPORTED_MEDIA_TYPE, f"Content-Type: expected {media_type}, found {found[:100]!r}"
+        )
+    coding = request.headers.get("content-encoding", "identity").strip().lower()
+    if coding != "identity":
+        raise GatewayError(
+            UNSUPPORTED_MEDIA_TYPE,
+            f"Content-Encoding: expected none, found {coding[:100]!r}; images are compressed",
+        )
+
+
+class _MeteredBody:
+    """One request's body."""
+
+    def __init__(self, intake: Intake, receive: Receive, options: GatewayOptions) -> None:
+        self._intake = intake
+        self._receive = receive
+        self._options = options
+        self._end = time.monotonic() + options.body_timeout_s
+        self.held_bytes = 0
+
+    async def receive(self) -> Message:
+        message = await self._next()
+        size = len(message.get("body", b""))
+        if self.held_bytes + size > self._options.max_body_bytes:
+            raise self.too_large()
+        if self._intake.buffered_bytes + size > self._options.max_buffered_bytes:
+            raise GatewayError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
+        self.held_bytes += size
+        self._intake.buffered_bytes += size
+        return message
+
+    def too_large(self) -> GatewayError:
+        return GatewayError(
+            ErrorCode.TOO_LARGE,
+            f"body: expected at most {self._options.max_body_bytes} bytes; send a smaller picture",
+        )
+
+    async def _next(self) -> Message:
+        try:
+            async with asyncio.timeout(max(0.0, self._end - time.monotonic())):
+                message = await self._receive()
+        except TimeoutError as error:
+            raise GatewayError(
+                SLOW_BODY, f"body: expected within {self._options.body_timeout_s:g} s, found a part of it"
+            ) from error
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        return message

@@ -1,0 +1,210 @@
+"""What /openapi.json says beside the paths: bodies, examples, statuses."""
+
+from typing import Any, Literal
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+from pydantic import BaseModel
+
+from reloc.gateway.failures import ErrorBody
+from reloc.gateway.protocol import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
+from reloc.wire import CameraRequest, LocaliseReply, PriorRequest, RequestOptions
+from reloc.wire_server import MapsReply
+
+DESCRIPTION = (
+    "Where was this photo taken? A thin adapter over a featuredb server, which is asked over Zenoh: OSCP "
+    "GeoPoseProtocol v2 at /geopose, plain multipart at /localise. Quaternions turn camera axes (x forward, "
+    "y left, z up) into true east, north, up. See docs/gateway.md."
+)
+
+
+class Health(BaseModel):
+    """A server answers."""
+
+    status: Literal["ok"] = "ok"
+    database: str
+    snapshot: int
+    maps: int
+
+
+_REF = "#/components/schemas/{model}"
+_TOLD = {
+    400: "BAD_REQUEST: the body is not what it should be; the message names the field",
+    404: "NOT_FOUND",
+    406: "NOT_ACCEPTABLE: another version of the protocol is asked for",
+    408: "SLOW_BODY: the body did not arrive in time",
+    413: "TOO_LARGE: more bytes or pixels than are taken",
+    415: "UNSUPPORTED_MEDIA_TYPE, or BAD_IMAGE: the picture is no image file, or a broken one",
+    422: "NOT_LOCALISED: a valid request, and no place is known for its photo",
+    501: "UNSUPPORTED: a valid wish that the server does not fulfil",
+    502: "INTERNAL, INCOMPATIBLE_EXTRACTOR, BAD_REPLY: the server behind failed",
+    503: "BUSY, SHUTTING_DOWN, NO_SERVER: try again after Retry-After seconds",
+    504: "DEADLINE, TIMEOUT: no answer in time",
+}
+_PRIVACY: dict[str, list[str]] = {
+    "dataRetention": [],
+    "dataAcceptableUse": [],
+    "dataSanitizationApplied": [],
+    "dataSanitizationRequested": [],
+}
+# A whole picture is longer than an example should be: this one is answered by 415.
+_EXAMPLE_REQUEST = {
+    "id": "d9fbf438-b7c6-419a-a75b-1cf79275e58d",
+    "timestamp": 1608995990413,
+    "type": "geopose",
+    "sensors": [{"id": "0", "type": "camera"}, {"id": "1", "type": "geolocation"}],
+    "sensorReadings": {
+        "cameraReadings": [
+            {
+                "timestamp": 1608995990381,
+                "sensorId": "0",
+                "privacy": _PRIVACY,
+                "sequenceNumber": 0,
+                "imageFormat": "JPG",
+                "size": [1920, 1080],
+                "imageBytes": "/9j/4AAQSkZJRg==",
+                "imageOrientation": {"mirrored": False, "rotation": 0},
+                "params": {
+                    "model": "OPENCV",
+                    "modelParams": [1499.027, 1499.027, 954.783, 511.957, 0.0, 0.0, 0.0, 0.0],
+                },
+            }
+        ],
+        "geolocationReadings": [
+            {
+                "timestamp": 1608995990381,
+                "sensorId": "1",
+                "privacy": _PRIVACY,
+                "latitude": 49.0149,
+                "longitude": 8.4091,
+                "altitude": 0,
+                "accuracy": 20,
+                "altitudeAccuracy": 0,
+                "heading": 0,
+                "speed": 0,
+            }
+        ],
+    },
+}
+_EXAMPLE_RESPONSE = {
+    "id": "d9fbf438-b7c6-419a-a75b-1cf79275e58d",
+    "timestamp": 1608995990413,
+    "accuracy": {"position": 0.12, "orientation": 0.08},
+    "type": "geopose",
+    "geopose": {
+        "position": {"lon": 8.4091, "lat": 49.0149, "h": 168.2},
+        "quaternion": {"x": 0.0, "y": 0.0, "z": 0.7071067811865476, "w": 0.7071067811865476},
+    },
+}
+
+
+def _responses(*statuses: int) -> dict[int | str, dict[str, Any]]:
+    return {status: {"model": ErrorBody, "description": _TOLD[status]} for status in statuses}
+
+
+GEOPOSE: dict[str, Any] = {
+    "summary": "OSCP GeoPoseProtocol v2: the pose of the first camera reading",
+    "responses": {
+        200: {
+            "model": GeoPoseResp,
+            "description": "The pose. Header Featuredb-Height-Datum names the datum of h where it is not the "
+            "ellipsoid's.",
+            "content": {
+                "application/json": {"example": _EXAMPLE_RESPONSE},
+                MEDIA_TYPE: {"schema": {"$ref": _REF.format(model="GeoPoseResp")}},
+            },
+        },
+        **_responses(400, 406, 408, 413, 415, 422, 501, 502, 503, 504),
+    },
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "content": {
+                "application/json": {
+                    "schema": {"$ref": _REF.format(model="GeoPoseReq")},
+                    "example": _EXAMPLE_REQUEST,
+                }
+            },
+        }
+    },
+}
+RUNNING: dict[str, Any] = {
+    "summary": "The gateway runs, as the protocol's reference servers say it",
+    "responses": {200: {"content": {"application/json": {"example": {"status": "running"}}}}},
+}
+LOCALISE: dict[str, Any] = {
+    "summary": "One photo as a form; the answer is the wire's localise_reply.json",
+    "responses": {
+        200: {
+            "model": LocaliseReply,
+            "description": "The reply, localised or not: `status` tells, and `reason` why not",
+        },
+        **_responses(400, 408, 413, 415, 501, 502, 503, 504),
+    },
+    "openapi_extra": {
+        "requestBody": {
+            "required": True,
+            "content": {
+                "multipart/form-data": {
+                    "schema": {
+                        "type": "object",
+                        "required": ["image"],
+                        "properties": {
+                            "image": {
+                                "type": "string",
+                                "format": "binary",
+                                "description": "JPEG, PNG, WebP, TIFF, BMP",
+                            },
+                            "camera": {"$ref": _REF.format(model="CameraRequest")},
+                            "prior": {"$ref": _REF.format(model="PriorRequest")},
+                            "options": {"$ref": _REF.format(model="RequestOptions")},
+                            "request_id": {"type": "string", "pattern": "^[A-Za-z0-9._:-]{1,128}$"},
+                        },
+                    },
+                    "encoding": {
+                        "image": {"contentType": "image/jpeg"},
+                        "camera": {"contentType": "application/json"},
+                        "prior": {"contentType": "application/json"},
+                        "options": {"contentType": "application/json"},
+                    },
+                }
+            },
+        }
+    },
+}
+MAPS: dict[str, Any] = {
+    "summary": "The maps that the server answers from",
+    "responses": {200: {"model": MapsReply}, **_responses(502, 503, 504)},
+}
+HEALTH: dict[str, Any] = {
+    "summary": "200 only if a server answers over Zenoh",
+    "responses": {
+        200: {"model": Health},
+        503: {"model": ErrorBody, "description": "NO_SERVER or any other code: none answers, and why"},
+    },
+}
+METRICS: dict[str, Any] = {
+    "summary": "Prometheus' text format",
+    "responses": {200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+}
+
+
+def install(app: FastAPI) -> None:
+    """Make `app.openapi` give the document with the bodies' schemas among its components."""
+
+    def document() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            made = get_openapi(
+                title=app.title, version=app.version, description=app.description, routes=app.routes
+            )
+            schemas = made.setdefault("components", {}).setdefault("schemas", {})
+            bodies: tuple[type[BaseModel], ...] = (GeoPoseReq, CameraRequest, PriorRequest, RequestOptions)
+            for model in bodies:
+                schema = model.model_json_schema(ref_template=_REF)
+                for name, part in schema.pop("$defs", {}).items():
+                    schemas.setdefault(name, part)
+                schemas[model.__name__] = schema
+            app.openapi_schema = made
+        return app.openapi_schema
+
+    app.openapi = document  # type: ignore[method-assign]

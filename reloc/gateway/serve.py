@@ -1,0 +1,86 @@
+"""Run the gateway until told to stop."""
+
+import logging
+import signal
+import socket
+from collections.abc import Callable
+from types import FrameType
+
+import uvicorn
+
+from featuredb.errors import FeatureDbError
+from reloc.gateway.app import create_app
+from reloc.gateway.options import GatewayOptions
+
+_BACKLOG = 128
+# Connections, idle ones with them; who needs more stands behind a proxy that holds them.
+_MAX_CONNECTIONS = 512
+_KEEP_ALIVE_S = 10
+
+
+class GatewayStartError(FeatureDbError):
+    """The gateway cannot listen."""
+
+
+def listen(options: GatewayOptions) -> socket.socket:
+    """A listening socket.
+
+    Raises:
+        GatewayStartError: the port is taken, or the host is not this machine's.
+    """
+    family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
+    try:
+        bound = socket.create_server((options.host, options.port), family=family, backlog=_BACKLOG)
+        # asyncio does so only for sockets that it makes itself. Without it the body of an answer waits for
+        # the acknowledgement of its head: 40 ms on a connection that is kept.
+        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return bound
+    except OSError as error:
+        raise GatewayStartError(
+            f"cannot listen on {options.host}:{options.port}: {error.strerror or error}; choose another with "
+            "--host and --port"
+        ) from error
+
+
+def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
+    """The server of the application, not yet running; `run(sockets=[listen(options)])` runs it."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            create_app(options),
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            ws="none",
+            # Who sends too much is answered at once; this one then reads on and throws away until the
+            # keep-alive is over, so that the answer is not lost by a reset.
+            http="h11",
+            lifespan="on",
+            limit_concurrency=_MAX_CONNECTIONS,
+            timeout_keep_alive=_KEEP_ALIVE_S,
+            # What is in hand is answered first, and it takes no longer than this.
+            timeout_graceful_shutdown=int(options.timeout_s) + 1,
+        )
+    )
+
+
+def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url: None) -> None:
+    """Serve until SIGINT or SIGTERM; call from the main thread.
+
+    Raises:
+        GatewayStartError: cannot listen.
+    """
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    # uvicorn stops in good order on these, and then raises them again for whoever had them before.
+    before = {number: signal.signal(number, _stopped) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        with listen(options) as bound:
+            host, port = bound.getsockname()[:2]
+            on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
+            uvicorn_server(options).run(sockets=[bound])
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _stopped(number: int, frame: FrameType | None) -> None:
+    """The end of the command is no failure of it."""
