@@ -12,10 +12,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from featuredb.errors import GeodesyError, ScanError
+from featuredb.file_digest import file_sha256
 from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
 from featuredb.lidar.intensity import stretch_of
-from featuredb.lidar.las import ScanFile, file_sha256, open_scan_file, read_points
+from featuredb.lidar.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.ortho import open_ortho

@@ -5,7 +5,6 @@ that
 names the file: what was expected, what was found, what to do.
 """
 
-import hashlib
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import MissingExtraError, ScanFileError
+from featuredb.file_digest import file_sha256
 from featuredb.geo.geotiff_keys import GeoKeys
 from featuredb.geometry.arrays import FloatArray
 
 NOISE_CLASSES = (7, 18)  # ASPRS: low noise, high noise
 _UNCLASSIFIED = 1
 _WKT_RECORD, _KEYS_RECORD = 2112, 34735
-_HASH_BYTES = 1 << 20
 _SHORTEST_HEADER, _HEADER_1_4 = 227, 375
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60  # bytes of a VLR and an EVLR without their data
 # The longest coordinate that any CRS in metres or feet has, generously; beyond it scale or offset are broken.
@@ -310,12 +309,3 @@ def _measured_box(path: Path) -> tuple[FloatArray, FloatArray]:
         if len(points):
             low, high = np.minimum(low, points.xyz.min(axis=0)), np.maximum(high, points.xyz.max(axis=0))
     return low, high
-
-
-def file_sha256(path: Path) -> str:
-    """Digest of a file's bytes, hex."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(_HASH_BYTES):
-            digest.update(block)
-    return digest.hexdigest()

@@ -1,6 +1,5 @@
 """A COLMAP model with its place on Earth becomes a map of a database."""
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -15,6 +14,7 @@ from featuredb.errors import IngestError
 from featuredb.export.colmap import DATABASE
 from featuredb.export.georeference import GEOREFERENCE
 from featuredb.features.extractor import ExtractorOptions
+from featuredb.file_digest import file_sha256
 from featuredb.geo.datum import check_datum
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from ingest.extract import PhotoFeatures
@@ -28,7 +28,6 @@ from ingest.photo import Photo
 from ingest.scan import ScanOptions, scan_folder
 
 Descriptors = Literal["stored", "photos"]
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,7 +187,7 @@ def _identity(
     """The same files and options are the same map."""
     files = sorted(model_folder(folder).glob("*.bin")) + sorted(model_folder(folder).glob("*.txt"))
     files += [path for path in (folder / GEOREFERENCE, database) if path.is_file()]
-    key = digest(*(f"{path.name} {_sha256(path)}" for path in files), _plain(options))
+    key = digest(*(f"{path.name} {file_sha256(path)}" for path in files), _plain(options))
     was = (document or {}).get("map", {})
     imported = {"format": "colmap", "descriptors": options.descriptors or "stored"}
     if was:
@@ -227,11 +226,3 @@ def _finished(made: FeatureMap, place: Place) -> FeatureMap:
 def _plain(options: ModelOptions) -> str:
     """The options that the map depends on; not where its photos lie."""
     return repr(replace(options, photos=None, colmap_database=None))
-
-
-def _sha256(path: Path) -> str:
-    value = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(_BLOCK):
-            value.update(block)
-    return value.hexdigest()

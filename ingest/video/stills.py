@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import TelemetryError, VideoError
 from featuredb.features.exif_write import gps_directory
+from featuredb.file_digest import file_sha256
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
 from featuredb.video.frames import open_video
@@ -177,8 +178,7 @@ def _lateness(
 
 def _digest_of(film: Path) -> str:
     try:
-        with film.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return file_sha256(film)
     except OSError as error:
         raise VideoError(
             f"{film}: expected a film, {error.strerror or error}; folders of pictures go to "

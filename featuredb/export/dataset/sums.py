@@ -1,10 +1,10 @@
 """SHA256SUMS of a folder, as `sha256sum -c SHA256SUMS` reads it."""
 
-import hashlib
 import re
 from pathlib import Path, PurePosixPath
 
 from featuredb.errors import ExportError
+from featuredb.file_digest import file_sha256
 
 SUMS = "SHA256SUMS"
 
@@ -14,7 +14,7 @@ _LINE = re.compile(r"([0-9a-f]{64})  (\S.*)")
 def write_sums(folder: Path) -> None:
     """List every file below the folder, by path, with its SHA-256."""
     files = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
-    text = "".join(f"{_digest(folder / name)}  {name}\n" for name in files)
+    text = "".join(f"{file_sha256(folder / name)}  {name}\n" for name in files)
     (folder / SUMS).write_text(text, encoding="utf-8")
 
 
@@ -43,7 +43,7 @@ def check_sums(folder: Path) -> frozenset[str]:
             raise ExportError(
                 f"{path}: {SUMS} lists this file, and it is missing; copy the dataset once more"
             )
-        if _digest(path) != digest:
+        if file_sha256(path) != digest:
             raise ExportError(
                 f"{path}: the content is not what {SUMS} says; it was damaged or changed, copy it once more"
             )
@@ -54,8 +54,3 @@ def check_sums(folder: Path) -> frozenset[str]:
 def _inside(name: str) -> bool:
     path = PurePosixPath(name)
     return not path.is_absolute() and ".." not in path.parts
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,13 +1,12 @@
 """The photos of a map on disk. A map keeps their names and SHA-256, not their pixels."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.errors import RegistrationError
+from featuredb.file_digest import file_sha256
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
-_CHUNK_BYTES = 1 << 20
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
 
@@ -97,11 +96,7 @@ def sha256_of(path: Path) -> str:
     Raises:
         RegistrationError: it cannot be read.
     """
-    digest = hashlib.sha256()
     try:
-        with path.open("rb") as file:
-            while chunk := file.read(_CHUNK_BYTES):
-                digest.update(chunk)
+        return file_sha256(path)
     except OSError as error:
         raise RegistrationError(f"photo {path} cannot be read: {error.strerror or error}") from error
-    return digest.hexdigest()
