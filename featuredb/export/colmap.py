@@ -1,8 +1,9 @@
 """COLMAP: a folder for each map with the model, the database and the place on Earth."""
 
+from functools import partial
 from pathlib import Path
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
+from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
 from featuredb.export.colmap_model import (
     image_names,
     keypoint_rows,
@@ -10,8 +11,8 @@ from featuredb.export.colmap_model import (
     write_colmap_database,
 )
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.tally import Tally
+from featuredb.export.job import Exported, ExportJob
+from featuredb.export.tally import folder_for_each_map
 from featuredb.maps.feature_map import FeatureMap
 
 MODEL_FOLDER = "sparse"
@@ -27,13 +28,7 @@ def write_colmap(job: ExportJob, *, text: bool = False) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = Tally()
-    with whole_or_nothing(job.out) as part:
-        part.mkdir()
-        for feature_map in job.maps():
-            write_map(part / folder_name(feature_map.map_id), feature_map, text=text)
-            tally.add(feature_map)
-        return tally.exported(part)
+    return folder_for_each_map(job, partial(write_map, text=text))
 
 
 def write_map(folder: Path, feature_map: FeatureMap, *, text: bool = False) -> None:

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob
 from featuredb.export.shots import Shot, shots_of
-from featuredb.export.tally import Tally
+from featuredb.export.tally import folder_for_each_map
 from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rotation import quaternion_from_matrix
@@ -31,13 +31,7 @@ def write_geopose(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = Tally()
-    with whole_or_nothing(job.out) as part:
-        part.mkdir()
-        for feature_map in job.maps():
-            _write_map(part / folder_name(feature_map.map_id), feature_map)
-            tally.add(feature_map)
-        return tally.exported(part)
+    return folder_for_each_map(job, _write_map)
 
 
 def _write_map(folder: Path, feature_map: FeatureMap) -> None:

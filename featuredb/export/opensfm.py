@@ -10,12 +10,12 @@ from typing import IO, Any
 
 import numpy as np
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
+from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
 from featuredb.export.colmap_model import image_names
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob
 from featuredb.export.opensfm_camera import opensfm_camera
 from featuredb.export.shots import Shot, shots_of
-from featuredb.export.tally import Tally
+from featuredb.export.tally import folder_for_each_map
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
@@ -28,13 +28,7 @@ def write_opensfm(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, there is something at `job.out`, or a lens that OpenSfM cannot have.
     """
-    tally = Tally()
-    with whole_or_nothing(job.out) as part:
-        part.mkdir()
-        for feature_map in job.maps():
-            _write_map(part / folder_name(feature_map.map_id), feature_map)
-            tally.add(feature_map)
-        return tally.exported(part)
+    return folder_for_each_map(job, _write_map)
 
 
 def _write_map(folder: Path, feature_map: FeatureMap) -> None:

@@ -1,8 +1,10 @@
-"""What an export has written so far."""
+"""What an export has written so far, and the formats that give each map a folder."""
 
+from collections.abc import Callable
 from pathlib import Path
 
-from featuredb.export.job import Exported, size_of
+from featuredb.export.attribution import folder_name
+from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
 
 
@@ -28,3 +30,18 @@ class Tally:
             observations=self._observations,
             bytes=size_of(path),
         )
+
+
+def folder_for_each_map(job: ExportJob, write: Callable[[Path, FeatureMap], None]) -> Exported:
+    """Make `job.out` with a folder for every selected map, which `write` makes and fills.
+
+    Raises:
+        ExportError: nothing is selected, or there is something at `job.out`; and what `write` raises.
+    """
+    tally = Tally()
+    with whole_or_nothing(job.out) as part:
+        part.mkdir()
+        for feature_map in job.maps():
+            write(part / folder_name(feature_map.map_id), feature_map)
+            tally.add(feature_map)
+        return tally.exported(part)

@@ -23,15 +23,9 @@ def utm_wkt(epsg: int, height_datum: str) -> str:
         GeodesyError: not a UTM code.
         InvalidValueError: not a datum's name.
     """
-    zone_of(epsg)
-    datum = check_datum(height_datum)
-    if datum in _EPSG_OF_DATUM:
-        return str(CRS.from_user_input(f"EPSG:{epsg}+{_EPSG_OF_DATUM[datum]}").to_wkt("WKT1_GDAL"))
-    zone = CRS.from_epsg(epsg)
-    plane = str(zone.to_wkt("WKT1_GDAL"))
-    return (
-        plane if datum == "unknown" else f'COMPD_CS["{zone.name} + Ellipsoid (metre)",{plane},{_ELLIPSOID}]'
-    )
+    crs, ellipsoidal = _zone_and_datum(epsg, height_datum)
+    text = str(crs.to_wkt("WKT1_GDAL"))
+    return f'COMPD_CS["{crs.name} + Ellipsoid (metre)",{text},{_ELLIPSOID}]' if ellipsoidal else text
 
 
 def utm_projjson(epsg: int, height_datum: str) -> dict[str, Any]:
@@ -48,11 +42,15 @@ def utm_projjson(epsg: int, height_datum: str) -> dict[str, Any]:
         GeodesyError: not a UTM code.
         InvalidValueError: not a datum's name.
     """
+    crs, ellipsoidal = _zone_and_datum(epsg, height_datum)
+    document: dict[str, Any] = (crs.to_3d() if ellipsoidal else crs).to_json_dict()
+    return document
+
+
+def _zone_and_datum(epsg: int, height_datum: str) -> tuple[CRS, bool]:
+    """The zone, as a compound system with a geoid's heights; whether heights are above the ellipsoid."""
     zone_of(epsg)
     datum = check_datum(height_datum)
-    if datum in _EPSG_OF_DATUM:
-        crs = CRS.from_user_input(f"EPSG:{epsg}+{_EPSG_OF_DATUM[datum]}")
-    else:
-        crs = CRS.from_epsg(epsg) if datum == "unknown" else CRS.from_epsg(epsg).to_3d()
-    document: dict[str, Any] = crs.to_json_dict()
-    return document
+    geoid = _EPSG_OF_DATUM.get(datum)
+    crs = CRS.from_epsg(epsg) if geoid is None else CRS.from_user_input(f"EPSG:{epsg}+{geoid}")
+    return crs, datum == "ellipsoidal"
