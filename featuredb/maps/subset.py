@@ -72,8 +72,10 @@ def take_points(points: MapPoints, rows: NDArray[np.bool_]) -> MapPoints:
     )
 
 
-def take_observations(observations: MapObservations, rows: NDArray[np.bool_]) -> MapObservations:
-    """Some rows (m,); `point_index` names the same points as before."""
+def take_observations(
+    observations: MapObservations, rows: NDArray[np.bool_] | NDArray[np.int64]
+) -> MapObservations:
+    """Some rows, by a mask (m,) or their numbers; `point_index` names the same points as before."""
     return MapObservations(
         point_index=observations.point_index[rows],
         **{name: getattr(observations, name)[rows] for name in _PER_OBSERVATION},

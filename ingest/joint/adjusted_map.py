@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints
+from featuredb.maps.subset import take_observations
 from ingest.colmap_anchored import Anchored
 from ingest.colmap_bridge import Model
 from ingest.joint.joined import Joined, MapRows, observed_pixels
@@ -87,15 +88,7 @@ def adjusted_map(
             error_px=precision.error_px[joint].astype(np.float32),
             covariance=upper_triangle(turned),
         ),
-        observations=MapObservations(
-            point_index=index,
-            image_id=seen.image_id[kept],
-            xy=seen.xy[kept],
-            scale=seen.scale[kept],
-            angle=seen.angle[kept],
-            has_descriptor=seen.has_descriptor[kept],
-            descriptors=seen.descriptors[kept],
-        ),
+        observations=replace(take_observations(seen, kept), point_index=index),
         placement=replace(
             placement,
             local_from_sfm=(move or Sim3.identity()) @ placement.local_from_sfm,
