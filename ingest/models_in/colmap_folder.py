@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import IngestError, InvalidValueError
 from ingest.colmap_bridge import Model, model_of
+from ingest.models_in.colmap_whole import check_whole
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,6 +61,7 @@ def read_colmap(folder: Path) -> ColmapModel:
             do not have.
     """
     place = model_folder(folder)
+    check_whole(place)
     try:
         reconstruction = pycolmap.Reconstruction(str(place))
     except (ValueError, RuntimeError, OSError, IndexError, MemoryError) as error:
