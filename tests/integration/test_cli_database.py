@@ -3,7 +3,6 @@
 import csv
 import io
 import json
-import logging
 from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -13,6 +12,7 @@ import pytest
 from featuredb.cli.main import COMMAND_GROUP, build_parser, main
 from featuredb.errors import StoreError
 from featuredb.store import Database
+from tests.support.command_line import only_command
 from tests.support.maps import random_map
 
 DATABASE_COMMANDS = EntryPoint("db", "featuredb.cli.database:register", COMMAND_GROUP)
@@ -20,14 +20,8 @@ DATABASE_COMMANDS = EntryPoint("db", "featuredb.cli.database:register", COMMAND_
 
 @pytest.fixture(autouse=True)
 def _only_database_commands(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As if only featuredb itself were installed; and leave no handlers behind."""
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [DATABASE_COMMANDS])
-    root, package = logging.getLogger(), logging.getLogger("featuredb")
-    handlers, level, package_level = list(root.handlers), root.level, package.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    package.setLevel(package_level)
+    with only_command(monkeypatch, "db", "featuredb.cli.database:register"):
+        yield
 
 
 @pytest.fixture

@@ -1,33 +1,25 @@
 """The commands `lineage` and `candidates` on a database with a family of maps and an inbox."""
 
 import json
-import logging
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from featuredb.cli.main import COMMAND_GROUP, main
+from featuredb.cli.main import main
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.candidates import contribute, list_candidates, mark_used, refuse
+from tests.support.command_line import only_command
 from tests.support.contributions import contribution
 from tests.support.maps import random_map
 
 
 @pytest.fixture(autouse=True)
 def _only_database_commands(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """As if only featuredb itself were installed; and leave no handlers behind."""
-    command = EntryPoint("db", "featuredb.cli.database:register", COMMAND_GROUP)
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [command])
-    root, package = logging.getLogger(), logging.getLogger("featuredb")
-    handlers, level, package_level = list(root.handlers), root.level, package.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    package.setLevel(package_level)
+    with only_command(monkeypatch, "db", "featuredb.cli.database:register"):
+        yield
 
 
 def grown(seed: int, map_id: str, parents: tuple[str, ...], drift_m: float | None = None) -> FeatureMap:

@@ -13,7 +13,6 @@ import time
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from functools import lru_cache
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +33,7 @@ from featuredb.features.xmp_write import with_properties
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tests.support import planar_map as field
+from tests.support.command_line import only_command
 
 XMP = b"""<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">
 <rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about=""
@@ -298,15 +298,14 @@ def test_a_kill_in_the_middle_leaves_nothing(tmp_path: Path) -> None:
 def test_the_command_wants_the_photos(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    entry = EntryPoint("export", "featuredb.cli.export:register", "featuredb.commands")
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [entry])
-    job_of(tmp_path)
-    argv = ["export", str(tmp_path / "maps.db"), str(tmp_path / "out"), "--format", "exif"]
-    assert main(argv) == 2
-    assert "expected --photos FOLDER" in capsys.readouterr().err
-    assert main([*argv, "--photos", str(tmp_path / "nowhere")]) == 2
-    assert "expected the folder of the photos" in capsys.readouterr().err
-    folder = folder_of_photos(tmp_path)
-    assert main([*argv, "--photos", str(folder)]) == 0
-    assert "exif, 1 maps, 4 images" in capsys.readouterr().out
-    shutil.rmtree(folder)
+    with only_command(monkeypatch, "export", "featuredb.cli.export:register"):
+        job_of(tmp_path)
+        argv = ["export", str(tmp_path / "maps.db"), str(tmp_path / "out"), "--format", "exif"]
+        assert main(argv) == 2
+        assert "expected --photos FOLDER" in capsys.readouterr().err
+        assert main([*argv, "--photos", str(tmp_path / "nowhere")]) == 2
+        assert "expected the folder of the photos" in capsys.readouterr().err
+        folder = folder_of_photos(tmp_path)
+        assert main([*argv, "--photos", str(folder)]) == 0
+        assert "exif, 1 maps, 4 images" in capsys.readouterr().out
+        shutil.rmtree(folder)

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from datetime import date
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import laspy
@@ -25,6 +24,7 @@ from featuredb.geo.crs import scan_crs
 from featuredb.lidar.las_stream import LasStream, offset_and_step
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from tests.support.command_line import only_command
 from tests.support.maps import random_map
 
 DAY = date(2026, 5, 1)
@@ -201,11 +201,10 @@ def test_a_kill_in_the_middle_leaves_nothing(job: ExportJob, tmp_path: Path) -> 
 def test_the_command_writes_them(
     job: ExportJob, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    entry = EntryPoint("export", "featuredb.cli.export:register", "featuredb.commands")
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [entry])
-    for ending in ("las", "laz", "ply"):
-        argv = ["export", str(tmp_path / "maps.db"), str(tmp_path / ending), "--format", ending]
-        assert main(argv) == 0, capsys.readouterr().err
-        assert len(list((tmp_path / ending).glob(f"*.{ending}"))) == 3
-        assert main([*argv[:2], str(tmp_path / "no"), *argv[3:], "--text"]) == 2
-        assert f"--text: expected --format colmap beside it, found {ending}" in capsys.readouterr().err
+    with only_command(monkeypatch, "export", "featuredb.cli.export:register"):
+        for ending in ("las", "laz", "ply"):
+            argv = ["export", str(tmp_path / "maps.db"), str(tmp_path / ending), "--format", ending]
+            assert main(argv) == 0, capsys.readouterr().err
+            assert len(list((tmp_path / ending).glob(f"*.{ending}"))) == 3
+            assert main([*argv[:2], str(tmp_path / "no"), *argv[3:], "--text"]) == 2
+            assert f"--text: expected --format colmap beside it, found {ending}" in capsys.readouterr().err

@@ -3,20 +3,20 @@
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from featuredb.cli.main import COMMAND_GROUP, main
+from featuredb.cli.main import main
 from featuredb.errors import ExportError
 from featuredb.export.dataset import import_dataset, read_dataset
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 from featuredb.store.verify import verify
+from tests.support.command_line import only_command
 from tests.support.datasets import EVERYTHING, export, files_of, map_at, varied_database
 from tests.support.maps import assert_same_map, random_map
 
@@ -246,10 +246,8 @@ def test_a_part_by_licence_is_another_map_to_its_own_database(source: Database, 
 
 @pytest.fixture
 def _command(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    entry = EntryPoint("import", "featuredb.cli.import_dataset:register", COMMAND_GROUP)
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [entry])
-    monkeypatch.setattr("featuredb.cli.main._configure_logging", lambda level: None)
-    return
+    with only_command(monkeypatch, "import", "featuredb.cli.import_dataset:register"):
+        yield
 
 
 @pytest.mark.usefixtures("_command")

@@ -1,29 +1,21 @@
 """`featuredb export`: what it takes, what it says, how it ends."""
 
 import json
-import logging
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 
-from featuredb.cli.main import COMMAND_GROUP, main
+from featuredb.cli.main import main
 from featuredb.store import Database
+from tests.support.command_line import only_command
 from tests.support.maps import random_map
-
-COMMAND = EntryPoint("export", "featuredb.cli.export:register", COMMAND_GROUP)
 
 
 @pytest.fixture(autouse=True)
 def _only_this_command(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.setattr("featuredb.cli.main.entry_points", lambda group: [COMMAND])
-    root, package = logging.getLogger(), logging.getLogger("featuredb")
-    handlers, level, package_level = list(root.handlers), root.level, package.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    package.setLevel(package_level)
+    with only_command(monkeypatch, "export", "featuredb.cli.export:register"):
+        yield
 
 
 @pytest.fixture
