@@ -42,7 +42,7 @@ class ScaleOptions:
     per_district: int = 500
     town_size_m: tuple[float, float] = (300.0, 260.0)
     sights: int = 24
-    width: int = 800
+    width: int = 640
     texel_m: float = 0.1
     geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=8.0, far_share=0.03))
 
@@ -53,7 +53,7 @@ class ScaleOptions:
     @classmethod
     def short(cls, seed: int = 3) -> "ScaleOptions":
         """Four small districts of 60 photos."""
-        return cls(seed=seed, districts=4, per_district=60, town_size_m=(200.0, 180.0), sights=6, width=640)
+        return cls(seed=seed, districts=4, per_district=60, town_size_m=(200.0, 180.0), sights=6)
 
     def scene(self, key: str) -> Scene:
         """Scenes "d<district>/light/week"; one light in all, since each is painted anew."""
