@@ -5,7 +5,6 @@ its segments can be exchanged without touching the picture.
 """
 
 import csv
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -26,6 +25,7 @@ from featuredb.features.exif_gps_write import GpsFields, with_gps
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
 from featuredb.features.xmp_write import with_properties
+from featuredb.maps.photo_files import sha256_of
 
 FILES_TABLE = "files.csv"
 _COLUMNS = ("map_id", "image", "sha256", "file", "reason")
@@ -36,7 +36,6 @@ _STALE = (
     *("drone-dji:GpsStatus", "drone-dji:GpsLatitude", "drone-dji:GpsLongitude", "drone-dji:GpsLongtitude"),
     "drone-dji:AbsoluteAltitude",
 )
-_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -96,11 +95,7 @@ def files_by_sha256(folder: Path) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
-            digest = hashlib.sha256()
-            with path.open("rb") as file:
-                while block := file.read(_BLOCK):
-                    digest.update(block)
-            found.setdefault(digest.hexdigest(), path)
+            found.setdefault(sha256_of(path), path)
     return found
 
 
