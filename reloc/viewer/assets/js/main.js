@@ -1,0 +1,212 @@
+/** The page: loads the scene, and joins its parts. */
+
+import * as THREE from "three";
+import { Ground } from "viewer/clouds.js";
+import { ANSWER, colourOfMap, SCAN, SELECTED } from "viewer/colours.js";
+import { Controls } from "viewer/controls.js";
+import { ask, loadPoints, loadScene, picture } from "viewer/data.js";
+import { byId, check, make } from "viewer/dom.js";
+import { ellipseOf, inliersOf } from "viewer/figures.js";
+import { Cameras, depthOf, spacingOf } from "viewer/markers.js";
+import { aboutAnswer, aboutMap, aboutPhoto, putPicture, show } from "viewer/panel.js";
+import { Player } from "viewer/player.js";
+import { Pointing } from "viewer/pointing.js";
+import { Stage } from "viewer/stage.js";
+import { Tree } from "viewer/tree.js";
+
+class Viewer {
+  /** @param {any} document_ of reloc/viewer/scene.py */
+  constructor(document_) {
+    this.document = document_;
+    this.stage = new Stage(byId("canvas"));
+    this.player = new Player(this.stage);
+    this.selection = new THREE.Group();
+    this.selectedCameras = null;
+    this.number = 0;
+    this.stage.scene.add(this.player.object, this.selection);
+    this.stage.beforeFrame.push((share) => this.prepare(share));
+    this.controls = new Controls(this);
+    this.pointing = new Pointing(this);
+  }
+
+  get place() {
+    return this.document.places[this.number];
+  }
+
+  /** @param {number} number of the place */
+  async open(number) {
+    this.number = number;
+    const data = await loadPoints(number);
+    this.ground?.object.removeFromParent();
+    this.ground?.dispose();
+    this.cameras?.forEach((cameras) => cameras.object.removeFromParent());
+    this.close();
+    this.ground = new Ground(this.place, data);
+    this.cameras = this.place.maps.map((map, row) => new Cameras(map.photos, colourOfMap("map", map, row)));
+    this.spacing = spacingOf(this.place.maps.flatMap((map) => map.photos));
+    this.stage.scene.add(this.ground.object, ...this.cameras.map((cameras) => cameras.object));
+    this.tree = new Tree(byId("tree"), this.place.maps, (id) => this.openMap(id), () => this.refresh());
+    this.scanBoxes = this.place.scans.map((scan) => {
+      const about = ` (${scan.buffer.count.toLocaleString("en")} of ${scan.points_here.toLocaleString("en")} points)`;
+      return check(scan.name + about, true, () => this.refresh(), SCAN).querySelector("input");
+    });
+    byId("scans").replaceChildren(...this.scanBoxes.map((box) => make("li", {}, box.parentElement)));
+    byId("scans-section").hidden = this.scanBoxes.length === 0;
+    this.controls.fill(this.place);
+    this.player.load(this.place.trajectories);
+    this.refresh();
+    this.fit();
+  }
+
+  /** Shows what the boxes say, in the colours that are chosen. */
+  refresh() {
+    const { kinds, mode, size } = this.controls;
+    this.ground.paint(mode);
+    this.ground.size(size);
+    this.tree.paint((map, row) => colourOfMap(mode, map, row));
+    this.tree.fade((map) => this.controls.takes(map));
+    this.place.maps.forEach((map, row) => {
+      const shown = this.tree.isShown(map.id) && this.controls.takes(map);
+      this.ground.maps[row].object.visible = shown && kinds.points;
+      this.ground.covers[row].visible = shown && kinds.coverage;
+      this.cameras[row].object.visible = shown && kinds.photos;
+      this.cameras[row].paint(colourOfMap(mode, map, row));
+    });
+    this.scanBoxes.forEach((box, row) => (this.ground.scans[row].object.visible = box.checked && kinds.points));
+    this.player.object.visible = kinds.tracks;
+    this.controls.drawLegend();
+    this.stage.draw();
+  }
+
+  /** Both views show all of the place. */
+  fit() {
+    const box = new THREE.Box3();
+    for (const cloud of [...this.ground.maps, ...this.ground.scans]) {
+      const [low, high] = cloud.buffer.heights_m;
+      if (!cloud.buffer.count) continue;
+      cloud.object.geometry.computeBoundingBox();
+      const own = cloud.object.geometry.boundingBox.clone().translate(cloud.object.position);
+      own.min.z = low;
+      own.max.z = high;
+      box.union(own);
+    }
+    const tracks = this.place.trajectories.flatMap((track) => track.frames.map((frame) => frame.pose));
+    for (const pose of [...this.place.maps.flatMap((map) => map.photos), ...tracks.filter(Boolean)]) {
+      box.expandByPoint(new THREE.Vector3(...pose.center));
+    }
+    if (box.isEmpty()) box.set(new THREE.Vector3(-50, -50, 0), new THREE.Vector3(50, 50, 20));
+    this.stage.fit(box);
+  }
+
+  /** Before each frame: as many points as are drawn in time, pyramids that fit the zoom. */
+  prepare(share) {
+    this.ground?.drawShare(share);
+    const depth = depthOf(this.stage, this.spacing ?? 10);
+    const ratio = this.stage.renderer.getPixelRatio();
+    for (const cameras of this.cameras ?? []) cameras.scale(depth, this.stage.mode === "space", ratio);
+    this.selectedCameras?.scale(1.6 * depth, false, ratio);
+    this.player.camera?.scale(1.6 * depth, false, ratio);
+    this.pointing.drawScale();
+  }
+
+  /** @param {"plan"|"space"} mode */
+  view(mode) {
+    this.stage.show(mode);
+    this.controls.showMode(mode);
+    this.pointing.leave();
+  }
+
+  map(id) {
+    return this.place.maps.find((map) => map.id === id);
+  }
+
+  nameOf(id) {
+    return this.document.places.flatMap((place) => place.maps).find((map) => map.id === id)?.name || id;
+  }
+
+  /** A map in the panel, and the view on it. @param {string} id */
+  openMap(id) {
+    const map = this.map(id);
+    if (map === undefined) return;
+    this.close();
+    this.tree.mark(id);
+    const body = aboutMap(map, (other) => this.nameOf(other), (other) => this.openMap(other), (p) => this.openPhoto(map, p));
+    show(map.name || map.id, () => this.close(), ...body);
+  }
+
+  /** A photo in the panel, its camera and ellipse in the view. */
+  async openPhoto(map, photo) {
+    this.close();
+    this.tree.mark(map.id);
+    show(photo.name, () => this.close(), ...aboutPhoto(photo, map, () => this.openMap(map.id)));
+    this.select(photo, SELECTED);
+    const found = await picture(map.id, photo.id);
+    if (this.selected === photo) putPicture(found, photo.name);
+  }
+
+  /** Asks where a photo was taken, and shows the answer. @param {File} file */
+  async ask(file) {
+    this.close();
+    const waiting = make("p", { class: "note", role: "status" }, "The photo is being localised. The first one waits for the index.");
+    show(file.name, () => this.close(), waiting);
+    try {
+      const answer = await ask(file, byId("exif-prior").checked);
+      if (answer.place !== undefined && answer.place !== this.number) await this.controls.goToPlace(answer.place);
+      this.close();
+      show(file.name, () => this.close(), ...aboutAnswer(answer));
+      if (answer.pose) {
+        this.select(answer.pose, ANSWER);
+        this.selection.add(inliersOf(answer.pose.center, answer.points, ANSWER));
+        const width_m = Math.max(12 * this.spacing, 10 * answer.pose.ellipse.major_m);
+        this.stage.goTo(answer.pose.center, width_m, byId("panel").offsetWidth);
+      }
+    } catch (error) {
+      waiting.textContent = `No answer: ${error.message}`;
+    }
+  }
+
+  /** Draws a pose as the selected one. */
+  select(pose, colour) {
+    this.selected = pose;
+    this.selectedCameras = new Cameras([pose], colour, 14);
+    this.selection.add(this.selectedCameras.object, ellipseOf(pose, colour));
+    this.stage.draw();
+  }
+
+  /** Nothing is selected. */
+  close() {
+    this.selected = null;
+    this.selection.clear();
+    this.selectedCameras = null;
+    this.tree?.mark(null);
+    byId("panel").hidden = true;
+    this.stage.draw();
+  }
+}
+
+async function start() {
+  const message = byId("message");
+  try {
+    const scene = await loadScene();
+    document.title = `${scene.database} – featuredb`;
+    byId("title").textContent = scene.database;
+    byId("subtitle").textContent = `version ${scene.snapshot} of ${scene.time.replace("T", " ")}`;
+    byId("drop").hidden = !scene.queries;
+    byId("no-queries").hidden = scene.queries;
+    if (scene.places.length === 0) {
+      message.textContent = "There is no map and no scan in this database yet: featuredb ingest photos DB FOLDER makes maps of photos.";
+      message.hidden = false;
+      return null;
+    }
+    const viewer = new Viewer(scene);
+    await viewer.open(0);
+    return viewer;
+  } catch (error) {
+    message.textContent = `The page cannot be shown: ${error.message}`;
+    message.hidden = false;
+    throw error;
+  }
+}
+
+/** For programs that drive the page: the viewer, or null where there is nothing to show. */
+window.featuredb = start();
