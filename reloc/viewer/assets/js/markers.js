@@ -12,17 +12,13 @@ const DOTS = `
 const PLAIN = `
   uniform vec3 colour;
   uniform float opacity;
-  void main() {
-    gl_FragColor = vec4(colour, opacity);
-    #include <colorspace_fragment>
-  }`;
+  void main() { gl_FragColor = vec4(colour, opacity); }`;
 const ROUND = `
   uniform vec3 colour;
   void main() {
     float r = length(gl_PointCoord - 0.5);
     if (r > 0.5) discard;
     gl_FragColor = vec4(mix(colour, vec3(1.0), step(0.34, r)), 1.0);
-    #include <colorspace_fragment>
   }`;
 
 /** @typedef {{center: number[], forward: number[], corners: number[][]}} Pose of reloc/viewer/poses.py */

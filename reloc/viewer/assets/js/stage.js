@@ -3,6 +3,8 @@
 import * as THREE from "three";
 import { OrbitControls } from "three/orbit";
 
+THREE.ColorManagement.enabled = false;
+
 const SLOW_MS = 40; // a frame that takes longer while the view moves is drawn with fewer points
 const FAST_MS = 22;
 const REST_MS = 250; // after which a view that moved is drawn in full
@@ -13,6 +15,8 @@ export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
     this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true });
+    // Colours are data here and come out as they go in: no light is computed.
+    this.renderer.outputColorSpace = THREE.LinearSRGBColorSpace;
     this.renderer.setClearColor("#f3f5f7");
     this.scene = new THREE.Scene();
     this.plan = new THREE.OrthographicCamera(-1, 1, 1, -1, 1, 10);
