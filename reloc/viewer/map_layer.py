@@ -91,12 +91,14 @@ def coverage(points: DrawnPoints) -> dict[str, Any]:
         `ground_m`: the height at which it is drawn, below nearly all points. `cell_m`, and `cells`: rows i, j
         of square cells with at least two points, from i * cell_m to (i + 1) * cell_m east, j likewise north.
         `hull`: corners (k, 2) of the points' convex hull, counterclockwise; none where there is no area.
+        Strays are left out of both.
     """
     plan = points.offsets[:, :2].astype(np.float64) + points.origin[:2]
     if len(plan) == 0:
         return {"ground_m": 0.0, "cell_m": 1.0, "cells": [], "hull": []}
     ground = float(np.percentile(points.offsets[:, 2], 2.0)) + float(points.origin[2])
-    inside = plan[_without_strays(plan)]
+    low, high = points.box()[:, :2]
+    inside = plan[((plan >= low) & (plan <= high)).all(axis=1)]
     cell = _round_length(max(float(np.ptp(inside, axis=0).max()) / _CELLS, 0.1))
     cells, count = np.unique(np.floor(inside / cell).astype(np.int64), axis=0, return_counts=True)
     return {
@@ -111,13 +113,6 @@ def spot_of_map(summary: MapSummary, feature_map: FeatureMap) -> Spot:
     """Where a map without points lies: at its frame's origin."""
     e, n, h = feature_map.frame.utm_from_enu(np.zeros(3), summary.epsg)
     return Spot(easting=float(e), northing=float(n), height=float(h), epsg=summary.epsg)
-
-
-def _without_strays(plan: FloatArray) -> FloatArray:
-    """Rows without the few points that lie far from all others, which would stretch what is drawn."""
-    low, high = np.percentile(plan, (1.0, 99.0), axis=0)
-    margin = 0.25 * (high - low) + 1.0
-    return np.asarray(((plan >= low - margin) & (plan <= high + margin)).all(axis=1))
 
 
 def _hull(plan: FloatArray) -> FloatArray:

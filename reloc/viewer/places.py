@@ -14,8 +14,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.store import MapSummary, UtmBox
-from featuredb.store.scans import ScanSummary
+from featuredb.store import UtmBox
 
 # Over this distance the vertical turns by 0.18 degrees and the ground falls away by 31 m.
 _TOGETHER_M = 20_000.0
@@ -62,26 +61,22 @@ def group(spots: Sequence[Spot]) -> list[tuple[LocalFrame, list[int]]]:
 
 
 def scan_box(
-    frame: LocalFrame, maps: Sequence[MapSummary], scan: ScanSummary
+    frame: LocalFrame, boxes: Sequence[FloatArray], epsg: int
 ) -> tuple[float, float, float, float] | None:
-    """(e0, n0, e1, n1) in the scan's zone of what is shown of it: 50 m around the maps; None where none has
-    points: all of it."""
-    corners = [
-        frame.enu_from_utm((e, n, m.box.min_height), m.epsg)
-        for m in maps
-        if m.box is not None
-        for e in (m.box.min_easting, m.box.max_easting)
-        for n in (m.box.min_northing, m.box.max_northing)
-    ]
-    if not corners:
+    """(e0, n0, e1, n1) in the zone of a scan of what is shown of it: 50 m around the maps.
+
+    Args:
+        boxes: corners (2, 3) of each map's points in the place's frame; without any all of the scan is shown.
+    """
+    if not boxes:
         return None
-    (e0, n0, up), (e1, n1, _) = np.min(corners, axis=0), np.max(corners, axis=0)
+    (e0, n0, up), (e1, n1, _) = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
     around = [
         (e, n, up)
         for e in (e0 - SCAN_MARGIN_M, e1 + SCAN_MARGIN_M)
         for n in (n0 - SCAN_MARGIN_M, n1 + SCAN_MARGIN_M)
     ]
-    utm = frame.utm_from_enu(np.array(around), scan.epsg)
+    utm = frame.utm_from_enu(np.array(around), epsg)
     low, high = utm.min(axis=0), utm.max(axis=0)
     return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 

@@ -5,7 +5,7 @@ So the same database shows the same points, no part of a map is favoured, and th
 of what it has while the view moves.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
@@ -45,6 +45,22 @@ class DrawnPoints:
 
     def __len__(self) -> int:
         return len(self.offsets)
+
+    def first(self, count: int) -> "DrawnPoints":
+        """At most `count` of them."""
+        return replace(self, offsets=self.offsets[:count], rgb=self.rgb[:count])
+
+    def box(self) -> FloatArray:
+        """Corners (2, 3), lowest and highest, around all but the strays that every reconstruction has.
+
+        From the first to the last hundredth of the points along each axis, and a tenth more on each side;
+        zeros where there are none.
+        """
+        if len(self) == 0:
+            return np.zeros((2, 3))
+        low, high = np.percentile(self.offsets.astype(np.float64), (1.0, 99.0), axis=0)
+        margin = 0.1 * (high - low)
+        return np.array([low - margin, high + margin]) + self.origin
 
     def packed(self) -> bytes:
         """Little-endian float32 x, y, z of all points, then red, green, blue of all, then zeros to a multiple

@@ -155,22 +155,25 @@ class _Builder:
     def _place(
         self, number: int, frame: LocalFrame, maps: list[MapSummary], scans: list[ScanSummary]
     ) -> tuple[dict[str, Any], bytes]:
-        boxes = [scan_box(frame, maps, scan) for scan in scans]
+        limit = self._options.points
+        wanted = shares([m.points for m in maps], limit)
+        read = [self._map(number, frame, m, int(n)) for m, n in zip(maps, wanted, strict=True)]
+        shown = [entry for entry in read if entry is not None]
+        map_boxes = [drawn.box() for _, drawn in shown if len(drawn)]
+        boxes = [scan_box(frame, map_boxes, scan.epsg) for scan in scans]
         of_scans = [
             sum(count_points(self._database, s, level, box) for level in range(len(s.level_points)))
             for s, box in zip(scans, boxes, strict=True)
         ]
-        for_maps, for_scans = _budget(sum(m.points for m in maps), sum(of_scans), self._options.points)
+        for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
         buffers = _Buffers()
-        described_maps = [
-            self._map(number, frame, summary, int(wanted), buffers)
-            for summary, wanted in zip(maps, shares([m.points for m in maps], for_maps), strict=True)
-        ]
+        described_maps = []
+        for (told, drawn), count in zip(shown, shares([len(d) for _, d in shown], for_maps), strict=True):
+            described_maps.append({**told, "buffer": buffers.add(drawn.first(int(count)))})
         described_scans = []
-        for scan, box, wanted in zip(scans, boxes, shares(of_scans, for_scans), strict=True):
-            drawn = scan_points_in(self._database, scan, frame, box, int(wanted))
+        for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True):
+            drawn = scan_points_in(self._database, scan, frame, box, int(count))
             described_scans.append(_describe_scan(scan, drawn, buffers.add(drawn)))
-        shown = [entry for entry in described_maps if entry is not None]
         place = {
             "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
             "frame": {
@@ -180,15 +183,15 @@ class _Builder:
             },
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
             "epsg": (maps[0].epsg if maps else scans[0].epsg) if maps or scans else None,
-            "maps": shown,
+            "maps": described_maps,
             "scans": described_scans,
         }
         return place, buffers.data()
 
     def _map(
-        self, number: int, frame: LocalFrame, summary: MapSummary, wanted: int, buffers: "_Buffers"
-    ) -> dict[str, Any] | None:
-        """None where no photo has one of the licences."""
+        self, number: int, frame: LocalFrame, summary: MapSummary, wanted: int
+    ) -> tuple[dict[str, Any], DrawnPoints] | None:
+        """A map and at most `wanted` of its points; None where no photo has one of the licences."""
         feature_map = licensed(self._snapshot.load_map(summary.map_id), self._options.selection.licences)
         self._read += 1
         self._options.told(self._read, len(self._maps))
@@ -198,13 +201,13 @@ class _Builder:
         self._place_of_map[summary.map_id] = number
         for image in feature_map.images:
             self._images[summary.map_id, image.image_id] = image
-        return {
+        told = {
             **describe_map(summary, self._lineages[summary.map_id], self._under(summary.map_id)),
             "points": len(feature_map.points),
             "photos": describe_photos(feature_map, frame),
             "coverage": coverage(drawn),
-            "buffer": buffers.add(drawn),
         }
+        return told, drawn
 
     def _under(self, map_id: str) -> str | None:
         """The map under which it stands in the tree: the next one on its chain to an anchor."""
@@ -226,7 +229,7 @@ class _Buffers:
             "origin": drawn.origin.tolist(),
             "count": len(drawn),
             "offset": self._size,
-            "heights_m": _height_range(drawn),
+            "box": np.round(drawn.box(), 3).tolist(),
         }
         self._parts.append(data)
         self._size += len(data)
@@ -255,14 +258,6 @@ def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]
         "licence": scan.licence,
         "buffer": buffer,
     }
-
-
-def _height_range(drawn: DrawnPoints) -> list[float]:
-    """Heights between which nearly all points lie, metres above the place's origin; for colours by height."""
-    if len(drawn) == 0:
-        return [0.0, 0.0]
-    low, high = np.percentile(drawn.offsets[:, 2], (2.0, 98.0)) + drawn.origin[2]
-    return [round(float(low), 3), round(float(high), 3)]
 
 
 def _known_spot(trajectory: Trajectory) -> Spot:

@@ -37,6 +37,7 @@ _STATUS = {
     ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 409,
 }
 _CLIENT_GONE = 499
+_LAST_PORT = 65_535
 
 
 class ViewerStartError(FeatureDbError):
@@ -108,15 +109,17 @@ def listen(port: int) -> socket.socket:
     Raises:
         ViewerStartError: the port is taken or none.
     """
+    if not 0 <= port <= _LAST_PORT:
+        raise ViewerStartError(f"--port: expected 0 to {_LAST_PORT}, found {port}")
     try:
         bound = socket.create_server((HOST, port))
         # Without it the body of an answer waits for the acknowledgement of its head.
         bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         return bound
-    except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+    except OSError as error:
         raise ViewerStartError(
-            f"cannot listen on {HOST}:{port}: {reason}; choose another with --port, 0 takes a free one"
+            f"cannot listen on {HOST}:{port}: {error.strerror or error}; choose another with --port, "
+            "0 takes a free one"
         ) from error
 
 

@@ -7,7 +7,7 @@ import { colourOfMap, heightColours, SCAN } from "viewer/colours.js";
 export class Cloud {
   /**
    * @param {ArrayBuffer} data points of the whole place
-   * @param {{origin: number[], count: number, offset: number, heights_m: [number, number]}} buffer where they are
+   * @param {{origin: number[], count: number, offset: number, box: number[][]}} buffer where they are
    */
   constructor(data, buffer) {
     this.buffer = buffer;
@@ -71,8 +71,9 @@ export class Ground {
     this.scans = place.scans.map((scan) => new Cloud(data, scan.buffer));
     this.covers = place.maps.map((map, row) => coverageOf(map.coverage, colourOfMap("map", map, row)));
     this.object.add(...[...this.scans, ...this.maps].map((cloud) => cloud.object), ...this.covers);
-    const ranges = [...this.maps, ...this.scans].filter((c) => c.buffer.count).map((c) => c.buffer.heights_m);
-    this.heights = [Math.min(...ranges.map((r) => r[0]), Infinity), Math.max(...ranges.map((r) => r[1]), -Infinity)];
+    const ranges = [...this.maps, ...this.scans].filter((c) => c.buffer.count).map((c) => c.buffer.box);
+    /** Lowest and highest point, strays apart, above the frame's origin. */
+    this.heights = [Math.min(...ranges.map((box) => box[0][2])), Math.max(...ranges.map((box) => box[1][2]))];
   }
 
   /** @param {string} mode */

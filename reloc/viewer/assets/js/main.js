@@ -82,13 +82,7 @@ class Viewer {
   fit() {
     const box = new THREE.Box3();
     for (const cloud of [...this.ground.maps, ...this.ground.scans]) {
-      const [low, high] = cloud.buffer.heights_m;
-      if (!cloud.buffer.count) continue;
-      cloud.object.geometry.computeBoundingBox();
-      const own = cloud.object.geometry.boundingBox.clone().translate(cloud.object.position);
-      own.min.z = low;
-      own.max.z = high;
-      box.union(own);
+      if (cloud.buffer.count) for (const corner of cloud.buffer.box) box.expandByPoint(new THREE.Vector3(...corner));
     }
     const tracks = this.place.trajectories.flatMap((track) => track.frames.map((frame) => frame.pose));
     for (const pose of [...this.place.maps.flatMap((map) => map.photos), ...tracks.filter(Boolean)]) {

@@ -91,7 +91,7 @@ export class Stage {
     this.plan.position.set(center.x, center.y, center.z + 2 * reach + 1);
     this.planControls.target.copy(center);
     Object.assign(this.space, { near: reach / 2000, far: reach * 20 });
-    this.space.position.copy(center).add(new THREE.Vector3(-0.35, -0.75, 0.55).multiplyScalar(0.95 * reach));
+    this.space.position.copy(center).add(new THREE.Vector3(-0.35, -0.75, 0.55).multiplyScalar(1.15 * reach));
     this.spaceControls.target.copy(center);
     this.planControls.update();
     this.spaceControls.update();
