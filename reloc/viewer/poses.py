@@ -94,9 +94,13 @@ def _corner_rays(camera: Camera | None) -> FloatArray:
     """Rays (4, 3) in camera axes at unit depth."""
     if camera is not None:
         w, h = float(camera.width), float(camera.height)
-        rays = camera.unproject(np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]]))
+        pixels = np.array([[0.0, 0.0], [w, 0.0], [w, h], [0.0, h]])
+        rays = np.column_stack([camera.unproject(pixels), np.ones(4)])
+        # A fisheye's corners may lie beyond what it images; then there is no ray that comes back to them.
         if np.isfinite(rays).all() and np.abs(rays).max() < _WIDEST:
-            return np.column_stack([rays, np.ones(4)])
+            back = camera.project(rays)
+            if np.isfinite(back).all() and np.abs(back - pixels).max() < 1.0:
+                return rays
     x, y = np.tan(np.radians(30.0)), np.tan(np.radians(22.5))
     return np.array([[-x, -y, 1.0], [x, -y, 1.0], [x, y, 1.0], [-x, y, 1.0]])
 
