@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from featuredb.features.decode import DecodeLimits
+from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import matrix_from_quaternion
@@ -40,8 +41,8 @@ class Queries:
         """The answer to the bytes of an image file.
 
         Returns:
-            `reply`: as on the wire. Where it is localised also `overlay` (JPEG as a data URL), and where the
-            place is shown `place`: row of it, and `pose`, `points` (inliers), metres in its frame.
+            `reply`: as on the wire. Where it is localised also `angles`, `overlay` (JPEG as a data URL), and
+            where the place is shown `place`: row of it, and `pose`, `points` (inliers), metres in its frame.
 
         Raises:
             RequestError: no usable image, or maps of another extractor. StoreError: the database is gone.
@@ -63,6 +64,7 @@ class Queries:
         answer: dict[str, Any] = {"reply": reply.model_dump(mode="json")}
         if reply.status != "localised":
             return answer
+        answer["angles"] = _angles(reply)
         overlay = draw_overlay(photo, reply, map_points_in_view(localiser.areas, reply))
         answer["overlay"] = data_url("image/jpeg", jpeg_of(overlay, PICTURE_PX))
         place = next((self._scene.place_of_map[m] for m in reply.maps if m in self._scene.place_of_map), None)
@@ -74,6 +76,20 @@ class Queries:
 def data_url(media_type: str, data: bytes) -> str:
     """Bytes as a URL."""
     return f"data:{media_type};base64,{base64.b64encode(data).decode()}"
+
+
+def _angles(reply: LocaliseReply) -> dict[str, float]:
+    assert reply.position is not None
+    assert reply.quaternion is not None
+    turn = reply.quaternion
+    geopose = GeoPose(
+        latitude_deg=reply.position.lat,
+        longitude_deg=reply.position.lon,
+        height_m=reply.position.h,
+        quaternion_xyzw=(turn.x, turn.y, turn.z, turn.w),
+    )
+    heading, pitch, roll = geopose.heading_pitch_roll_deg
+    return {"heading_deg": heading, "pitch_deg": pitch, "roll_deg": roll}
 
 
 def _drawn(reply: LocaliseReply, frame: LocalFrame) -> dict[str, Any]:

@@ -43,7 +43,7 @@ export function inliersOf(center, points, colour) {
   return group;
 }
 
-/** The way of a camera, by state; grey where it is lost. @param {Array<any>} frames of a track */
+/** The way of a camera: a dot for each frame, by state; the line is red where frames between are lost. @param {Array<any>} frames of a track */
 export function wayOf(frames) {
   const known = frames.filter((frame) => frame.pose !== null);
   const positions = [];
@@ -57,12 +57,17 @@ export function wayOf(frames) {
     positions.push(...from.pose.center, ...to.pose.center);
     colours.push(colour.r, colour.g, colour.b, colour.r, colour.g, colour.b);
   }
-  const geometry = geometryOf(positions);
-  geometry.setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
-  const line = new THREE.LineSegments(geometry, new THREE.LineBasicMaterial({ vertexColors: true, depthTest: false }));
-  line.renderOrder = 8;
-  line.frustumCulled = false;
-  return line;
+  const dots = known.flatMap((frame) => colour.set(STATE[frame.state]).toArray());
+  const dot = { vertexColors: true, depthTest: false, size: 5, sizeAttenuation: false };
+  const group = new THREE.Group().add(
+    new THREE.LineSegments(coloured(positions, colours), new THREE.LineBasicMaterial({ vertexColors: true, depthTest: false })),
+    new THREE.Points(coloured(known.flatMap((frame) => frame.pose.center), dots), new THREE.PointsMaterial(dot)),
+  );
+  for (const part of group.children) part.renderOrder = 12;
+  return group;
 }
+
+const coloured = (positions, colours) =>
+  geometryOf(positions).setAttribute("color", new THREE.Float32BufferAttribute(colours, 3));
 
 const at = (values, k) => values.slice(3 * k, 3 * k + 3);

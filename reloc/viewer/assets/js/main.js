@@ -147,7 +147,7 @@ class Viewer {
       const answer = await ask(file, byId("exif-prior").checked);
       if (answer.place !== undefined && answer.place !== this.number) await this.controls.goToPlace(answer.place);
       this.close();
-      show(file.name, () => this.close(), ...aboutAnswer(answer));
+      show(file.name, () => this.close(), ...aboutAnswer(answer, (id) => this.nameOf(id)));
       if (answer.pose) {
         this.select(answer.pose, ANSWER);
         this.selection.add(inliersOf(answer.pose.center, answer.points, ANSWER));

@@ -29,14 +29,17 @@ export class Cameras {
   constructor(poses, colour, dot = 9) {
     this.dot = dot;
     this.colour = { value: new THREE.Color(colour) };
-    this.lines = new THREE.LineSegments(
-      pyramids(poses),
-      shader(LINES, PLAIN, { size: { value: 1 }, colour: this.colour, opacity: { value: 0.85 } }),
-    );
+    const size = { value: 1 };
+    const white = { size, colour: { value: new THREE.Color("#ffffff") }, opacity: { value: 0.4 } };
+    this.bases = new THREE.Mesh(bases(poses), shader(LINES, PLAIN, white));
+    this.bases.material.side = THREE.DoubleSide;
+    const edges = { size, colour: this.colour, opacity: { value: 1 } };
+    this.lines = new THREE.LineSegments(pyramids(poses), shader(LINES, PLAIN, edges));
     const centers = new Float32Array(poses.flatMap((pose) => pose.center));
     const geometry = new THREE.BufferGeometry().setAttribute("position", new THREE.BufferAttribute(centers, 3));
     this.dots = new THREE.Points(geometry, shader(DOTS, ROUND, { size: { value: dot }, colour: this.colour }));
-    this.object = new THREE.Group().add(this.lines, this.dots);
+    this.object = new THREE.Group().add(this.bases, this.lines, this.dots);
+    this.bases.renderOrder = 9;
     this.lines.renderOrder = 10;
     this.dots.renderOrder = 11;
     for (const part of this.object.children) part.frustumCulled = false;
@@ -52,8 +55,7 @@ export class Cameras {
    */
   scale(depth_m, hidden, pixelRatio) {
     this.lines.material.uniforms.size.value = depth_m;
-    this.lines.material.depthTest = hidden;
-    this.dots.material.depthTest = hidden;
+    for (const part of this.object.children) part.material.depthTest = hidden;
     this.dots.material.uniforms.size.value = this.dot * pixelRatio;
   }
 
@@ -87,22 +89,33 @@ export function spacingOf(poses) {
   return nearest.length ? nearest[nearest.length >> 1] : 10;
 }
 
+/** The picture's rectangle of each, two triangles; light, so that edges show on any ground. */
+function bases(poses) {
+  return shapes(poses, ({ corners: [a, b, c, d] }) => [a, b, c, a, c, d]);
+}
+
 /** @param {Pose[]} poses */
 function pyramids(poses) {
-  const centers = [];
-  const directions = [];
-  for (const { center, corners } of poses) {
+  const apex = [0, 0, 0];
+  const mix = (a, b, t) => a.map((v, c) => v + t * (b[c] - v));
+  return shapes(poses, ({ corners }) => {
     const [topLeft, topRight, bottomRight, bottomLeft] = corners;
-    const mix = (a, b, t, out) => a.map((v, c) => (v + t * (b[c] - v)) * out);
-    const top = mix(topLeft, topRight, 0.5, 1).map((v, c) => v + 0.35 * (topLeft[c] - bottomLeft[c]));
-    const apex = [0, 0, 0];
-    const ends = [
+    const top = mix(topLeft, topRight, 0.5).map((v, c) => v + 0.35 * (topLeft[c] - bottomLeft[c]));
+    return [
       ...corners.flatMap((corner) => [apex, corner]),
       ...[topLeft, topRight, topRight, bottomRight, bottomRight, bottomLeft, bottomLeft, topLeft],
-      ...[mix(topLeft, topRight, 0.3, 1), top, top, mix(topLeft, topRight, 0.7, 1)],
+      ...[mix(topLeft, topRight, 0.3), top, top, mix(topLeft, topRight, 0.7)],
     ];
-    for (const end of ends) {
-      centers.push(...center);
+  });
+}
+
+/** Vertices at the cameras' centres, each with the direction in which the shader moves it. */
+function shapes(poses, endsOf) {
+  const centers = [];
+  const directions = [];
+  for (const pose of poses) {
+    for (const end of endsOf(pose)) {
+      centers.push(...pose.center);
       directions.push(...end);
     }
   }

@@ -67,8 +67,8 @@ export function aboutMap(map, nameOf, openMap, openPhoto) {
   ];
 }
 
-/** The answer to a photo. @param {any} answer of reloc/viewer/query.py */
-export function aboutAnswer(answer) {
+/** The answer to a photo. @param {any} answer of reloc/viewer/query.py @param {function(string): string} nameOf a map */
+export function aboutAnswer(answer, nameOf) {
   const { reply } = answer;
   if (reply.status !== "localised") {
     return [
@@ -81,11 +81,11 @@ export function aboutAnswer(answer) {
   return [
     make("p", { class: "good" }, "Localised"),
     make("img", { src: answer.overlay, alt: "The photo with the map's points that agree with the pose" }),
-    table([["inliers", String(reply.inliers)], ["confidence", reply.confidence.toFixed(3)], ["maps", reply.maps.join(", ")]]),
+    table([["inliers", String(reply.inliers)], ["confidence", reply.confidence.toFixed(3)], ["maps", reply.maps.map(nameOf).join(", ")]]),
     make("h3", {}, "Pose"),
     placeTable({
       utm: reply.utm, height_datum: reply.height_datum, latitude_deg: reply.position.lat, longitude_deg: reply.position.lon,
-      quaternion_xyzw: ["x", "y", "z", "w"].map((axis) => reply.quaternion[axis]),
+      quaternion_xyzw: ["x", "y", "z", "w"].map((axis) => reply.quaternion[axis]), ...answer.angles,
     }),
     make("h3", {}, "Uncertainty"),
     table([

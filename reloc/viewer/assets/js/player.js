@@ -111,8 +111,9 @@ export class Player {
     const context = canvas.getContext("2d");
     frames.forEach((frame, k) => {
       context.fillStyle = STATE[frame.state];
-      const next = frames[k + 1]?.time_s ?? frame.time_s;
-      context.fillRect((frame.time_s - start) * perSecond, 0, Math.max((next - frame.time_s) * perSecond, 1), 6);
+      const from = Math.floor((frame.time_s - start) * perSecond);
+      const to = Math.ceil(((frames[k + 1]?.time_s ?? frame.time_s) - start) * perSecond);
+      context.fillRect(from, 0, Math.max(to - from, 1), 6);
     });
   }
 }

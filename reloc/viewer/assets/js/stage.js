@@ -33,6 +33,7 @@ export class Stage {
     /** Called before each frame with the share of points to draw. @type {Array<function(number): void>} */
     this.beforeFrame = [];
     this.asked = false;
+    this.moving = false;
     this.movedAt = -Infinity;
     this.frameAt = -Infinity;
     for (const controls of [this.planControls, this.spaceControls]) {
@@ -91,7 +92,7 @@ export class Stage {
     this.plan.position.set(center.x, center.y, center.z + 2 * reach + 1);
     this.planControls.target.copy(center);
     Object.assign(this.space, { near: reach / 2000, far: reach * 20 });
-    this.space.position.copy(center).add(new THREE.Vector3(-0.35, -0.75, 0.55).multiplyScalar(1.15 * reach));
+    this.space.position.copy(center).add(new THREE.Vector3(-0.35, -0.75, 0.55).multiplyScalar(reach));
     this.spaceControls.target.copy(center);
     this.planControls.update();
     this.spaceControls.update();
@@ -164,12 +165,11 @@ export class Stage {
     const now = performance.now();
     const took = now - this.frameAt;
     const moving = now - this.movedAt < REST_MS;
+    // Frames follow each other while the view moves, so the time between two is what one takes.
     if (!moving) this.share = 1;
-    else if (took < 1000) {
-      // Frames follow each other while the view moves, so the time between two is what one takes.
-      if (took > SLOW_MS) this.share = Math.max(LEAST_SHARE, this.share * 0.7);
-      else if (took < FAST_MS) this.share = Math.min(1, this.share * 1.1);
-    }
+    else if (this.moving && took > SLOW_MS) this.share = Math.max(LEAST_SHARE, (this.share * SLOW_MS) / took);
+    else if (this.moving && took < FAST_MS) this.share = Math.min(1, this.share * 1.1);
+    this.moving = moving;
     this.frameAt = now;
     for (const prepare of this.beforeFrame) prepare(this.share);
     this.renderer.render(this.scene, this.camera);
