@@ -71,6 +71,7 @@ def make_town(demo: Path, work: Path) -> tuple[Database, Path]:
 
 def take_pictures(page: Page, query: Path, out: Path) -> None:
     """An answer in plan, photo and scan in space, a track in colours by height."""
+    page.locator("#size").fill("3")
     page.uncheck("#kinds label:has-text('tracks') input")
     page.set_input_files("#file", query)
     page.wait_for_selector("#panel .good")
@@ -80,8 +81,9 @@ def take_pictures(page: Page, query: Path, out: Path) -> None:
     page.click("#view-all")
     page.click("#view-space")
     page.evaluate(
-        "window.featuredb.then((v) => { v.openPhoto(v.place.maps[0], v.place.maps[0].photos[8]);"
-        "v.stage.zoom(1.35); })"
+        "window.featuredb.then((v) => { const photo = v.place.maps[0].photos[8];"
+        "v.openPhoto(v.place.maps[0], photo);"
+        "const [east, north, up] = photo.center; v.stage.goTo([east + 30, north - 25, up - 45], 190, 0); })"
     )
     page.wait_for_selector("#picture img")
     _save(page, out / "viewer_space.jpg")
@@ -91,7 +93,8 @@ def take_pictures(page: Page, query: Path, out: Path) -> None:
     page.click("#view-plan")
     page.select_option("#colour", "height")
     page.locator("#time").fill("4.2")
-    page.evaluate("window.featuredb.then((v) => v.stage.zoom(1.5))")
+    page.click("#view-all")
+    page.evaluate("window.featuredb.then((v) => v.stage.goTo(v.player.frame.pose.center, 200, 0))")
     _save(page, out / "viewer_track.jpg")
 
 

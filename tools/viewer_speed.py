@@ -34,8 +34,7 @@ _FULL_FRAMES = """async () => {
   const times = [];
   for (let k = 0; k < 22; k++) {
     const start = performance.now();
-    stage.share = 1;
-    stage.movedAt = -Infinity;
+    stage.moved = false;
     stage.frame();
     gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
     times.push(performance.now() - start);

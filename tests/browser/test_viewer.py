@@ -18,6 +18,7 @@ from reloc.tracking.trajectory_read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import build_scene
 from reloc.viewer.static_page import write_static_page
+from tests.support.datasets import varied_database
 from tests.support.viewer import MISSING, QUERY_POSE, ViewerWorld, make_world, running_viewer
 
 pytestmark = pytest.mark.slow
@@ -326,6 +327,19 @@ def test_the_static_page_needs_no_server(seen: Seen, world: ViewerWorld, tmp_pat
     assert seen.page.locator("#picture img").evaluate("(i) => i.naturalWidth") == 480
     assert not seen.page.locator("#drop").is_visible()
     assert "featuredb view" in seen.page.locator("#no-queries").inner_text()
+
+
+def test_places_far_apart_are_shown_one_at_a_time(seen: Seen, tmp_path: Path) -> None:
+    with running_viewer(varied_database(tmp_path / "maps.db")) as address:
+        seen.open(address)
+        assert seen.page.locator("#place option").count() == 4
+        for number in range(4):
+            seen.page.select_option("#place", str(number))
+            seen.page.wait_for_function(f"() => window.featuredb.then((v) => v.number === {number})")
+            name = seen.of_viewer("viewer.place.maps[0].id")
+            seen.page.wait_for_selector(f"#tree button[title='{name}']")
+            seen.only("points", "photos")
+            assert coloured(seen.pixels()) > 500
 
 
 def test_an_empty_database_says_so(seen: Seen, tmp_path: Path) -> None:

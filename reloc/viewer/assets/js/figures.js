@@ -58,12 +58,14 @@ export function wayOf(frames) {
     colours.push(colour.r, colour.g, colour.b, colour.r, colour.g, colour.b);
   }
   const dots = known.flatMap((frame) => colour.set(STATE[frame.state]).toArray());
-  const dot = { vertexColors: true, depthTest: false, size: 5, sizeAttenuation: false };
+  const centers = known.flatMap((frame) => frame.pose.center);
+  const dot = { depthTest: false, sizeAttenuation: false };
   const group = new THREE.Group().add(
     new THREE.LineSegments(coloured(positions, colours), new THREE.LineBasicMaterial({ vertexColors: true, depthTest: false })),
-    new THREE.Points(coloured(known.flatMap((frame) => frame.pose.center), dots), new THREE.PointsMaterial(dot)),
+    new THREE.Points(geometryOf(centers), new THREE.PointsMaterial({ ...dot, size: 8 })),
+    new THREE.Points(coloured(centers, dots), new THREE.PointsMaterial({ ...dot, size: 5, vertexColors: true })),
   );
-  for (const part of group.children) part.renderOrder = 12;
+  group.children.forEach((part, k) => (part.renderOrder = 12 + k));
   return group;
 }
 
