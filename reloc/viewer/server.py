@@ -21,7 +21,7 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse
 
-from featuredb.errors import FeatureDbError, ServiceError
+from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
 from reloc.viewer.page import assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.query import LIMITS, Queries
@@ -185,9 +185,14 @@ def _add_failures(app: FastAPI) -> None:
     async def service_error(request: Request, error: ServiceError) -> Response:
         return failed(_STATUS.get(error.code, 500), error.code, error.message)
 
-    @app.exception_handler(FeatureDbError)
+    @app.exception_handler(InvalidValueError)
+    @app.exception_handler(GeodesyError)
     async def refused(request: Request, error: FeatureDbError) -> Response:
         return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
+
+    @app.exception_handler(FeatureDbError)
+    async def broken(request: Request, error: FeatureDbError) -> Response:
+        return failed(500, ErrorCode.INTERNAL.value, str(error))  # the database is gone, for example
 
     @app.exception_handler(RequestValidationError)
     async def unreadable(request: Request, error: RequestValidationError) -> Response:

@@ -4,7 +4,11 @@ import hashlib
 import http.client
 import io
 import json
+import shutil
+import signal
 import socket
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator
 from dataclasses import replace
@@ -301,6 +305,36 @@ def test_a_spot_is_told_in_utm_and_degrees(url: str, world: ViewerWorld) -> None
         response = get(f"{url}/api/where", params={"place": 0, "east": east, "north": 0, "up": 0})
         assert response.status_code == 400
     assert get(f"{url}/api/where", params={"place": 3, "east": 0, "north": 0, "up": 0}).status_code == 404
+
+
+def test_a_database_that_is_gone_is_an_error_in_json(tmp_path: Path, world: ViewerWorld) -> None:
+    shutil.copytree(world.database.url, tmp_path / "maps.db")
+    with running_viewer(Database.open(tmp_path / "maps.db")) as url:
+        shutil.rmtree(tmp_path / "maps.db")
+        response = post(url, world.query.read_bytes())
+        assert response.status_code == 500
+        assert response.json()["code"] == "INTERNAL"
+        assert get(f"{url}/api/scene").status_code == 200  # the page goes on
+
+
+def test_the_command_serves_until_it_is_stopped(world: ViewerWorld) -> None:
+    command = [sys.executable, "-m", "featuredb.cli", "view", world.database.url, "--no-browser"]
+    command += ["--photos", str(world.photos), "--trajectory", str(world.track), "--maps", "field"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            url = process.stdout.readline().split(";")[0].rstrip("/")
+            assert url.startswith("http://127.0.0.1:")
+            scene = get(f"{url}/api/scene").json()
+            assert [m["id"] for m in scene["places"][0]["maps"]] == ["field"]
+            assert len(scene["places"][0]["trajectories"][0]["frames"]) == 11
+            assert get(f"{url}/api/picture", params={"map": "field", "image": 0}).status_code == 200
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 0
+            assert process.stderr is not None
+            assert process.stderr.read() == ""
+        finally:
+            process.kill()
 
 
 def test_without_a_folder_of_photos_the_page_says_so() -> None:

@@ -93,11 +93,13 @@ export class Ground {
   drawShare(share) {
     for (const cloud of [...this.maps, ...this.scans]) cloud.drawShare(share);
   }
+}
 
-  dispose() {
-    this.object.traverse((object) => {
-      object.geometry?.dispose();
-      object.material?.dispose();
-    });
-  }
+/** Takes objects out of the view for good. @param {THREE.Object3D} group */
+export function discard(group) {
+  group.traverse((object) => {
+    object.geometry?.dispose();
+    object.material?.dispose();
+  });
+  group.removeFromParent();
 }

@@ -96,7 +96,9 @@ export class Controls {
       const text = ground.heights.map((h) => `${(h + place.frame.height_m).toFixed(1)} m`);
       keys.push(ramp, make("span", { class: "ends" }, text[0], make("span", {}, datum), text[1]));
     }
-    if (this.mode === "map") place.maps.slice(0, 12).forEach((m, k) => keys.push(key(colourOfMap("map", m, k), m.name || m.id)));
+    if (this.mode === "map") {
+      place.maps.slice(0, 12).forEach((map, row) => keys.push(key(colourOfMap("map", map, row), map.name || map.id)));
+    }
     if (!["own", "height"].includes(this.mode) && place.scans.length) keys.push(key(SCAN, "scan"));
     if (place.trajectories.length) for (const [state, colour] of Object.entries(STATE)) keys.push(key(colour, state));
     if (place.height_datums.length > 1) {

@@ -43,7 +43,10 @@ export function inliersOf(center, points, colour) {
   return group;
 }
 
-/** The way of a camera: a dot for each frame, by state; the line is red where frames between are lost. @param {Array<any>} frames of a track */
+/**
+ * The way of a camera: a dot for each frame, by state; the line is red where frames between are lost.
+ * @param {Array<any>} frames of a track
+ */
 export function wayOf(frames) {
   const known = frames.filter((frame) => frame.pose !== null);
   const positions = [];
@@ -59,9 +62,10 @@ export function wayOf(frames) {
   }
   const dots = known.flatMap((frame) => colour.set(STATE[frame.state]).toArray());
   const centers = known.flatMap((frame) => frame.pose.center);
+  const line = new THREE.LineBasicMaterial({ vertexColors: true, depthTest: false });
   const dot = { depthTest: false, sizeAttenuation: false };
   const group = new THREE.Group().add(
-    new THREE.LineSegments(coloured(positions, colours), new THREE.LineBasicMaterial({ vertexColors: true, depthTest: false })),
+    new THREE.LineSegments(coloured(positions, colours), line),
     new THREE.Points(geometryOf(centers), new THREE.PointsMaterial({ ...dot, size: 8 })),
     new THREE.Points(coloured(centers, dots), new THREE.PointsMaterial({ ...dot, size: 5, vertexColors: true })),
   );

@@ -1,7 +1,7 @@
 /** The page: loads the scene, and joins its parts. */
 
 import * as THREE from "three";
-import { Ground } from "viewer/clouds.js";
+import { discard, Ground } from "viewer/clouds.js";
 import { ANSWER, colourOfMap, SCAN, SELECTED } from "viewer/colours.js";
 import { Controls } from "viewer/controls.js";
 import { ask, loadPoints, loadScene, picture } from "viewer/data.js";
@@ -37,9 +37,7 @@ class Viewer {
   async open(number) {
     this.number = number;
     const data = await loadPoints(number);
-    this.ground?.object.removeFromParent();
-    this.ground?.dispose();
-    this.cameras?.forEach((cameras) => cameras.object.removeFromParent());
+    if (this.ground) [this.ground, ...this.cameras].forEach((layer) => discard(layer.object));
     this.close();
     this.ground = new Ground(this.place, data);
     this.cameras = this.place.maps.map((map, row) => new Cameras(map.photos, colourOfMap("map", map, row)));
@@ -141,7 +139,8 @@ class Viewer {
   /** Asks where a photo was taken, and shows the answer. @param {File} file */
   async ask(file) {
     this.close();
-    const waiting = make("p", { class: "note", role: "status" }, "The photo is being localised. The first one waits for the index.");
+    const text = "The photo is being localised. The first one waits for the index.";
+    const waiting = make("p", { class: "note", role: "status" }, text);
     show(file.name, () => this.close(), waiting);
     try {
       const answer = await ask(file, byId("exif-prior").checked);
@@ -170,7 +169,7 @@ class Viewer {
   /** Nothing is selected. */
   close() {
     this.selected = null;
-    this.selection.clear();
+    [...this.selection.children].forEach(discard);
     this.selectedCameras = null;
     this.tree?.mark(null);
     byId("panel").hidden = true;
@@ -188,7 +187,8 @@ async function start() {
     byId("drop").hidden = !scene.queries;
     byId("no-queries").hidden = scene.queries;
     if (scene.places.length === 0) {
-      message.textContent = "There is no map and no scan in this database yet: featuredb ingest photos DB FOLDER makes maps of photos.";
+      const command = "featuredb ingest photos DB FOLDER";
+      message.textContent = `There is no map and no scan in this database yet: ${command} makes maps of photos.`;
       message.hidden = false;
       return null;
     }

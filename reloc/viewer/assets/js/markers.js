@@ -58,13 +58,6 @@ export class Cameras {
     for (const part of this.object.children) part.material.depthTest = hidden;
     this.dots.material.uniforms.size.value = this.dot * pixelRatio;
   }
-
-  dispose() {
-    for (const part of this.object.children) {
-      part.geometry.dispose();
-      part.material.dispose();
-    }
-  }
 }
 
 /** How deep pyramids are: some pixels in the plan, and never larger than the cameras lie apart. */

@@ -30,8 +30,12 @@ export function aboutPhoto(photo, map, openMap) {
 
 /** Puts the picture, or the reason why there is none, into its place. */
 export function putPicture({ url, reason }, name) {
-  const picture = url === null ? make("p", { class: "note" }, `No picture: ${reason}.`) : make("img", { src: url, alt: name });
-  byId("picture").replaceChildren(picture);
+  if (url === null) byId("picture").replaceChildren(make("p", { class: "note" }, `No picture: ${reason}.`));
+  else {
+    const shown = make("img", { src: url, alt: name });
+    shown.addEventListener("load", () => URL.revokeObjectURL(url));
+    byId("picture").replaceChildren(shown);
+  }
 }
 
 /** What is known of a map, and its photos. @param {function(any): void} openPhoto */
@@ -67,7 +71,11 @@ export function aboutMap(map, nameOf, openMap, openPhoto) {
   ];
 }
 
-/** The answer to a photo. @param {any} answer of reloc/viewer/query.py @param {function(string): string} nameOf a map */
+/**
+ * The answer to a photo.
+ * @param {any} answer of reloc/viewer/query.py
+ * @param {function(string): string} nameOf a map
+ */
 export function aboutAnswer(answer, nameOf) {
   const { reply } = answer;
   if (reply.status !== "localised") {
@@ -84,7 +92,8 @@ export function aboutAnswer(answer, nameOf) {
     table([["inliers", String(reply.inliers)], ["confidence", reply.confidence.toFixed(3)], ["maps", reply.maps.map(nameOf).join(", ")]]),
     make("h3", {}, "Pose"),
     placeTable({
-      utm: reply.utm, height_datum: reply.height_datum, latitude_deg: reply.position.lat, longitude_deg: reply.position.lon,
+      utm: reply.utm, height_datum: reply.height_datum,
+      latitude_deg: reply.position.lat, longitude_deg: reply.position.lon,
       quaternion_xyzw: ["x", "y", "z", "w"].map((axis) => reply.quaternion[axis]), ...answer.angles,
     }),
     make("h3", {}, "Uncertainty"),
@@ -92,7 +101,7 @@ export function aboutAnswer(answer, nameOf) {
       ["68 %", `${metres(accuracy.horizontal_68_m)} in plan, ${metres(accuracy.vertical_68_m)} in height`],
       ["", `${accuracy.orientation_68_deg.toFixed(3)}°`],
     ]),
-    ...(answer.pose ? uncertainty(answer.pose, ANSWER) : [make("p", { class: "note" }, "Its map is not among those shown.")]),
+    ...(answer.pose ? uncertainty(answer.pose, ANSWER) : [make("p", { class: "note" }, "Its map is not shown here.")]),
   ];
 }
 

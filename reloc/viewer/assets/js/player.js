@@ -1,6 +1,7 @@
 /** Plays tracks of films: which frame is now, and where its camera is. */
 
 import * as THREE from "three";
+import { discard } from "viewer/clouds.js";
 import { SELECTED, STATE } from "viewer/colours.js";
 import { byId, make } from "viewer/dom.js";
 import { wayOf } from "viewer/figures.js";
@@ -25,7 +26,7 @@ export class Player {
   load(tracks) {
     this.pause();
     this.tracks = tracks;
-    this.object.clear();
+    [...this.object.children].forEach(discard);
     byId("player").hidden = tracks.length === 0;
     byId("track").replaceChildren(...tracks.map((t, k) => make("option", { value: k }, t.name)));
     byId("track").hidden = tracks.length < 2;
@@ -60,8 +61,7 @@ export class Player {
     byId("time").value = time_s;
     const frame = this.frameAt(time_s);
     this.frame = frame;
-    this.camera?.dispose();
-    this.camera?.object.removeFromParent();
+    if (this.camera) discard(this.camera.object);
     this.camera = frame.pose === null ? null : new Cameras([frame.pose], SELECTED, 13);
     if (this.camera) this.object.add(this.camera.object);
     const state = make("b", {}, frame.state);
