@@ -114,6 +114,8 @@ class _Builder:
             if not here and not played and self._is_part:
                 continue
             place, data = self._place(len(places), frame, here, beside)
+            # Of what there is first: the zone in which spots of this place are told.
+            place["epsg"] = spots[rows[0]].epsg
             place["trajectories"] = [describe_trajectory(t, frame) for t in played]
             places.append(place)
             points.append(data)
@@ -182,7 +184,6 @@ class _Builder:
                 "height_m": frame.height_m,
             },
             "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
-            "epsg": (maps[0].epsg if maps else scans[0].epsg) if maps or scans else None,
             "maps": described_maps,
             "scans": described_scans,
         }

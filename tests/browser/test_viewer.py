@@ -283,6 +283,18 @@ def test_a_track_plays_and_tells_what_is_lost(seen: Seen, url: str) -> None:
     assert end - start == pytest.approx(40.0, abs=0.05)  # type: ignore[operator]
 
 
+def test_a_track_alone_is_shown(seen: Seen, world: ViewerWorld, tmp_path: Path) -> None:
+    database = Database.create(tmp_path / "empty.db")
+    scene = build_scene(database, database.snapshot(), [read_trajectory_csv(world.track)])
+    with running_viewer(database, scene) as address:
+        seen.open(address)
+        seen.page.locator("#time").fill("2")
+        assert "frame 10" in seen.page.locator("#moment").inner_text()
+        assert coloured(seen.pixels()) > 500
+        seen.page.locator("#canvas").hover(position={"x": 300, "y": 200})
+        seen.page.wait_for_selector("#readout:has-text('EPSG:32632')")
+
+
 def test_the_lineage_is_a_tree_whose_maps_can_be_opened(seen: Seen, url: str) -> None:
     seen.open(url)
     below = seen.page.locator("#tree > li", has=seen.page.locator("button[title=field]")).locator("ul button")

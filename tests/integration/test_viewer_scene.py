@@ -246,6 +246,7 @@ def test_a_track_is_a_place_where_no_map_is(tmp_path: Path) -> None:
     write_trajectory(tmp_path / "t.csv", track)
     scene = build_scene(database, database.snapshot(), [read_trajectory_csv(tmp_path / "t.csv")])
     (place,) = scene.document["places"]
+    assert (place["maps"], place["scans"], place["epsg"]) == ([], [], 32632)
     frames = place["trajectories"][0]["frames"]
     steps = [f["pose"]["center"][0] for f in frames if f["pose"]]
     assert steps[-1] - steps[0] == pytest.approx(40.0, abs=0.01)

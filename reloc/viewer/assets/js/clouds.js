@@ -70,7 +70,8 @@ export class Ground {
     this.maps = place.maps.map((map) => new Cloud(data, map.buffer));
     this.scans = place.scans.map((scan) => new Cloud(data, scan.buffer));
     this.covers = place.maps.map((map, row) => coverageOf(map.coverage, colourOfMap("map", map, row)));
-    this.object.add(...[...this.scans, ...this.maps].map((cloud) => cloud.object), ...this.covers);
+    for (const cloud of [...this.scans, ...this.maps]) this.object.add(cloud.object);
+    for (const cover of this.covers) this.object.add(cover);
     const ranges = [...this.maps, ...this.scans].filter((c) => c.buffer.count).map((c) => c.buffer.box);
     /** Lowest and highest point, strays apart, above the frame's origin. */
     this.heights = [Math.min(...ranges.map((box) => box[0][2])), Math.max(...ranges.map((box) => box[1][2]))];

@@ -37,6 +37,7 @@ class Viewer {
   async open(number) {
     this.number = number;
     const data = await loadPoints(number);
+    if (this.number !== number) return; // another place was chosen meanwhile
     if (this.ground) [this.ground, ...this.cameras].forEach((layer) => discard(layer.object));
     this.close();
     this.ground = new Ground(this.place, data);
@@ -142,8 +143,10 @@ class Viewer {
     const text = "The photo is being localised. The first one waits for the index.";
     const waiting = make("p", { class: "note", role: "status" }, text);
     show(file.name, () => this.close(), waiting);
+    const question = (this.question = {});
     try {
       const answer = await ask(file, byId("exif-prior").checked);
+      if (this.question !== question) return; // another photo was dropped meanwhile
       if (answer.place !== undefined && answer.place !== this.number) await this.controls.goToPlace(answer.place);
       this.close();
       show(file.name, () => this.close(), ...aboutAnswer(answer, (id) => this.nameOf(id)));

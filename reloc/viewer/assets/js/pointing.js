@@ -64,7 +64,6 @@ export class Pointing {
   /** Adds what the server knows of the spot. */
   async tell(local, east, north) {
     const { number, place } = this.viewer;
-    if (place.epsg === null) return;
     const found = await where(number, [east, north, place.maps[0]?.coverage.ground_m ?? 0]).catch(() => null);
     if (found === null || byId("readout").textContent !== local) return;
     const { epsg, easting, northing } = found.utm;
