@@ -295,7 +295,7 @@ def test_a_track_alone_is_shown(seen: Seen, world: ViewerWorld, tmp_path: Path) 
         seen.page.wait_for_selector("#readout:has-text('EPSG:32632')")
 
 
-def test_the_lineage_is_a_tree_whose_maps_can_be_opened(seen: Seen, url: str) -> None:
+def test_the_lineage_is_a_tree_whose_maps_can_be_opened(seen: Seen, url: str, world: ViewerWorld) -> None:
     seen.open(url)
     below = seen.page.locator("#tree > li", has=seen.page.locator("button[title=field]")).locator("ul button")
     assert below.get_attribute("title") == "child"
@@ -306,6 +306,17 @@ def test_the_lineage_is_a_tree_whose_maps_can_be_opened(seen: Seen, url: str) ->
     assert rows["lineage"] == "1 step from anchor field"
     seen.page.locator("#panel dd button", has_text="field (flat)").click()
     assert seen.page.locator("#panel .photos button").count() == 9
+    seen.page.get_by_role("button", name="Fit").click()
+    wide = seen.of_viewer("viewer.stage.widthOfPlan")
+    seen.of_viewer("viewer.stage.zoom(0.2)")
+    seen.page.get_by_role("button", name="Go there").click()
+    assert seen.of_viewer("viewer.stage.widthOfPlan") < 2.5 * wide  # type: ignore[operator]
+    panel = seen.page.locator("#panel").bounding_box()
+    assert panel is not None
+    for row in range(len(world.field.images)):  # all of them beside the panel
+        at = seen.of_viewer(f"viewer.stage.project(viewer.place.maps[0].photos[{row}].center)")
+        assert 0 < at[0] < panel["x"] - 284  # type: ignore[index]
+        assert 0 < at[1] < 720  # type: ignore[index]
 
 
 def test_it_can_be_used_by_keyboard(seen: Seen, url: str) -> None:

@@ -38,7 +38,7 @@ export class Controls {
   fillPlaces(places) {
     byId("place-row").hidden = places.length < 2;
     byId("place").replaceChildren(
-      ...places.map((place, k) => make("option", { value: k }, `${place.name} (${place.maps.length} maps)`)),
+      ...places.map((place, k) => make("option", { value: k }, `${place.name}: ${place.maps.length} maps`)),
     );
     byId("place").addEventListener("change", () => this.viewer.open(Number(byId("place").value)));
   }

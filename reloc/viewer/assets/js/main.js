@@ -117,14 +117,29 @@ class Viewer {
     return this.document.places.flatMap((place) => place.maps).find((map) => map.id === id)?.name || id;
   }
 
-  /** A map in the panel, and the view on it. @param {string} id */
+  /** A map in the panel. @param {string} id */
   openMap(id) {
     const map = this.map(id);
     if (map === undefined) return;
     this.close();
     this.tree.mark(id);
     const body = aboutMap(map, (other) => this.nameOf(other), (other) => this.openMap(other), (p) => this.openPhoto(map, p));
-    show(map.name || map.id, () => this.close(), ...body);
+    const there = make("button", {}, "Go there");
+    there.addEventListener("click", () => this.goToMap(map));
+    show(map.name || map.id, () => this.close(), there, ...body);
+  }
+
+  /** The view on a map's points, or on its photos where it has none. */
+  goToMap(map) {
+    const box = new THREE.Box3();
+    const spots = map.buffer.count ? map.buffer.box : map.photos.map((photo) => photo.center);
+    for (const spot of spots) box.expandByPoint(new THREE.Vector3(...spot));
+    if (box.isEmpty()) return;
+    const size = box.getSize(new THREE.Vector3());
+    const across = Math.max(size.x, size.y * this.stage.space.aspect, 20);
+    const covered = byId("panel").offsetWidth;
+    const free = 1 - covered / this.stage.canvas.clientWidth;
+    this.stage.goTo(box.getCenter(new THREE.Vector3()).toArray(), (1.1 * across) / free, covered);
   }
 
   /** A photo in the panel, its camera and ellipse in the view. */
@@ -154,7 +169,7 @@ class Viewer {
         this.select(answer.pose, ANSWER);
         this.selection.add(inliersOf(answer.pose.center, answer.points, ANSWER));
         const width_m = Math.max(12 * this.spacing, 10 * answer.pose.ellipse.major_m);
-        this.stage.goTo(answer.pose.center, width_m, byId("panel").offsetWidth);
+        this.stage.goTo(answer.pose.center, Math.min(width_m, this.stage.widthOfPlan), byId("panel").offsetWidth);
       }
     } catch (error) {
       waiting.textContent = `No answer: ${error.message}`;

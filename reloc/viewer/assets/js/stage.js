@@ -102,12 +102,12 @@ export class Stage {
 
   /**
    * Moves both views so that a spot is in the middle.
-   * @param {number} width_m of the plan, unless it shows less already
+   * @param {number} width_m of the plan
    * @param {number} covered_px at the right, where a panel lies
    */
   goTo([x, y, z], width_m, covered_px) {
     const to = new THREE.Vector3(x, y, z);
-    this.plan.zoom = Math.max(this.plan.zoom, (this.plan.right - this.plan.left) / width_m);
+    this.plan.zoom = (this.plan.right - this.plan.left) / width_m;
     this.plan.updateProjectionMatrix();
     const shift = to.clone().sub(this.planControls.target).setZ(0);
     shift.x += (covered_px / 2) * this.metresPerPixel;
@@ -134,9 +134,14 @@ export class Stage {
     this.draw();
   }
 
+  /** Metres across the plan. */
+  get widthOfPlan() {
+    return (this.plan.right - this.plan.left) / this.plan.zoom;
+  }
+
   /** Metres across a pixel in the plan. */
   get metresPerPixel() {
-    return (this.plan.right - this.plan.left) / this.plan.zoom / Math.max(this.canvas.clientWidth, 1);
+    return this.widthOfPlan / Math.max(this.canvas.clientWidth, 1);
   }
 
   /** Where a spot is seen: pixels of the canvas, or null behind the camera. @returns {?[number, number]} */
