@@ -1,13 +1,11 @@
-"""The photos of a map on disk. A map keeps their names and SHA-256, not their pixels."""
+"""The photos of one map on disk, as registration needs them: all that there are, or the reason for none."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.errors import RegistrationError
-from featuredb.file_digest import file_sha256
 from featuredb.maps.feature_map import FeatureMap, MapImage
-
-_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
+from featuredb.maps.photo_files import PhotoFolder
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,18 +49,19 @@ def find_photos(feature_map: FeatureMap, folder: Path) -> PhotoFiles:
         raise RegistrationError(
             f"--photos: expected the folder of the map's photos, found no folder {folder}"
         )
+    search = PhotoFolder(folder)
     paths: dict[int, Path] = {}
     missing: dict[int, str] = {}
     for image in feature_map.images:
-        path = folder / image.name
-        if not path.is_file():
-            missing[image.image_id] = "there is no such file"
-        elif sha256_of(path) != image.sha256:
-            missing[image.image_id] = "the file of that name has other bytes (SHA-256) than the map's photo"
+        path, reason = search.by_name(image)
+        if path is None:
+            missing[image.image_id] = reason
         else:
             paths[image.image_id] = path
-    if missing:
-        _find_by_content(feature_map, folder, paths, missing)
+    for image in feature_map.images:
+        if image.image_id in missing and (path := search.by_content(image)) is not None:
+            paths[image.image_id] = path
+            del missing[image.image_id]
     if not paths:
         reasons = sorted(set(missing.values()))
         raise RegistrationError(
@@ -71,32 +70,3 @@ def find_photos(feature_map: FeatureMap, folder: Path) -> PhotoFiles:
             f"{'; '.join(reasons) or 'the map has no photos'}; name the folder that the map was made of"
         )
     return PhotoFiles(folder=folder, paths=paths, missing=missing)
-
-
-def _find_by_content(
-    feature_map: FeatureMap, folder: Path, paths: dict[int, Path], missing: dict[int, str]
-) -> None:
-    """Look for renamed or moved photos; what is found goes from `missing` to `paths`."""
-    taken = set(paths.values())
-    candidates = [
-        path
-        for path in sorted(folder.rglob("*"))
-        if path.suffix.lower() in _SUFFIXES and path.is_file() and path not in taken
-    ]
-    by_digest = {sha256_of(path): path for path in candidates}
-    for image in feature_map.images:
-        if image.image_id in missing and image.sha256 in by_digest:
-            paths[image.image_id] = by_digest[image.sha256]
-            del missing[image.image_id]
-
-
-def sha256_of(path: Path) -> str:
-    """Hex digest of a file's bytes.
-
-    Raises:
-        RegistrationError: it cannot be read.
-    """
-    try:
-        return file_sha256(path)
-    except OSError as error:
-        raise RegistrationError(f"photo {path} cannot be read: {error.strerror or error}") from error

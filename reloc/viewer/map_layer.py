@@ -1,0 +1,128 @@
+"""One map as the page shows it: what is known of it, its photos, what it covers."""
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from featuredb.export.selection import licence_of
+from featuredb.export.shots import pose_covariance
+from featuredb.geo.geopose import geopose_from_camera
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import Lineage, describe_lineage
+from featuredb.store import MapSummary
+from reloc.viewer.places import Spot
+from reloc.viewer.points import DrawnPoints
+from reloc.viewer.poses import drawn_pose, worded_place, worded_sigmas
+
+_CELLS = 60  # along the longer side of the drawn points; smaller cells would fall into specks
+_LEAST_POINTS = 2  # in a cell that counts as covered; a single one is often wrong
+
+
+def describe_map(summary: MapSummary, lineage: Lineage, drawn_under: str | None) -> dict[str, Any]:
+    """What the store knows of a map, without loading it.
+
+    Args:
+        drawn_under: the map under which it stands in the tree, or None.
+    """
+    return {
+        "id": summary.map_id,
+        "name": summary.name,
+        "status": summary.status,
+        "status_reason": summary.status_reason,
+        "method": summary.method,
+        "generation": summary.generation,
+        "parents": list(summary.parents),
+        "under": drawn_under,
+        "chain": list(lineage.chain),
+        "lineage": describe_lineage(lineage),
+        "drift_m": lineage.drift_m,
+        "budget_m": lineage.budget_m,
+        "residual_rms_m": summary.residual_rms_m,
+        "points": summary.points,
+        "epsg": summary.epsg,
+        "height_datum": summary.height_datum,
+        "created_at": summary.created_at.isoformat(timespec="seconds"),
+        "source": summary.source,
+        "licence": summary.licence,
+    }
+
+
+def describe_photos(feature_map: FeatureMap, frame: LocalFrame) -> list[dict[str, Any]]:
+    """The photos of a map, poses in the place's frame."""
+    frame_from_map = frame.enu_from(feature_map.frame)
+    photos = []
+    for image in feature_map.images:
+        pose = image.cam_from_local
+        center = frame_from_map.act(pose.center)
+        camera = feature_map.cameras[image.camera_id]
+        utm = feature_map.frame.utm_from_enu(pose.center, feature_map.epsg)
+        geopose = geopose_from_camera(pose, feature_map.frame)
+        local_from_true = frame.true_enu_from_enu(center).T
+        time = image.capture_time
+        photos.append(
+            {
+                "id": image.image_id,
+                "name": image.name,
+                **drawn_pose(center, frame_from_map.rotation @ pose.rotation.T, camera),
+                **worded_place(geopose, utm, feature_map.epsg, feature_map.height_datum),
+                **worded_sigmas(pose_covariance(feature_map, image), local_from_true),
+                "camera": worded_camera(camera),
+                "time": None if time is None else time.isoformat(),
+                "owner": image.owner,
+                "licence": licence_of(image, feature_map),
+            }
+        )
+    return photos
+
+
+def worded_camera(camera: Camera) -> str:
+    """A lens in a few words."""
+    return f"{camera.model} {camera.width}x{camera.height}, focal length {camera.focal_px:.0f} px"
+
+
+def coverage(points: DrawnPoints) -> dict[str, Any]:
+    """Where the map has points, in plan.
+
+    Returns:
+        `ground_m`: the height at which it is drawn, below nearly all points. `cell_m`, and `cells`: rows i, j
+        of square cells with at least two points, from i * cell_m to (i + 1) * cell_m east, j likewise north.
+        `hull`: corners (k, 2) of the points' convex hull, counterclockwise; none where there is no area.
+        Strays are left out of both.
+    """
+    plan = points.offsets[:, :2].astype(np.float64) + points.origin[:2]
+    if len(plan) == 0:
+        return {"ground_m": 0.0, "cell_m": 1.0, "cells": [], "hull": []}
+    ground = float(np.percentile(points.offsets[:, 2], 2.0)) + float(points.origin[2])
+    low, high = points.box()[:, :2]
+    inside = plan[((plan >= low) & (plan <= high)).all(axis=1)]
+    cell = _round_length(max(float(np.ptp(inside, axis=0).max()) / _CELLS, 0.1))
+    cells, count = np.unique(np.floor(inside / cell).astype(np.int64), axis=0, return_counts=True)
+    return {
+        "ground_m": round(ground, 3),
+        "cell_m": cell,
+        "cells": cells[count >= _LEAST_POINTS].tolist(),
+        "hull": np.round(_hull(inside), 3).tolist(),
+    }
+
+
+def spot_of_map(summary: MapSummary, feature_map: FeatureMap) -> Spot:
+    """Where a map without points lies: at its frame's origin."""
+    e, n, h = feature_map.frame.utm_from_enu(np.zeros(3), summary.epsg)
+    return Spot(easting=float(e), northing=float(n), height=float(h), epsg=summary.epsg)
+
+
+def _hull(plan: FloatArray) -> FloatArray:
+    try:
+        return np.asarray(plan[ConvexHull(plan).vertices])
+    except (QhullError, ValueError):
+        return np.empty((0, 2))
+
+
+def _round_length(length: float) -> float:
+    """1, 2 or 5 times a power of ten, at least `length`."""
+    power = 10.0 ** np.floor(np.log10(length))
+    return float(next(f * power for f in (1.0, 2.0, 5.0, 10.0) if f * power >= length - 1e-12))

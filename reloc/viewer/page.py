@@ -1,0 +1,108 @@
+"""The page's own files: HTML, style, modules, and the libraries beside them.
+
+Modules name each other by bare names ("viewer/plan.js", "three"), which an import map in the page leads to
+files here, or to the text itself in a page that is one file.
+"""
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+
+_MEDIA_TYPES = {"js": "text/javascript", "css": "text/css", "txt": "text/plain", "json": "application/json"}
+_TEMPLATE = "index.html"
+_STYLE = "viewer.css"
+# Module names of the libraries; "three/core" is what three.module.min.js calls "./three.core.min.js".
+_LIBRARIES = {
+    "three": "vendor/three.module.min.js",
+    "three/core": "vendor/three.core.min.js",
+    "three/orbit": "vendor/OrbitControls.js",
+}
+_RELATIVE_CORE = b'"./three.core.min.js"'
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asset:
+    """One file as it is sent."""
+
+    data: bytes
+    media_type: str
+
+
+def assets() -> dict[str, Asset]:
+    """All files that the page loads, by their path below /assets/."""
+    root = resources.files("reloc.viewer") / "assets"
+    found = {}
+    for folder in ("", "js", "vendor"):
+        for file in (root / folder).iterdir():
+            if file.is_file() and file.name != _TEMPLATE:
+                name = f"{folder}/{file.name}" if folder else file.name
+                found[name] = Asset(
+                    data=file.read_bytes(), media_type=_MEDIA_TYPES[file.name.rsplit(".", 1)[-1]]
+                )
+    return found
+
+
+def page() -> str:
+    """The page whose files lie below /assets/."""
+    imports = {name: f"/assets/{path}" for name, path in _LIBRARIES.items()}
+    return _filled(
+        imports={**imports, "viewer/": "/assets/js/"},
+        style=f'<link rel="stylesheet" href="/assets/{_STYLE}">',
+        values="",
+        main='<script type="module" src="/assets/js/main.js"></script>',
+    )
+
+
+def content_policy() -> str:
+    """Content-Security-Policy of `page`: nothing from elsewhere, and no script in the page but the map."""
+    inside = page().split('<script type="importmap">')[1].split("</script>")[0]
+    digest = base64.b64encode(hashlib.sha256(inside.encode()).digest()).decode()
+    return (
+        f"default-src 'none'; script-src 'self' 'sha256-{digest}'; style-src 'self'; "
+        "img-src 'self' data: blob:; connect-src 'self'; base-uri 'none'; form-action 'none'; "
+        "frame-ancestors 'none'"
+    )
+
+
+def page_in_one(values: Mapping[str, str]) -> str:
+    """The page with everything in it.
+
+    Args:
+        values: texts by id that the page finds in itself: JSON, or base64.
+    """
+    files = assets()
+    # A module in a data URL has no folder to look into, so the library's one relative import gets a name.
+    three = files[_LIBRARIES["three"]].data
+    assert _RELATIVE_CORE in three
+    modules = {name: files[path].data for name, path in _LIBRARIES.items()}
+    modules["three"] = three.replace(_RELATIVE_CORE, b'"three/core"')
+    modules |= {f"viewer/{n.removeprefix('js/')}": f.data for n, f in files.items() if n.startswith("js/")}
+    imports = {
+        name: f"data:text/javascript;base64,{base64.b64encode(data).decode()}"
+        for name, data in modules.items()
+    }
+    style = f"<style>\n{files[_STYLE].data.decode()}</style>"
+    licence = files["vendor/LICENSE-three.txt"].data.decode()
+    inside = "".join(
+        f'<script type="text/plain" id="{name}">{text.replace("<", chr(92) + "u003c")}</script>\n'
+        for name, text in values.items()
+    )
+    return _filled(
+        imports=imports,
+        style=style,
+        values=f"<!-- three.js\n{licence}-->\n{inside}",
+        main='<script type="module">import "viewer/main.js";</script>',
+    )
+
+
+def _filled(*, imports: Mapping[str, str], style: str, values: str, main: str) -> str:
+    template = (resources.files("reloc.viewer") / "assets" / _TEMPLATE).read_text(encoding="utf-8")
+    # The values last: whatever maps are called, nothing is looked for in them.
+    marks = {"@STYLE@": style, "@IMPORTS@": json.dumps({"imports": imports}), "@MAIN@": main}
+    for mark, text in {**marks, "@VALUES@": values}.items():
+        assert template.count(mark) == 1, mark
+        template = template.replace(mark, text)
+    return template

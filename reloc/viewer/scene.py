@@ -1,0 +1,270 @@
+"""A snapshot as the page's values: places with maps, photos, scans and tracks, and the points to draw.
+
+`build_scene` reads everything once; after it the database is needed for queries only. What is in
+`Scene.document` goes into JSON as it is; coordinates are metres east, north, up in the frame of their place.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.export.selection import Selection, licence_is, licensed, selected_maps
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.maps.feature_map import MapImage
+from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.scans import ScanSummary, count_points, list_scans
+from reloc.tracking.trajectory import Trajectory
+from reloc.viewer.map_layer import coverage, describe_map, describe_photos, spot_of_map
+from reloc.viewer.places import Spot, group, scan_box, spot_of
+from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
+from reloc.viewer.trajectories import describe_trajectory, spot_of_trajectory
+
+DEFAULT_POINTS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions:
+    """What is shown.
+
+    Attributes:
+        selection: of maps; of their photos where it names licences.
+        points: at most so many in each place, of maps and scans together.
+        told: is called with the number of maps read and their total.
+    """
+
+    selection: Selection = field(
+        default_factory=lambda: Selection(statuses=("active", "quarantined", "retired"))
+    )
+    points: int = DEFAULT_POINTS
+    told: Callable[[int, int], None] = lambda done, total: None
+
+    def __post_init__(self) -> None:
+        if self.points < 0:
+            raise InvalidValueError(f"--points: expected a number from 0 on, found {self.points}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """Everything that the page shows.
+
+    Attributes:
+        document: ready for JSON; each map and scan names its part of its place's points by `buffer`.
+        points: of each place, the buffers of its maps and scans one after the other.
+        images: by map id and image id.
+        frames: of each place.
+        place_of_map: row of the place, by map id.
+    """
+
+    document: dict[str, Any]
+    points: tuple[bytes, ...]
+    images: Mapping[tuple[str, int], MapImage]
+    frames: tuple[LocalFrame, ...]
+    place_of_map: Mapping[str, int]
+
+
+def build_scene(
+    database: Database,
+    snapshot: Snapshot,
+    trajectories: Sequence[Trajectory] = (),
+    options: SceneOptions | None = None,
+) -> Scene:
+    """Read what is shown of a snapshot, and the scans of the newest version.
+
+    Raises:
+        ExportError: nothing is selected of a database that has maps. InvalidValueError: a track without a
+            single pose. StoreError, MapNotFoundError: as `Snapshot`.
+    """
+    return _Builder(database, snapshot, trajectories, options or SceneOptions()).build()
+
+
+class _Builder:
+    """What the steps of `build_scene` share."""
+
+    def __init__(
+        self,
+        database: Database,
+        snapshot: Snapshot,
+        trajectories: Sequence[Trajectory],
+        options: SceneOptions,
+    ) -> None:
+        self._database, self._snapshot = database, snapshot
+        self._trajectories, self._options = trajectories, options
+        known = snapshot.maps(include_retired=True)
+        self._maps = selected_maps(database, snapshot, options.selection) if known else []
+        self._shown = {m.map_id for m in self._maps}
+        self._lineages = snapshot.lineages()
+        self._images: dict[tuple[str, int], MapImage] = {}
+        self._place_of_map: dict[str, int] = {}
+        self._read = 0
+
+    def build(self) -> Scene:
+        maps, scans, tracks = self._maps, self._scans(), self._trajectories
+        spots = [self._spot(m) for m in maps] + [spot_of(s.box, s.epsg) for s in scans]
+        spots += [_known_spot(t) for t in tracks]
+        places: list[dict[str, Any]] = []
+        points: list[bytes] = []
+        frames: list[LocalFrame] = []
+        for frame, rows in group(spots):
+            here = [maps[r] for r in rows if r < len(maps)]
+            beside = [scans[r - len(maps)] for r in rows if 0 <= r - len(maps) < len(scans)]
+            played = [tracks[r - len(maps) - len(scans)] for r in rows if r >= len(maps) + len(scans)]
+            if not here and not played and self._is_part:
+                continue
+            place, data = self._place(len(places), frame, here, beside)
+            # Of what there is first: the zone in which spots of this place are told.
+            place["epsg"] = spots[rows[0]].epsg
+            place["trajectories"] = [describe_trajectory(t, frame) for t in played]
+            places.append(place)
+            points.append(data)
+            frames.append(frame)
+        document = {
+            "database": self._database.name,
+            "snapshot": self._snapshot.version,
+            "time": self._snapshot.timestamp.isoformat(timespec="seconds"),
+            "points_limit": self._options.points,
+            "places": places,
+        }
+        return Scene(
+            document=document,
+            points=tuple(points),
+            images=self._images,
+            frames=tuple(frames),
+            place_of_map=self._place_of_map,
+        )
+
+    @property
+    def _is_part(self) -> bool:
+        """Whether a part of the database was asked for; scans elsewhere do not belong to it."""
+        asked = self._options.selection
+        return bool(asked.maps or asked.bbox or asked.where)
+
+    def _scans(self) -> list[ScanSummary]:
+        licences = self._options.selection.licences
+        return [
+            scan
+            for scan in list_scans(self._database)
+            if licences is None or any(licence_is(scan.licence, wanted) for wanted in licences)
+        ]
+
+    def _spot(self, summary: MapSummary) -> Spot:
+        if summary.box is not None:
+            return spot_of(summary.box, summary.epsg)
+        return spot_of_map(summary, self._snapshot.load_map(summary.map_id))
+
+    def _place(
+        self, number: int, frame: LocalFrame, maps: list[MapSummary], scans: list[ScanSummary]
+    ) -> tuple[dict[str, Any], bytes]:
+        limit = self._options.points
+        wanted = shares([m.points for m in maps], limit)
+        read = [self._map(number, frame, m, int(n)) for m, n in zip(maps, wanted, strict=True)]
+        shown = [entry for entry in read if entry is not None]
+        map_boxes = [drawn.box() for _, drawn in shown if len(drawn)]
+        boxes = [scan_box(frame, map_boxes, scan.epsg) for scan in scans]
+        of_scans = [
+            sum(count_points(self._database, s, level, box) for level in range(len(s.level_points)))
+            for s, box in zip(scans, boxes, strict=True)
+        ]
+        for_maps, for_scans = _budget(sum(len(drawn) for _, drawn in shown), sum(of_scans), limit)
+        buffers = _Buffers()
+        described_maps = []
+        for (told, drawn), count in zip(shown, shares([len(d) for _, d in shown], for_maps), strict=True):
+            described_maps.append({**told, "buffer": buffers.add(drawn.first(int(count)))})
+        described_scans = []
+        for scan, box, count in zip(scans, boxes, shares(of_scans, for_scans), strict=True):
+            drawn = scan_points_in(self._database, scan, frame, box, int(count))
+            described_scans.append(_describe_scan(scan, drawn, buffers.add(drawn)))
+        place = {
+            "name": f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}",
+            "frame": {
+                "latitude_deg": frame.latitude_deg,
+                "longitude_deg": frame.longitude_deg,
+                "height_m": frame.height_m,
+            },
+            "height_datums": sorted({m.height_datum for m in maps} | {s.height_datum for s in scans}),
+            "maps": described_maps,
+            "scans": described_scans,
+        }
+        return place, buffers.data()
+
+    def _map(
+        self, number: int, frame: LocalFrame, summary: MapSummary, wanted: int
+    ) -> tuple[dict[str, Any], DrawnPoints] | None:
+        """A map and at most `wanted` of its points; None where no photo has one of the licences."""
+        feature_map = licensed(self._snapshot.load_map(summary.map_id), self._options.selection.licences)
+        self._read += 1
+        self._options.told(self._read, len(self._maps))
+        if feature_map is None:
+            return None
+        drawn = map_points(feature_map.points, feature_map.epsg, frame, wanted)
+        self._place_of_map[summary.map_id] = number
+        for image in feature_map.images:
+            self._images[summary.map_id, image.image_id] = image
+        told = {
+            **describe_map(summary, self._lineages[summary.map_id], self._under(summary.map_id)),
+            "points": len(feature_map.points),
+            "photos": describe_photos(feature_map, frame),
+            "coverage": coverage(drawn),
+        }
+        return told, drawn
+
+    def _under(self, map_id: str) -> str | None:
+        """The map under which it stands in the tree: the next one on its chain to an anchor."""
+        chain = self._lineages[map_id].chain
+        return chain[1] if len(chain) > 1 and chain[1] in self._shown else None
+
+
+class _Buffers:
+    """Points of one place, one after the other."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, drawn: DrawnPoints) -> dict[str, Any]:
+        """Append points; says where they are and how to read them."""
+        data = drawn.packed()
+        told = {
+            "origin": drawn.origin.tolist(),
+            "count": len(drawn),
+            "offset": self._size,
+            "box": np.round(drawn.box(), 3).tolist(),
+        }
+        self._parts.append(data)
+        self._size += len(data)
+        return told
+
+    def data(self) -> bytes:
+        return b"".join(self._parts)
+
+
+def _budget(of_maps: int, of_scans: int, limit: int) -> tuple[int, int]:
+    """How many points maps and scans may draw: all, or half each, and what the one leaves the other takes."""
+    for_maps = min(of_maps, max(limit - limit // 2, limit - of_scans))
+    return for_maps, min(of_scans, limit - for_maps)
+
+
+def _describe_scan(scan: ScanSummary, drawn: DrawnPoints, buffer: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "id": scan.scan_id,
+        "name": scan.name,
+        "points": scan.points,
+        "points_here": drawn.of,
+        "spacing_m": scan.spacing_m,
+        "colour": scan.colour or ("intensity" if scan.has_intensity else "none"),
+        "epsg": scan.epsg,
+        "height_datum": scan.height_datum,
+        "licence": scan.licence,
+        "buffer": buffer,
+    }
+
+
+def _known_spot(trajectory: Trajectory) -> Spot:
+    spot = spot_of_trajectory(trajectory)
+    if spot is None:
+        raise InvalidValueError(
+            f"{trajectory.source}: all {len(trajectory.points)} frames are lost, there is nothing to show"
+        )
+    return spot

@@ -1,0 +1,210 @@
+"""The page and its data over HTTP, to this machine only.
+
+The socket is bound to 127.0.0.1. A web page from elsewhere, open in the same browser, could still send
+requests here: names that lead to 127.0.0.1 are refused by the Host header, and a photo is taken only with a
+media type that a browser does not send to another site unasked.
+"""
+
+import asyncio
+import logging
+import socket
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from starlette.exceptions import HTTPException
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import ClientDisconnect
+from starlette.responses import JSONResponse
+
+from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
+from reloc.viewer.page import assets, content_policy, page
+from reloc.viewer.photos import PICTURE_PX, Pictures
+from reloc.viewer.query import LIMITS, Queries
+from reloc.viewer.scene import Scene
+from reloc.wire import ErrorCode
+
+HOST = "127.0.0.1"
+PHOTO_TYPE = "application/octet-stream"
+_STATUS = {
+    ErrorCode.BAD_REQUEST.value: 400,
+    ErrorCode.BAD_IMAGE.value: 415,
+    ErrorCode.TOO_LARGE.value: 413,
+    ErrorCode.INCOMPATIBLE_EXTRACTOR.value: 409,
+}
+_CLIENT_GONE = 499
+_LAST_PORT = 65_535
+
+
+class ViewerStartError(FeatureDbError):
+    """The viewer cannot listen."""
+
+
+def create_app(scene: Scene, pictures: Pictures, queries: Queries) -> FastAPI:
+    """The application.
+
+    Args:
+        queries: answers photos that are dropped on the page.
+    """
+    app = FastAPI(title="featuredb viewer", docs_url=None, redoc_url=None, openapi_url=None)
+    # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
+    threads = ThreadPoolExecutor(4, thread_name_prefix="viewer")
+    files, html, policy = assets(), page(), content_policy()
+    document = {**scene.document, "queries": True}
+
+    async def in_thread(work: Callable[[], Any]) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(threads, work)
+
+    @app.get("/")
+    async def index() -> Response:
+        return Response(html, media_type="text/html", headers={"Content-Security-Policy": policy})
+
+    @app.get("/assets/{name:path}")
+    async def asset(name: str) -> Response:
+        if name not in files:
+            raise HTTPException(404, f"no file {name[:100]!r}")
+        return Response(files[name].data, media_type=files[name].media_type)
+
+    @app.get("/api/scene")
+    async def scene_document() -> Response:
+        return JSONResponse(document)
+
+    @app.get("/api/points/{place}")
+    async def points(place: int) -> Response:
+        if not 0 <= place < len(scene.points):
+            raise HTTPException(404, f"no place {place}")
+        return Response(scene.points[place], media_type=PHOTO_TYPE)
+
+    @app.get("/api/picture")
+    async def picture(map: str, image: int) -> Response:
+        asked = scene.images.get((map, image))
+        if asked is None:
+            raise HTTPException(404, "no such photo")
+        data, reason = await in_thread(partial(pictures.jpeg, asked, PICTURE_PX))
+        if data is None:
+            raise HTTPException(404, reason)
+        return Response(data, media_type="image/jpeg")
+
+    @app.get("/api/where")
+    async def where(place: int, east: float, north: float, up: float) -> Response:
+        return JSONResponse(_where(scene, place, east, north, up))
+
+    @app.post("/api/query")
+    async def query(request: Request, exif_prior: bool = False) -> Response:
+        photo = await _photo(request)
+        return JSONResponse(await in_thread(partial(queries.ask, photo, exif_prior=exif_prior)))
+
+    _add_failures(app)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
+    return app
+
+
+def listen(port: int) -> socket.socket:
+    """A listening socket on this machine; port 0 takes a free one.
+
+    Raises:
+        ViewerStartError: the port is taken or none.
+    """
+    if not 0 <= port <= _LAST_PORT:
+        raise ViewerStartError(f"--port: expected 0 to {_LAST_PORT}, found {port}")
+    try:
+        bound = socket.create_server((HOST, port))
+        # Without it the body of an answer waits for the acknowledgement of its head.
+        bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return bound
+    except OSError as error:
+        raise ViewerStartError(
+            f"cannot listen on {HOST}:{port}: {error.strerror or error}; choose another with --port, "
+            "0 takes a free one"
+        ) from error
+
+
+def uvicorn_server(app: FastAPI) -> uvicorn.Server:
+    """The server, not yet running; `run(sockets=[listen(port)])` runs it."""
+    logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            server_header=False,
+            ws="none",
+            http="h11",
+            timeout_graceful_shutdown=2,
+        )
+    )
+
+
+async def _photo(request: Request) -> bytes:
+    """The body, counted while it streams.
+
+    Raises:
+        HTTPException: another media type, or too large.
+    """
+    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if found != PHOTO_TYPE:
+        raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
+    data = bytearray()
+    async for part in request.stream():
+        data += part
+        if len(data) > LIMITS.max_bytes:
+            raise HTTPException(413, f"the photo has more than {LIMITS.max_bytes} bytes")
+    return bytes(data)
+
+
+def _where(scene: Scene, place: int, east: float, north: float, up: float) -> dict[str, Any]:
+    """UTM and geographic coordinates of a spot in a place's frame.
+
+    Raises:
+        HTTPException: no such place. GeodesyError, InvalidValueError: no such spot.
+    """
+    if not 0 <= place < len(scene.frames):
+        raise HTTPException(404, f"no place {place}")
+    frame, epsg = scene.frames[place], scene.document["places"][place]["epsg"]
+    latitude, longitude, height = frame.geodetic_from_enu((east, north, up))
+    easting, northing, _ = frame.utm_from_enu((east, north, up), epsg)
+    return {
+        "latitude_deg": round(float(latitude), 8),
+        "longitude_deg": round(float(longitude), 8),
+        "height_m": round(float(height), 3),
+        "utm": {"epsg": epsg, "easting": round(float(easting), 3), "northing": round(float(northing), 3)},
+    }
+
+
+def _add_failures(app: FastAPI) -> None:
+    """Every way to fail ends in {"code", "message"}."""
+
+    def failed(status: int, code: str, message: str) -> Response:
+        return JSONResponse({"code": code, "message": message}, status)
+
+    @app.exception_handler(ServiceError)
+    async def service_error(request: Request, error: ServiceError) -> Response:
+        return failed(_STATUS.get(error.code, 500), error.code, error.message)
+
+    @app.exception_handler(InvalidValueError)
+    @app.exception_handler(GeodesyError)
+    async def refused(request: Request, error: FeatureDbError) -> Response:
+        return failed(400, ErrorCode.BAD_REQUEST.value, str(error))
+
+    @app.exception_handler(FeatureDbError)
+    async def broken(request: Request, error: FeatureDbError) -> Response:
+        return failed(500, ErrorCode.INTERNAL.value, str(error))  # the database is gone, for example
+
+    @app.exception_handler(RequestValidationError)
+    async def unreadable(request: Request, error: RequestValidationError) -> Response:
+        return failed(400, ErrorCode.BAD_REQUEST.value, "the request cannot be read")
+
+    @app.exception_handler(HTTPException)
+    async def http_error(request: Request, error: HTTPException) -> Response:
+        code = {404: "NOT_FOUND", 405: "METHOD_NOT_ALLOWED", 413: ErrorCode.TOO_LARGE.value}
+        return failed(
+            error.status_code, code.get(error.status_code, ErrorCode.BAD_REQUEST.value), error.detail
+        )
+
+    @app.exception_handler(ClientDisconnect)
+    async def gone(request: Request, error: ClientDisconnect) -> Response:
+        return Response(status_code=_CLIENT_GONE)
