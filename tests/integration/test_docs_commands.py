@@ -99,6 +99,7 @@ def after_readme(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)  # it makes the town and its maps: three minutes on two free cores
 def test_the_commands_of_the_readme_run(after_readme: Path) -> None:
     made = ("report/report.html", "overlay.png", "track.csv", "track.kml", "drawn.mp4", "colmap/sparse")
     assert [name for name in made if not (after_readme / name).exists()] == []
@@ -110,7 +111,7 @@ def test_the_commands_of_a_page_run(after_readme: Path, tmp_path: Path, page: st
     run_page(page, Path(shutil.copytree(after_readme, tmp_path / "here")))
 
 
-@pytest.mark.parametrize("command", [*(c for c in _COMMANDS if not is_run(c)), *_PROSE], ids=str)
+@pytest.mark.parametrize("command", [*_COMMANDS, *_PROSE], ids=str)
 def test_a_program_takes_the_arguments_of_the_documentation(command: Command) -> None:
     check_usage(command)
 
