@@ -48,6 +48,7 @@ def test_the_curl_lines_run(here):
     form, geopose = (
         subprocess.run(["sh", "-c", here(line)], capture_output=True, check=True, timeout=60).stdout
         for line in programs("sh")
+        if "curl" in line
     )
     assert json.loads(form)["status"] == "localised"
     assert json.loads(geopose)["geopose"]["position"]["lat"] == pytest.approx(49.0, abs=0.1)

@@ -1,0 +1,211 @@
+"""Every command line of the documentation is run, or at least read by its own program; none is left out."""
+
+import shutil
+import subprocess
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from tests.support.doc_commands import (
+    ROOT,
+    Block,
+    Command,
+    begins_with_program,
+    blocks,
+    call_of,
+    commands,
+    pages,
+    prose,
+)
+from tests.support.doc_folder import go_on, inside, make_folder
+from tests.support.doc_runner import CommandFailedError, PageRun, is_free, ports
+from tests.support.doc_usage import UsageError, check_usage
+
+_REAL_DATA = "needs photos or scans that are not in the repository"
+_STUDY = "a study of its own world: many minutes, or hours"
+# Commands of blocks that are not run, by their beginning, and why. Their programs read their arguments.
+NOT_RUN = {
+    "featuredb demo": "the last step of tools/check.py runs it",
+    "tools/check.py": "it runs these tests",
+    "pip install": "installs; the extra is looked up",
+    "tools/scan_poses.py": _REAL_DATA,
+    "tools/descriptor_study.py": _REAL_DATA,
+    "tools/frame_real_photos.py": _REAL_DATA,
+    "tools/autzen_windows.py": _REAL_DATA,
+    "tools/thinning_study.py": _REAL_DATA,
+    "tools/frame_evaluation.py": _STUDY,
+    "tools/view_change.py": _STUDY,
+    "tools/street_views.py": _STUDY,
+}
+# Python of these pages is run elsewhere, or is a fragment; it compiles in any case.
+PYTHON_NOT_RUN = {
+    "docs/wire.md": "tests/integration/test_service_docs.py runs it",
+    "docs/gateway.md": "tests/integration/test_gateway_docs.py runs it",
+    "docs/store.md": "fragments, with names for maps and photos of the reader's own",
+}
+# The page that makes the database; the others begin with what it leaves.
+_FIRST = "README.md"
+_LANGUAGES = {"sh", "python", "sql", "json", "text"}
+
+_TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in pages()}
+_BLOCKS = [block for page, text in _TEXTS.items() for block in blocks(page, text)]
+_COMMANDS = [command for block in _BLOCKS if block.language == "sh" for command in commands(block)]
+_PROSE = [command for page, text in _TEXTS.items() for command in prose(page, text)]
+
+
+def why_not_run(command: Command) -> str | None:
+    call = call_of(command)
+    words = [call.program, *call.arguments]
+    return next((why for start, why in NOT_RUN.items() if words[: len(start.split())] == start.split()), None)
+
+
+def is_run(item: Command | Block) -> bool:
+    if isinstance(item, Block):
+        return item.language == "python" and item.page not in PYTHON_NOT_RUN
+    return why_not_run(item) is None
+
+
+def what_runs(page: str) -> list[Command | Block]:
+    """Commands and Python of a page, in their order."""
+    items = [item for item in [*_COMMANDS, *_BLOCKS] if item.page == page and is_run(item)]
+    return sorted(items, key=lambda item: item.line)
+
+
+def run_page(page: str, folder: Path) -> None:
+    """Run what a page shows, in its order."""
+    items = what_runs(page)
+    lines = [item for item in items if isinstance(item, Command)]
+    if taken := [port for port in ports(lines) if not is_free(port)]:
+        pytest.skip(f"somebody listens on {taken}, where the commands of {page} would serve")
+    if any("curl" in line.text for line in lines) and shutil.which("curl") is None:
+        pytest.skip("curl is not installed")
+    names: dict[str, object] = {"__name__": "__main__"}
+    with inside(folder), PageRun(folder) as run:
+        for item in items:
+            if isinstance(item, Command):
+                run.run(item)
+            else:
+                exec(compile(item.text, f"{item.page}:{item.line}", "exec"), names)
+
+
+@pytest.fixture(scope="module")
+def after_readme(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the simulated town, after all that the README shows."""
+    folder = make_folder(tmp_path_factory.mktemp("documentation"))
+    run_page(_FIRST, folder)
+    go_on(folder)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)  # it makes the town and its maps: three minutes on two free cores
+def test_the_commands_of_the_readme_run(after_readme: Path) -> None:
+    made = ("report/report.html", "overlay.png", "track.csv", "track.kml", "drawn.mp4", "colmap/sparse")
+    assert [name for name in made if not (after_readme / name).exists()] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in _TEXTS if page != _FIRST and what_runs(page)])
+def test_the_commands_of_a_page_run(after_readme: Path, tmp_path: Path, page: str) -> None:
+    run_page(page, Path(shutil.copytree(after_readme, tmp_path / "here")))
+
+
+@pytest.mark.parametrize("command", [*_COMMANDS, *_PROSE], ids=str)
+def test_a_program_takes_the_arguments_of_the_documentation(command: Command) -> None:
+    check_usage(command)
+
+
+@pytest.mark.parametrize("block", [b for b in _BLOCKS if b.language == "python"], ids=lambda b: b.page)
+def test_python_compiles(block: Block) -> None:
+    compile(block.text, f"{block.page}:{block.line}", "exec")
+
+
+def test_no_command_hides_in_another_block() -> None:
+    unknown = [f"{b.page}:{b.line}: {b.language!r}" for b in _BLOCKS if b.language not in _LANGUAGES]
+    assert unknown == [], f"the info string of a block is one of {sorted(_LANGUAGES)}"
+    hidden = [
+        f"{block.page}:{block.line}: {line}"
+        for block in _BLOCKS
+        if block.language in ("text", "json")
+        for line in block.text.splitlines()
+        if begins_with_program(line)
+    ]
+    assert hidden == []
+
+
+def test_what_is_not_run_is_in_the_documentation() -> None:
+    used = Counter(why_not_run(command) for command in _COMMANDS)
+    starts = [start for start in NOT_RUN if any(_begins(command, start) for command in _COMMANDS)]
+    assert starts == list(NOT_RUN)
+    assert {b.page for b in _BLOCKS if b.language == "python"} >= set(PYTHON_NOT_RUN)
+    assert used[None] > sum(used.values()) / 2  # most commands of blocks are run
+
+
+def _begins(command: Command, start: str) -> bool:
+    call = call_of(command)
+    return f"{' '.join([call.program, *call.arguments])} ".startswith(f"{start} ")
+
+
+# The mechanism itself: what is wrong in a page fails.
+
+_PAGE = """
+Text with `featuredb maps my.db`, `featuredb` and `tools/check.py`.
+
+```sh
+featuredb maps \\
+    my.db   # a remark
+# nothing but a remark
+printf '{"a":
+1}' |
+  cat
+```
+
+    featuredb indented
+"""
+
+
+def test_commands_are_found_and_joined() -> None:
+    fence, indented = blocks("page.md", _PAGE)
+    assert [(c.line, c.text.split()[0]) for c in commands(fence)] == [(5, "featuredb"), (8, "printf")]
+    assert call_of(commands(fence)[0]).arguments == ("maps", "my.db")
+    assert (indented.language, begins_with_program(indented.text)) == ("", True)
+    assert [c.text for c in prose("page.md", _PAGE)] == ["featuredb maps my.db", "tools/check.py"]
+    with pytest.raises(ValueError, match="ends before its command"):
+        commands(Block("page.md", 1, "sh", "featuredb maps \\\n"))
+
+
+@pytest.mark.parametrize(
+    ("text", "in_prose", "wrong"),
+    [
+        ("featuredb maps my.db --gone", False, "no option --gone"),
+        ("featuredb maps DB [--gone]", True, "no option --gone"),
+        ("featuredb gone my.db", False, "invalid choice: 'gone'"),
+        ("featuredb gone", True, "invalid choice: 'gone'"),
+        ("featuredb maps", False, "required: DB"),
+        ("featuredb maps my.db other.db", False, "unrecognized arguments: other.db"),
+        ("uv run --extra gone featuredb maps my.db", False, "no such extra: gone"),
+        ("pip install 'featuredb[gone]'", True, "no such extra: gone"),
+        ("python -m tools.growth_community --size gone", False, "invalid choice: 'gone'"),
+        ("tools/growth_community.py --gone 3", True, "no option --gone"),
+        ("tools/gone.py", True, "no file tools/gone.py"),
+        ("uv run --extra docs mkdocs gone", True, "gone"),
+    ],
+)
+def test_wrong_usage_is_told(text: str, in_prose: bool, wrong: str) -> None:
+    with pytest.raises(UsageError, match=wrong):
+        check_usage(Command("page.md", 1, text, in_prose))
+
+
+@pytest.mark.parametrize(
+    "text", ["featuredb maps nowhere.db", "featuredb serve nowhere.db", "echo out; exit 3"]
+)
+def test_a_command_that_fails_is_told(tmp_path: Path, text: str) -> None:
+    with inside(tmp_path), PageRun(tmp_path) as run, pytest.raises(CommandFailedError, match=r"page\.md:1: "):
+        run.run(Command("page.md", 1, text))
+
+
+def test_a_command_that_does_not_end_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tests.support.doc_runner._SHELL_S", 0.2)
+    with inside(tmp_path), PageRun(tmp_path) as run, pytest.raises(subprocess.TimeoutExpired):
+        run.run(Command("page.md", 1, "sleep 60"))

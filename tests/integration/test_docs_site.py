@@ -1,0 +1,102 @@
+"""The documentation's site builds without a warning, shows what the Markdown says, and needs no network."""
+
+import os
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from markdown_it import MarkdownIt
+
+from tools.site_pages import PAGES, ROOT
+
+_SOURCES = {page: ROOT / source for source, page in PAGES.items()} | {
+    path.relative_to(ROOT / "docs").as_posix(): path for path in (ROOT / "docs").rglob("*.md")
+}
+_COUNTED = ("table", "tr", "li", "pre", "img", "h1", "h2", "h3")
+
+
+class _Page(HTMLParser):
+    """Counts elements of a page's article, and what the page loads from elsewhere."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.counts = dict.fromkeys(_COUNTED, 0)
+        self.loaded: list[str] = []
+        self._inside = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        if tag == "article":
+            self._inside = True
+        if self._inside and tag in self.counts:
+            self.counts[tag] += 1
+        source = values.get("src") if tag != "link" else values.get("href")
+        if source and source.startswith(("http:", "https:", "//")):
+            self.loaded.append(source)
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = self._inside and tag != "article"
+
+
+def build(config: Path, out: Path) -> "subprocess.CompletedProcess[str]":
+    # Not --quiet: it silences the warnings before --strict counts them.
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-f", str(config), "-d", str(out)]
+    quiet = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    return subprocess.run(command, env=quiet, capture_output=True, text=True, check=False, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as `mkdocs build --strict` builds it."""
+    out = tmp_path_factory.mktemp("site")
+    done = build(ROOT / "mkdocs.yml", out)
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr
+    return out
+
+
+def html_of(page: str) -> str:
+    folder, _, name = page.rpartition("/")
+    return f"{folder}/index.html".lstrip("/") if name == "README.md" else page.replace(".md", ".html")
+
+
+@pytest.mark.parametrize("page", sorted(_SOURCES))
+def test_a_page_shows_the_tables_lists_and_code_of_its_markdown(site: Path, page: str) -> None:
+    # Python-Markdown and GitHub read lists and tables that follow a line of text in different ways.
+    markdown = MarkdownIt("commonmark").enable("table").render(_SOURCES[page].read_text(encoding="utf-8"))
+    expected = _Page(f"<article>{markdown}</article>").counts
+    assert _Page((site / html_of(page)).read_text(encoding="utf-8")).counts == expected
+
+
+def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
+    pages = [_Page(path.read_text(encoding="utf-8")) for path in site.rglob("*.html")]
+    assert len(pages) > len(_SOURCES)  # and the page for what is not found
+    assert [source for page in pages for source in page.loaded] == []
+    assert (site / "search" / "search_index.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("text", "warning"),
+    [
+        ("[gone](gone.md)", "'gone.md'"),
+        ("[gone](wire.md#gone)", "'#gone'"),
+        ("![gone](figures/gone.png)", "'figures/gone.png'"),
+        ("not in the navigation", 'not included in the "nav"'),
+    ],
+)
+def test_what_leads_nowhere_stops_the_build(tmp_path: Path, text: str, warning: str) -> None:
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "index.md").write_text(f"# Start\n\n{text}\n")
+    (tmp_path / "docs" / "wire.md").write_text("# The wire\n")
+    plain = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:")[0]
+    plain = "\n".join(
+        line for line in plain.splitlines() if "hooks:" not in line and "site_pages" not in line
+    )
+    listed = "[index.md]" if "navigation" in text else "[index.md, wire.md]"
+    (tmp_path / "mkdocs.yml").write_text(f"{plain}\nnav: {listed}\n")
+    done = build(tmp_path / "mkdocs.yml", tmp_path / "site")
+    assert done.returncode == 1
+    assert warning in done.stderr
