@@ -19,8 +19,10 @@ def main() -> int:
     parser.add_argument("--fast", action="store_true", help="leave out slow tests and the demo")
     fast = parser.parse_args().fast
     python = sys.executable
-    # Two at a time, a file on one worker each, since modules share what they have made.
-    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--durations", "20"]
+    # Two at a time, a file on one worker each, since modules share what they have made; in the order of
+    # their folders, which leaves the short ones to the end, when one worker may have to wait for the other.
+    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+    tests += ["--durations", "60"]
     tests += ["-m", "not slow"] if fast else []
     with tempfile.TemporaryDirectory() as folder:
         steps = [
