@@ -30,8 +30,8 @@ def test_copr_registers_by_its_control_points(
     folder = shared_data / "copr"
     survey = folder / "gcp_list.txt"
     made = _run(
-        "ingest", "photos", tmp_path / "db", folder / "images", "--gcp", survey, "--max-features", "3000",
-        "--quiet",
+        "ingest", "photos", tmp_path / "db", folder / "images", "--gcp", survey, "--quiet",
+        "--max-features", "2000", "--max-side", "1600",
     )  # fmt: skip
     assert made == 0
     out = capsys.readouterr().out
