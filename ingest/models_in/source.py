@@ -12,11 +12,12 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import GeoPrior
 from ingest.models_in.colmap_database import open_features
 from ingest.models_in.colmap_folder import model_folder, read_colmap
+from ingest.models_in.kapture_folder import KaptureFeatures, is_kapture, read_kapture
 from ingest.models_in.opensfm_folder import OpensfmFeatures, opensfm_folder, read_opensfm
 from ingest.models_in.stored import StoredFeatures, StoredModel
 
-ModelFormat = Literal["colmap", "opensfm"]
-NAMES: dict[ModelFormat, str] = {"colmap": "COLMAP", "opensfm": "OpenSfM"}
+ModelFormat = Literal["colmap", "opensfm", "kapture"]
+NAMES: dict[ModelFormat, str] = {"colmap": "COLMAP", "opensfm": "OpenSfM", "kapture": "kapture"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,11 +63,15 @@ def open_model(folder: Path, colmap_database: Path | None, reconstruction: int |
         raise IngestError(
             "--reconstruction: expected OpenSfM's reconstruction.json, found none; leave it out"
         )
-    if colmap_database is not None and place is not None:
-        raise IngestError(f"--database: expected a COLMAP model, found one of OpenSfM in {folder}; leave it out")
+    kapture = place is None and is_kapture(folder)
+    if colmap_database is not None and (place is not None or kapture):
+        found = "kapture" if kapture else "OpenSfM"
+        raise IngestError(
+            f"--database: expected a COLMAP model, found one of {found} in {folder}; leave it out"
+        )
     if place is not None:
         return _opensfm(folder, place, reconstruction)
-    return _colmap(folder, colmap_database)
+    return _kapture(folder) if kapture else _colmap(folder, colmap_database)
 
 
 def _colmap(folder: Path, database: Path | None) -> ModelSource:
@@ -96,4 +101,20 @@ def _opensfm(folder: Path, place: Path, reconstruction: int | None) -> ModelSour
         reference=opensfm.reference,
         gps=opensfm.gps,
         choice="" if reconstruction is None else f"reconstruction {reconstruction}",
+    )
+
+
+def _kapture(folder: Path) -> ModelSource:
+    kapture = read_kapture(folder)
+    photos = folder / "sensors" / "records_data"
+    return ModelSource(
+        format="kapture",
+        place=folder,
+        stored=kapture.stored,
+        files=kapture.files,
+        feature_files=kapture.feature_files,
+        open_features=lambda fingerprint: nullcontext(KaptureFeatures(kapture, fingerprint)),
+        has_descriptors=kapture.descriptors is not None,
+        photos=photos if photos.is_dir() else None,
+        gps=kapture.gps,
     )
