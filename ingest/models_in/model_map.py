@@ -123,19 +123,34 @@ def _described_anew(source: ModelSource, options: ModelOptions) -> bool:
     return anew
 
 
+def georeference_file(folder: Path, place: Path) -> Path | None:
+    """The geo-reference's file in a folder, or where its model was found; None where there is none."""
+    return next((p for p in (folder / GEOREFERENCE, place / GEOREFERENCE) if p.is_file()), None)
+
+
 def read_georeference(folder: Path, place: Path) -> dict[str, Any] | None:
     """The geo-reference in a folder, or where its model was found; None where there is none.
 
     Raises:
         IngestError: it cannot be read.
     """
-    path = next((p for p in (folder / GEOREFERENCE, place / GEOREFERENCE) if p.is_file()), None)
+    path = georeference_file(folder, place)
     if path is None:
         return None
     document = read_json(path)
     if not isinstance(document, dict) or not isinstance(document.get("map"), dict):
         raise IngestError(f"{path}: expected a geo-reference as `featuredb export` writes it")
+    images = document.get("images", [])
+    if not isinstance(images, list) or not all(_names_photo(entry) for entry in images):
+        raise IngestError(
+            f"{path}: expected images with name, original_name and sha256; export the model again"
+        )
     return document
+
+
+def _names_photo(entry: Any) -> bool:
+    names = ("name", "original_name", "sha256")
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), str) for name in names)
 
 
 def place_of(
@@ -212,13 +227,18 @@ def photos_of_model(
 
 
 def _told(entry: Mapping[str, Any], options: ModelOptions, file: Photo | None) -> Photo:
-    time, gps = entry.get("capture_time"), entry.get("gps")
+    try:
+        time, gps = entry.get("capture_time"), entry.get("gps")
+        capture_time = None if time is None else datetime.fromisoformat(time)
+        prior = None if gps is None else GeoPrior(**gps)
+    except (TypeError, ValueError) as error:
+        raise IngestError(f"{GEOREFERENCE}: {entry['name']}: broken time or position: {error}") from error
     return Photo(
         name=entry["original_name"],
         path=Path() if file is None else file.path,
         sha256=entry["sha256"],
-        capture_time=None if time is None else datetime.fromisoformat(time),
-        gps=None if gps is None else GeoPrior(**gps),
+        capture_time=capture_time,
+        gps=prior,
         owner=entry.get("owner") or options.owner,
         licence=entry.get("licence") or options.licence,
     )
@@ -232,8 +252,9 @@ def _identity(
     document: Mapping[str, Any] | None,
 ) -> MapIdentity:
     """The same files and options are the same map."""
-    files = [*source.files, folder / GEOREFERENCE, *source.feature_files]
-    texts = [f"{path.name} {file_sha256(path)}" for path in files if path.is_file()]
+    document_file = georeference_file(folder, source.place)
+    files = [*source.files, *([] if document_file is None else [document_file]), *source.feature_files]
+    texts = [f"{path.name} {file_sha256(path)}" for path in files]
     texts.append(_plain(options))
     if not source.has_descriptors:  # they are the photos'
         texts += [photo.sha256 for photo in photos]

@@ -34,6 +34,7 @@ _RECONSTRUCTIONS = ("reconstruction.topocentric.json", "reconstruction.json")
 # Larger residuals are outliers, over the longer side: 4 px at 1600, as in an ingest of photos.
 _OUTLIER = 0.0025
 _MOST_OUTLIERS, _MOST_UNSEEN = 0.5, 0.1  # more, and the files do not belong together
+_OF_VLFEAT = ("HAHOG", "DSPSIFT")  # the first is OpenSfM's default, the second OpenDroneMap's
 _UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
 _SAME_DEG, _SAME_M = 1e-9, 1e-3
 
@@ -257,11 +258,11 @@ def _stored(
 
 
 def _diameter_over_size(config: Path) -> float:
-    """OpenSfM's size of a feature is OpenCV's diameter, but HAHOG's (its default) a standard deviation."""
+    """What a detector says of a feature's size is OpenCV's diameter, but of VLFeat's a standard deviation."""
     if not config.is_file():
         return 1.0
     found = re.search(r"^\s*feature_type\s*:\s*[\"']?(\w+)", config.read_text(errors="replace"), re.MULTILINE)
-    return 2.0 if found is None or found[1].upper() == "HAHOG" else 1.0
+    return 2.0 if found is None or found[1].upper() in _OF_VLFEAT else 1.0
 
 
 def _reference(document: Mapping[str, Any], place: Path, path: Path) -> LocalFrame | None:

@@ -230,11 +230,11 @@ def test_opendronemaps_projected_coordinates_are_not_taken(tmp_path: Path) -> No
         ("feature_type: HAHOG", 2.0),
         ("processes: 1", 2.0),
         ("feature_type: SIFT", 1.0),
-        ("feature_type: dspsift", 1.0),
+        ("feature_type: dspsift", 2.0),
     ],
 )
 def test_sizes_are_those_of_the_detector(tmp_path: Path, config: str, factor: float) -> None:
-    """HAHOG, the default, says a standard deviation, SIFT a diameter."""
+    """HAHOG, the default, and OpenDroneMap's say a standard deviation, SIFT a diameter."""
     (write_tiny(tmp_path) / "config.yaml").write_text(f"# settings\n{config}\n")
     np.testing.assert_allclose(read_opensfm(tmp_path).diameters[0], [4.0 * factor, 2.0 * factor], rtol=1e-6)
 
