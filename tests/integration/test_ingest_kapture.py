@@ -1,9 +1,11 @@
 """kapture's reconstructions become maps: our own exports, one with a rig written by hand, and refusals."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -163,6 +165,26 @@ def test_a_rig_by_hand(tmp_path: Path) -> None:
     assert read.gps[0] is not None
     assert (read.gps[0].latitude_deg, read.gps[0].longitude_deg) == (48.25, 11.5)
     assert read.descriptors is None
+
+
+@pytest.mark.slow  # compiles for a minute or two when it is first imported
+def test_what_kaptures_own_package_writes(tmp_path: Path, field_map: FeatureMap) -> None:
+    """Our export, read and written by it: padded columns, points of ten digits."""
+    pytest.importorskip("kapture", reason="kapture's own package is not installed")
+    kapture_csv: Any = pytest.importorskip("kapture.io.csv")
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    write_map(ours, field_map)
+    kapture_csv.kapture_to_dir(str(theirs), kapture_csv.kapture_from_dir(str(ours)))
+    for kind in ("keypoints", "descriptors"):
+        for path in (ours / "reconstruction" / kind / "sift").glob("*.png.*"):
+            shutil.copy(path, theirs / "reconstruction" / kind / "sift")
+    shutil.copy(ours / "georeference.json", theirs)
+    mine, back = (map_of_model(folder, ModelOptions()) for folder in (ours, theirs))
+    assert back.cameras == mine.cameras
+    np.testing.assert_allclose(back.points.utm, mine.points.utm, atol=1e-6)
+    np.testing.assert_array_equal(back.observations.descriptors, mine.observations.descriptors)
+    for one, other in zip(back.images, mine.images, strict=True):
+        np.testing.assert_allclose(one.cam_from_local.matrix(), other.cam_from_local.matrix(), atol=1e-9)
 
 
 def test_of_several_kinds_of_keypoints_sift_is_taken(tmp_path: Path) -> None:
