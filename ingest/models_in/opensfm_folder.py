@@ -91,16 +91,17 @@ def read_opensfm(place: Path, chosen: int | None = None) -> OpensfmModel:
     """
     path = next(place / name for name in _RECONSTRUCTIONS if (place / name).is_file())
     document = _chosen(read_json(path), chosen, path)
-    cameras = {
-        key: camera_from_opensfm(mapping(entry, f"{path}: camera {key!r}"), f"{path}: camera {key!r}")
-        for key, entry in mapping(member(document, "cameras", str(path)), f"{path}: cameras").items()
-    }
+    cameras = mapping(member(document, "cameras", str(path)), f"{path}: cameras")
     shots = mapping(member(document, "shots", str(path)), f"{path}: shots")
     points = mapping(member(document, "points", str(path)), f"{path}: points")
     if not shots or not points:
         raise IngestError(f"{path}: expected shots and points, found {len(shots)} and {len(points)}")
     camera_names = list(cameras)
-    camera_of = [_camera_of(shot, name, camera_names, path) for name, shot in shots.items()]
+    camera_rows, camera_of = np.unique(
+        [_camera_of(shot, name, camera_names, path) for name, shot in shots.items()], return_inverse=True
+    )
+    # Cameras that no shot has may be lenses that maps do not have.
+    used = [_camera(camera_names[row], cameras, path) for row in camera_rows]
     poses = [_pose(shot, f"{path}: shot {name!r}") for name, shot in shots.items()]
     xyz = np.array([_point(p, "coordinates", f"{path}: point {k!r}") for k, p in points.items()])
     rgb = np.array([_point(p, "color", f"{path}: point {k!r}") for k, p in points.items()])
@@ -109,8 +110,9 @@ def read_opensfm(place: Path, chosen: int | None = None) -> OpensfmModel:
         {name: row for row, name in enumerate(shots)},
         {key: row for row, key in enumerate(points)},
     )
-    every = list(cameras.values())
-    parts = _Parts(cameras=every, camera_of=np.array(camera_of), poses=poses, xyz=xyz, tracks=tracks)
+    parts = _Parts(
+        cameras=used, camera_rows=camera_rows, camera_of=camera_of, poses=poses, xyz=xyz, tracks=tracks
+    )
     xy = _pixels(parts)
     kept = _kept(parts, xy, place / TRACKS)
     stored, rows, images = _stored(parts, xy, kept, list(shots), np.clip(np.rint(rgb), 0, 255))
@@ -128,7 +130,10 @@ def read_opensfm(place: Path, chosen: int | None = None) -> OpensfmModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Parts:
+    """What the files hold: the shots' cameras, their rows in the file, and for each shot its camera's row."""
+
     cameras: list[Camera]
+    camera_rows: NDArray[np.int64]
     camera_of: NDArray[np.int64]
     poses: list[Rigid3]
     xyz: FloatArray
@@ -160,6 +165,11 @@ def _camera_of(shot: Any, name: str, cameras: list[str], path: Path) -> int:
     if camera not in cameras:
         raise IngestError(f"{where}: expected one of the cameras {cameras[:5]}, found {camera!r}")
     return cameras.index(camera)
+
+
+def _camera(name: str, cameras: Mapping[str, Any], path: Path) -> Camera:
+    where = f"{path}: camera {name!r}"
+    return camera_from_opensfm(mapping(cameras[name], where), where)
 
 
 def _pose(shot: Mapping[str, Any], where: str) -> Rigid3:
@@ -203,8 +213,9 @@ def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
             "cut off, or belongs to another reconstruction; copy or create the tracks again"
         )
     residual = np.full(len(xy), np.inf)
-    for row, pose in enumerate(parts.poses):
-        mine = np.flatnonzero(tracks.image == row)
+    for row, (pose, mine) in enumerate(
+        zip(parts.poses, _of_each(tracks.image, len(parts.poses)), strict=True)
+    ):
         if len(mine):
             drawn = parts.cameras[parts.camera_of[row]].project(pose.act(parts.xyz[tracks.track[mine]]))
             residual[mine] = np.linalg.norm(drawn - xy[mine], axis=1)
@@ -224,13 +235,20 @@ def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
     return np.asarray(kept)
 
 
+def _of_each(image: NDArray[np.int64], count: int) -> list[NDArray[np.int64]]:
+    """For each of `count` images, the rows that are its own, rising."""
+    ends = np.cumsum(np.bincount(image, minlength=count))
+    return np.split(np.argsort(image, kind="stable"), ends[:-1])
+
+
 def _stored(
     parts: _Parts, xy: FloatArray, kept: NDArray[np.bool_], names: list[str], rgb: FloatArray
 ) -> tuple[StoredModel, list[NDArray[np.int64]], list[int]]:
     """The model of what is kept; for each of its images rows of the tracks, and its own among the shots."""
     tracks = parts.tracks
-    images = np.unique(tracks.image[kept]).tolist()
-    rows = [np.flatnonzero(kept & (tracks.image == image)) for image in images]
+    seen = np.flatnonzero(kept)
+    images = np.unique(tracks.image[seen]).tolist()
+    rows = [seen[r] for r in _of_each(tracks.image[seen], len(parts.poses)) if len(r)]
     points = np.unique(tracks.track[kept])
     photo_of = np.concatenate([np.full(len(r), k) for k, r in enumerate(rows)])
     keypoint_of = np.concatenate([np.arange(len(r)) for r in rows])
@@ -250,7 +268,7 @@ def _stored(
     stored = StoredModel(
         model=model,
         names=tuple(names[i] for i in images),
-        camera_ids=tuple(int(c) + 1 for c in used),
+        camera_ids=tuple(int(c) + 1 for c in parts.camera_rows[used]),
         xy=tuple(xy[r] for r in rows),
         rgb=rgb[points].astype(np.uint8),
     )

@@ -211,6 +211,15 @@ def test_a_reconstruction_by_hand(tmp_path: Path, version: int) -> None:
     assert read.gps[0].longitude_deg - 11.0 == pytest.approx(degrees, rel=1e-6)
 
 
+def test_a_camera_that_no_shot_has_may_be_any(tmp_path: Path) -> None:
+    cameras = {"before": {"projection_type": "spherical", "width": 2, "height": 1}} | TINY["cameras"]
+    (write_tiny(tmp_path) / "reconstruction.json").write_text(json.dumps([TINY | {"cameras": cameras}]))
+    stored = read_opensfm(tmp_path).stored
+    assert stored.camera_ids == (2,)
+    assert [camera.width for camera in stored.model.cameras] == [1000]
+    assert stored.model.camera_of.tolist() == [0, 0]
+
+
 def test_what_opensfm_leaves_out_by_its_residual_is_left_out(tmp_path: Path) -> None:
     """Of three that see point 7 one is 20 px beside it."""
     rows = [*ROWS, ("unseen.jpg", "7", "5", "0.11", "0.0", "0.004")]
