@@ -50,9 +50,11 @@ def _register_model(kinds: Any) -> None:
 
     model = kinds.add_parser(
         "model",
-        help="a COLMAP model, geo-referenced or of photos with GPS",
-        description="Import a COLMAP model (binary or text) as a map: as `featuredb export --format colmap` "
-        "wrote it, aligned to a known place, or of photos with GPS.",
+        help="a model of COLMAP, OpenSfM, ODM or kapture, geo-referenced or of photos with GPS",
+        description="Import a model of COLMAP, OpenSfM, OpenDroneMap or kapture as a map: as `featuredb "
+        "export` "
+        "wrote it, "
+        "aligned to a known place, or of photos with GPS.",
     )
     add_database_argument(model)
     add_model_arguments(model)

@@ -83,6 +83,12 @@ def _opensfm(job: "ExportJob", args: argparse.Namespace) -> "Exported":
     return write_opensfm(job)
 
 
+def _kapture(job: "ExportJob", args: argparse.Namespace) -> "Exported":
+    from featuredb.export.kapture import write_kapture
+
+    return write_kapture(job)
+
+
 def _exif(job: "ExportJob", args: argparse.Namespace) -> "Exported":
     from featuredb.export.exif import write_exif
 
@@ -111,6 +117,7 @@ FORMATS: dict[str, Format] = {
     "kml": Format(text="photos in space for Google Earth, one file", write=_kml),
     "geopose": Format(text="OGC GeoPose, a file for each photo", write=_geopose),
     "opensfm": Format(text="a folder for each map as OpenSfM and OpenDroneMap have it", write=_opensfm),
+    "kapture": Format(text="a folder for each map as kapture 1.1 has it, with its place", write=_kapture),
     "exif": Format(
         text="copies of the photos with their pose in EXIF and XMP", write=_exif, options=("photos",)
     ),

@@ -131,12 +131,18 @@ def _write_image(
     frame = pycolmap.Frame(frame_id=image_id, rig_id=image.camera_id + 1)
     frame.add_data_id(stored.data_id)
     database.write_frame(frame, use_frame_id=True)
-    columns = (seen.xy[rows], seen.scale[rows] / _DIAMETER_OVER_SCALE, np.radians(seen.angle[rows]))
-    database.write_keypoints(image_id, np.column_stack(columns).astype(np.float32))
+    database.write_keypoints(image_id, colmap_keypoints(feature_map, rows))
     descriptors = pycolmap.FeatureDescriptors(
         pycolmap.FeatureExtractorType.SIFT, np.ascontiguousarray(seen.descriptors[rows])
     )
     database.write_descriptors(image_id, descriptors)
+
+
+def colmap_keypoints(feature_map: FeatureMap, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+    """Of these observations (k, 4): x, y, scale, orientation in radians, as COLMAP counts them."""
+    seen = feature_map.observations
+    columns = (seen.xy[rows], seen.scale[rows] / _DIAMETER_OVER_SCALE, np.radians(seen.angle[rows]))
+    return np.column_stack(columns).astype(np.float32)
 
 
 def _camera(camera: Any, index: int) -> Any:

@@ -1,7 +1,8 @@
 """OpenSfM and OpenDroneMap: a folder for each map as OpenSfM leaves it when it has reconstructed.
 
 `reconstruction.json` has cameras, shots and points in the topocentric frame of `reference_lla.json`, which is
-the map's own local frame; `tracks.csv` the observations; `shots.geojson` the shots as ODM's report has them.
+the map's own local frame; `tracks.csv` the observations; `shots.geojson` the shots as ODM's report has them;
+`georeference.json` what OpenSfM has no room for.
 """
 
 import json
@@ -12,6 +13,7 @@ import numpy as np
 
 from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
 from featuredb.export.colmap_model import image_names
+from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob
 from featuredb.export.opensfm_camera import opensfm_camera
 from featuredb.export.shots import Shot, shots_of
@@ -28,10 +30,11 @@ def write_opensfm(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, there is something at `job.out`, or a lens that OpenSfM cannot have.
     """
-    return folder_for_each_map(job, _write_map)
+    return folder_for_each_map(job, write_map)
 
 
-def _write_map(folder: Path, feature_map: FeatureMap) -> None:
+def write_map(folder: Path, feature_map: FeatureMap) -> None:
+    """One map to a new folder; see `write_opensfm`."""
     folder.mkdir()
     names = image_names(feature_map)
     reference = _reference(feature_map)
@@ -48,6 +51,7 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
         ],
     }
     _write(folder / "shots.geojson", shots)
+    (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
 
 
@@ -59,7 +63,7 @@ def _reference(feature_map: FeatureMap) -> dict[str, float]:
 def _write_reconstruction(out: IO[str], feature_map: FeatureMap, names: list[str]) -> None:
     """A list of one reconstruction; points line by line, for there may be millions."""
     cameras = {_camera_id(k): opensfm_camera(camera) for k, camera in enumerate(feature_map.cameras)}
-    shots = {name: _shot(image) for image, name in zip(feature_map.images, names, strict=True)}
+    shots = {name: _shot(image, feature_map) for image, name in zip(feature_map.images, names, strict=True)}
     head: dict[str, Any] = {"cameras": cameras, "shots": shots}
     head |= {"biases": {}, "rig_cameras": {}, "rig_instances": {}}
     head["reference_lla"] = _reference(feature_map)
@@ -74,17 +78,19 @@ def _write_reconstruction(out: IO[str], feature_map: FeatureMap, names: list[str
     out.write("}}]\n")
 
 
-def _shot(image: MapImage) -> dict[str, Any]:
-    """World to camera as an angle-axis vector and a translation."""
+def _shot(image: MapImage, feature_map: FeatureMap) -> dict[str, Any]:
+    """World to camera as an angle-axis vector and a translation; the position as the photo itself says it."""
     shot: dict[str, Any] = {
         "rotation": so3_log(image.cam_from_local.rotation).tolist(),
         "translation": image.cam_from_local.translation.tolist(),
         "camera": _camera_id(image.camera_id),
         "orientation": 1,
         "capture_time": 0.0,
-        "gps_position": image.cam_from_local.center.tolist(),
-        "gps_dop": 15.0,  # OpenSfM's own value where nothing better is known
     }
+    gps = image.gps
+    if gps is not None and gps.height_m is not None:
+        said = feature_map.frame.enu_from_geodetic((gps.latitude_deg, gps.longitude_deg, gps.height_m))
+        shot |= {"gps_position": said.tolist(), "gps_dop": gps.sigma_horizontal_m}
     if image.capture_time is not None and image.capture_time.tzinfo is not None:
         shot["capture_time"] = image.capture_time.timestamp()
     return shot

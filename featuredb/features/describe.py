@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError
 from featuredb.features.extractor import ExtractorOptions, rootsift_8bit
+from featuredb.geometry.arrays import FloatArray
 
-_OCTAVE_LAYERS, _SIGMA = 3, 1.6  # of the extractor
+OCTAVE_LAYERS, SIGMA = 3, 1.6  # of the extractor
 # The smallest diameter that the extractor finds: half a layer below the first, in the doubled image.
-_FINEST_PX = 0.999 * 2.0 * _SIGMA * 2.0 ** (0.5 / _OCTAVE_LAYERS - 1.0)
+_FINEST_PX = 0.999 * 2.0 * SIGMA * 2.0 ** (0.5 / OCTAVE_LAYERS - 1.0)
 
 
 def describe_at(
@@ -35,9 +36,31 @@ def describe_at(
     Raises:
         ImageError: OpenCV does not describe all of them.
     """
-    options = options or ExtractorOptions()
     if not len(xy):
         return np.zeros((0, 128), np.uint8)
+    small, places, diameters = shrunk_for(gray, xy, scale, options or ExtractorOptions())
+    keypoints = [
+        cv2.KeyPoint(x, y, diameter, float(turn), 1.0, _packed(diameter), row)
+        for row, ((x, y), diameter, turn) in enumerate(
+            zip(places.tolist(), diameters.tolist(), angle, strict=True)
+        )
+    ]
+    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
+    sift = create(nOctaveLayers=OCTAVE_LAYERS, sigma=SIGMA, enable_precise_upscale=True)
+    kept, raw = sift.compute(small, keypoints)
+    if [k.class_id for k in kept] != list(range(len(xy))):
+        raise ImageError(f"expected descriptors of {len(xy)} keypoints, OpenCV gives {len(kept)}")
+    return rootsift_8bit(raw)
+
+
+def shrunk_for(
+    gray: NDArray[np.uint8], xy: NDArray[np.float32], scale: NDArray[np.float32], options: ExtractorOptions
+) -> tuple[NDArray[np.uint8], FloatArray, FloatArray]:
+    """The photo as it is described, and there the keypoints' places (n, 2), as OpenCV counts, and diameters.
+
+    Args:
+        gray, xy, scale: as for `describe_at`, at least one keypoint.
+    """
     height, width = gray.shape
     factor = min(1.0, options.max_side_px / max(height, width))
     if float(scale.min()) * factor < _FINEST_PX:
@@ -45,24 +68,20 @@ def describe_at(
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     small = gray if factor == 1.0 else np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
     ratio = np.array([small.shape[1] / width, small.shape[0] / height])
-    places = xy.astype(np.float64) * ratio - 0.5
-    keypoints = [
-        cv2.KeyPoint(x, y, diameter, float(turn), 1.0, _octave(diameter), row)
-        for row, ((x, y), diameter, turn) in enumerate(
-            zip(places.tolist(), (scale.astype(np.float64) * ratio.mean()).tolist(), angle, strict=True)
-        )
-    ]
-    create: Any = cv2.SIFT_create  # type: ignore[attr-defined]  # missing from OpenCV 5's stubs
-    sift = create(nOctaveLayers=_OCTAVE_LAYERS, sigma=_SIGMA, enable_precise_upscale=True)
-    kept, raw = sift.compute(small, keypoints)
-    if [k.class_id for k in kept] != list(range(len(xy))):
-        raise ImageError(f"expected descriptors of {len(xy)} keypoints, OpenCV gives {len(kept)}")
-    return rootsift_8bit(raw)
+    return small, xy.astype(np.float64) * ratio - 0.5, scale.astype(np.float64) * ratio.mean()
 
 
-def _octave(diameter: float) -> int:
-    """OpenCV's packed octave and layer of a keypoint's diameter in pixels of the image that is described."""
-    step = round(_OCTAVE_LAYERS * float(np.log2(diameter / (2.0 * _SIGMA))))
-    octave = max((step - 1) // _OCTAVE_LAYERS, -1)  # -1 is the doubled image
-    layer = max(step - _OCTAVE_LAYERS * octave, 0)
+def octave_and_layer(diameter: float) -> tuple[int, int]:
+    """Where the extractor's scale space has a keypoint of this diameter in pixels of the shrunk photo.
+
+    Octave -1 is the doubled image.
+    """
+    step = round(OCTAVE_LAYERS * float(np.log2(diameter / (2.0 * SIGMA))))
+    octave = max((step - 1) // OCTAVE_LAYERS, -1)
+    return octave, max(step - OCTAVE_LAYERS * octave, 0)
+
+
+def _packed(diameter: float) -> int:
+    """OpenCV's packed octave and layer of a keypoint's diameter."""
+    octave, layer = octave_and_layer(diameter)
     return (octave & 255) | (layer << 8)

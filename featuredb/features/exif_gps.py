@@ -14,7 +14,7 @@ AltitudeReference = Literal["sea_level", "ellipsoid", "unknown"]
 DEFAULT_SIGMA_HORIZONTAL_M = 4.0
 DEFAULT_SIGMA_VERTICAL_M = 10.0
 # User equivalent range error by which a dilution of precision becomes metres, single frequency.
-_RANGE_ERROR_M = 3.0
+RANGE_ERROR_M = 3.0
 # Radius of 68 % of a circular normal distribution, in units of the deviation of one axis.
 _RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
 _SIGMA_RANGE_M = (0.005, 1000.0)
@@ -92,7 +92,7 @@ def gps_sigmas(gps: Ifd, dji: dict[str, float], warnings: list[str]) -> tuple[fl
     if dji.get("RtkFlag") in _DJI_RTK_FLOAT_OR_FIXED and min(std) > 0:
         return min(max(std[0], std[1], low), high), min(max(std[2], low), high), "rtk"
     ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
-    for tag, factor, source in ((31, 1 / _RADIUS_68, "positioning_error"), (11, _RANGE_ERROR_M, "dop")):
+    for tag, factor, source in ((31, 1 / _RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
         value = gps.number(tag)
         if value is None or value == 0:
             continue

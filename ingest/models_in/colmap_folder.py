@@ -1,41 +1,15 @@
 """A COLMAP model on disk, as arrays: poses, points and keypoints, whatever version wrote it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from featuredb.errors import IngestError, InvalidValueError
 from ingest.colmap_bridge import Model, model_of
 from ingest.models_in.colmap_whole import check_whole
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ColmapModel:
-    """What the model's folder holds.
-
-    Attributes:
-        model: `model.rows` are 0, 1, ... of `names`.
-        names: of the registered images, in the order of their ids.
-        camera_ids: COLMAP's, of `model.cameras`.
-        xy: for each image its keypoints (k, 2), pixels.
-        rgb: (n, 3) uint8 of the points.
-    """
-
-    model: Model
-    names: tuple[str, ...]
-    camera_ids: tuple[int, ...]
-    xy: tuple[NDArray[np.float64], ...]
-    rgb: NDArray[np.uint8]
-
-    def keypoint_colours(self, row: int) -> NDArray[np.uint8]:
-        """(k, 3): each keypoint of an image has the colour of its point; black without one."""
-        colours = np.zeros((len(self.xy[row]), 3), np.uint8)
-        mine = self.model.photo_of == row
-        colours[self.model.keypoint_of[mine]] = self.rgb[self.model.point_of[mine]]
-        return colours
+from ingest.models_in.stored import StoredModel
 
 
 def model_folder(folder: Path) -> Path:
@@ -53,7 +27,7 @@ def model_folder(folder: Path) -> Path:
     )
 
 
-def read_colmap(folder: Path) -> ColmapModel:
+def read_colmap(folder: Path) -> StoredModel:
     """The model in one of the places of `model_folder`.
 
     Raises:
@@ -78,7 +52,7 @@ def read_colmap(folder: Path) -> ColmapModel:
         raise IngestError(f"{place}: {error}; undistort the images to a simpler camera first") from error
     images = [reconstruction.image(i) for i in image_ids]
     point_ids = sorted(reconstruction.point3D_ids())
-    return ColmapModel(
+    return StoredModel(
         model=_numbered(model),
         names=tuple(image.name for image in images),
         camera_ids=tuple(sorted({image.camera_id for image in images})),

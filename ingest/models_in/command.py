@@ -1,4 +1,4 @@
-"""`featuredb ingest model DB FOLDER`: a COLMAP model with its place on Earth as a map."""
+"""`featuredb ingest model DB FOLDER`: a model of another program with its place on Earth as a map."""
 
 import argparse
 import sys
@@ -12,14 +12,20 @@ if TYPE_CHECKING:
 def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     """What of the model is where."""
     parser.add_argument(
-        "folder", metavar="FOLDER", type=Path, help="with the model itself, or with sparse/ or sparse/0"
+        "folder",
+        metavar="FOLDER",
+        type=Path,
+        help="with a COLMAP model (itself, or in sparse/ or sparse/0), OpenSfM's reconstruction.json "
+        "(itself, "
+        "or in opensfm/), or kapture's sensors/ and reconstruction/",
     )
     parser.add_argument(
         "--photos",
         type=Path,
         default=None,
         metavar="FOLDER",
-        help="the model's photos under its names; needed unless georeference.json names them",
+        help="the model's photos under its names; needed unless georeference.json names them; "
+        "default: images/ of OpenSfM, sensors/records_data of kapture",
     )
     parser.add_argument(
         "--database", type=Path, default=None, metavar="FILE", help="COLMAP's; default: FOLDER/database.db"
@@ -28,7 +34,11 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         "--descriptors",
         choices=("stored", "photos"),
         default=None,
-        help="those of COLMAP's database (default), or made anew of the photos at its keypoints",
+        help="those of COLMAP's database (default), or made anew of the photos at the model's keypoints (the "
+        "only way for OpenSfM)",
+    )
+    parser.add_argument(
+        "--reconstruction", type=int, default=None, metavar="N", help="which of several of OpenSfM, from 0"
     )
     place = parser.add_argument_group(
         "where it lies; without these as georeference.json says, or by the GPS of its photos"
@@ -52,7 +62,9 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
         type=_two,
         default=None,
         metavar="M[,M]",
-        help="how well that is known, horizontally and vertically: one standard deviation in metres",
+        help="how well that is known, horizontally and vertically: one standard deviation in metres; alone: "
+        "how "
+        "well OpenSfM's own reference is",
     )
     place.add_argument(
         "--height-datum", default="unknown", help="ellipsoidal, egm96, egm2008, navd88 or unknown (default)"
@@ -69,9 +81,12 @@ def run_model(args: argparse.Namespace) -> int:
     from featuredb.store import Database
     from ingest.models_in.model_map import ModelOptions, map_of_model
 
+    stated = _stated(args)
     options = ModelOptions(
         photos=args.photos,
-        stated=_stated(args),
+        stated=stated,
+        sigma_m=args.sigma if stated is None else None,
+        reconstruction=args.reconstruction,
         colmap_database=args.database,
         descriptors=args.descriptors,
         height_datum=args.height_datum,
@@ -98,8 +113,8 @@ def _stated(args: argparse.Namespace) -> "Stated | None":
     from featuredb.errors import InvalidValueError
     from ingest.models_in.place import Stated
 
-    if args.epsg is None and args.origin is None and args.sigma is None and args.axes == "enu":
-        return None
+    if args.epsg is None and args.origin is None and args.axes == "enu":
+        return None  # and --sigma, if given, belongs to the model's own reference
     origin = args.origin
     if args.axes == "ecef":
         if origin is not None:

@@ -1,9 +1,7 @@
-"""A COLMAP model with its place on Earth becomes a map of a database."""
+"""A model of another program with its place on Earth becomes a map of a database."""
 
-import json
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from featuredb.errors import IngestError
-from featuredb.export.colmap import DATABASE
 from featuredb.export.georeference import GEOREFERENCE
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.file_digest import file_sha256
@@ -21,9 +18,16 @@ from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.models_in.anew import DescribedAnew
-from ingest.models_in.colmap_database import open_features
-from ingest.models_in.colmap_folder import ColmapModel, model_folder, read_colmap
-from ingest.models_in.place import Place, Stated, place_as_stated, place_by_photos, place_of_georeference
+from ingest.models_in.json_values import read_json
+from ingest.models_in.place import (
+    Place,
+    Stated,
+    place_as_stated,
+    place_at_reference,
+    place_by_photos,
+    place_of_georeference,
+)
+from ingest.models_in.source import NAMES, ModelSource, open_model
 from ingest.photo import Photo
 from ingest.scan import ScanOptions, scan_folder
 
@@ -36,11 +40,14 @@ class ModelOptions:
 
     Attributes:
         photos: folder of the photos under the names that the model has; needed where no georeference.json
-            names them.
+            names them, and where descriptors are made of them; None: where the format has its photos.
         stated: where the model lies, if a person says so.
+        sigma_m: how well the place is known that the model's own reference gives, horizontally and
+            vertically, if a person says so.
+        reconstruction: which of several in an OpenSfM file, counted from 0.
         colmap_database: None: database.db in the model's folder.
-        descriptors: from COLMAP's database (also where None), or made anew of the photos at the same
-            keypoints.
+        descriptors: those in the files (also where None, if the format has them), or made anew of the photos
+            at the same keypoints.
         height_datum: of the heights where no georeference.json says it.
         min_track_length: points seen by at least that many photos carry descriptors.
         name, owner, licence: of the map and of photos that do not name their own.
@@ -55,43 +62,43 @@ class ModelOptions:
     name: str = ""
     owner: str = ""
     licence: str = ""
+    # Not in the text that names maps (`_plain`): without them it is as it was before they were there.
+    sigma_m: tuple[float, float] | None = field(default=None, repr=False)
+    reconstruction: int | None = field(default=None, repr=False)
 
 
 def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
-    """The map of the COLMAP model in a folder.
+    """The map of the model in a folder: of COLMAP, of OpenSfM or OpenDroneMap, or of kapture.
 
     Raises:
         IngestError: the model cannot be read, placed or described; what is missing.
     """
     check_datum(options.height_datum)
-    if options.descriptors == "photos" and options.photos is None:
-        raise IngestError("--descriptors photos: expected --photos FOLDER to make them of, found none")
-    colmap = read_colmap(folder)
-    document = read_georeference(folder)
-    photos = photos_of_model(colmap, document, options)
-    place = place_of(colmap, document, photos, options)
+    source = open_model(folder, options.colmap_database, options.reconstruction)
+    anew = _described_anew(source, options)
+    document = read_georeference(folder, source.place)
+    photos = photos_of_model(source, document, options, anew=anew)
+    place = place_of(source, document, photos, options)
     if place.height_datum is not None and options.height_datum not in ("unknown", place.height_datum):
         raise IngestError(
             f"--height-datum {options.height_datum}: {GEOREFERENCE} says that heights are "
             f"{place.height_datum}"
         )
-    database = options.colmap_database or folder / DATABASE
     fingerprint = ExtractorOptions().fingerprint
     ours = document is not None and document["map"].get("extractor_fingerprint")
-    if ours and options.descriptors != "photos":
+    if ours and not anew:
         fingerprint = str(ours)  # of whatever extractor that map was made by
-    with ExitStack() as stack:
-        stored = stack.enter_context(open_features(database, colmap, fingerprint))
+    with source.open_features(fingerprint) as stored:
         features: Sequence[PhotoFeatures] = stored
-        if options.descriptors == "photos":
+        if anew:
             features = DescribedAnew(stored, [photo.path for photo in photos])
         made = build_map(
-            colmap.model,
+            source.stored.model,
             place.placement,
             place.frame,
             photos,
             features,
-            _identity(folder, database, options, document),
+            _identity(folder, source, photos, options, document),
             MapOptions(
                 min_track_length=options.min_track_length,
                 height_datum=place.height_datum or options.height_datum,
@@ -102,100 +109,167 @@ def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
     return _finished(made, place)
 
 
-def read_georeference(folder: Path) -> dict[str, Any] | None:
-    """The geo-reference beside the model, or None where there is none.
+def _described_anew(source: ModelSource, options: ModelOptions) -> bool:
+    """Whether descriptors are made of the photos."""
+    if not source.has_descriptors and options.descriptors == "stored":
+        raise IngestError(
+            f"--descriptors stored: {NAMES[source.format]} keeps none that can be compared with ours; leave "
+            "it out"
+        )
+    anew = options.descriptors == "photos" or not source.has_descriptors
+    if anew and options.photos is None and source.photos is None:
+        asked = "--descriptors photos" if source.has_descriptors else f"{source.place}: no descriptors"
+        raise IngestError(f"{asked}: expected --photos FOLDER to make them of, found none")
+    return anew
+
+
+def georeference_file(folder: Path, place: Path) -> Path | None:
+    """The geo-reference's file in a folder, or where its model was found; None where there is none."""
+    return next((p for p in (folder / GEOREFERENCE, place / GEOREFERENCE) if p.is_file()), None)
+
+
+def read_georeference(folder: Path, place: Path) -> dict[str, Any] | None:
+    """The geo-reference in a folder, or where its model was found; None where there is none.
 
     Raises:
         IngestError: it cannot be read.
     """
-    path = next(
-        (p for p in (folder / GEOREFERENCE, model_folder(folder) / GEOREFERENCE) if p.is_file()), None
-    )
+    path = georeference_file(folder, place)
     if path is None:
         return None
-    try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise IngestError(f"{path}: expected JSON, found something else ({error})") from error
+    document = read_json(path)
     if not isinstance(document, dict) or not isinstance(document.get("map"), dict):
         raise IngestError(f"{path}: expected a geo-reference as `featuredb export` writes it")
+    images = document.get("images", [])
+    if not isinstance(images, list) or not all(_names_photo(entry) for entry in images):
+        raise IngestError(
+            f"{path}: expected images with name, original_name and sha256; export the model again"
+        )
     return document
 
 
+def _names_photo(entry: Any) -> bool:
+    names = ("name", "original_name", "sha256")
+    return isinstance(entry, dict) and all(isinstance(entry.get(name), str) for name in names)
+
+
 def place_of(
-    colmap: ColmapModel, document: dict[str, Any] | None, photos: Sequence[Photo], options: ModelOptions
+    source: ModelSource, document: dict[str, Any] | None, photos: Sequence[Photo], options: ModelOptions
 ) -> Place:
-    """What a person states counts before the file, the file before the photos' GPS."""
+    """What a person states counts before the file, the file before the photos' GPS.
+
+    Raises:
+        IngestError: an accuracy of a place that nothing gives; and what the ways to place a model raise.
+    """
+    model = source.stored.model
     if options.stated is not None:
-        return place_as_stated(colmap.model, options.stated)
+        return place_as_stated(model, options.stated)
+    if options.sigma_m is not None:
+        if source.reference is None:
+            raise IngestError(
+                "expected --epsg, --origin and --sigma together, found no --epsg and no --origin, and no "
+                "reference in the model's files"
+            )
+        return place_at_reference(model, source.reference, options.sigma_m)
     if document is not None:
         return place_of_georeference(document)
-    return place_by_photos(colmap.model, photos)
+    return place_by_photos(model, photos)
 
 
 def photos_of_model(
-    colmap: ColmapModel, document: Mapping[str, Any] | None, options: ModelOptions
+    source: ModelSource, document: Mapping[str, Any] | None, options: ModelOptions, *, anew: bool
 ) -> list[Photo]:
     """What is known of each of the model's photos, in its order.
 
+    Args:
+        anew: their files are needed.
+
     Raises:
-        IngestError: a photo of which nothing is known: it is neither in georeference.json nor in the folder.
+        IngestError: a photo of which nothing is known: it is neither in georeference.json nor in the folder;
+            or one whose file is needed and is not there.
     """
     told = {entry["name"]: entry for entry in (document or {}).get("images", [])}
     keys = (document or {}).get("map", {}).get("camera_keys", [])
+    folder = options.photos or source.photos
     found: dict[str, Photo] = {}
-    if options.photos is not None:
-        if not options.photos.is_dir():
-            raise IngestError(f"--photos {options.photos}: expected the folder of the photos, found none")
+    if folder is not None:
+        if not folder.is_dir():
+            raise IngestError(f"--photos {folder}: expected the folder of the photos, found none")
         scan = ScanOptions(owner=options.owner, licence=options.licence)
-        found = {photo.name: photo for photo in scan_folder(options.photos, scan).photos if photo.sha256}
+        found = {photo.name: photo for photo in scan_folder(folder, scan).photos if photo.sha256}
     by_hash = {photo.sha256: photo for photo in found.values()}
     photos = []
-    for name, camera in zip(colmap.names, colmap.model.camera_of, strict=True):
-        if name in told:
+    stored = source.stored
+    for row, (name, camera) in enumerate(zip(stored.names, stored.model.camera_of, strict=True)):
+        if name in told and not (anew and told[name]["sha256"] not in by_hash):
             entry = told[name]
             photo = _told(entry, options, by_hash.get(entry["sha256"]))
-            key = colmap.camera_ids[int(camera)] - 1
+            key = stored.camera_ids[int(camera)] - 1
             photos.append(replace(photo, camera_key=keys[key] if 0 <= key < len(keys) else ""))
+        elif name in told:
+            raise IngestError(
+                f"{name}: expected this photo to make descriptors of, with the hash "
+                f"{told[name]['sha256'][:16]}... "
+                f"that {GEOREFERENCE} has, found none in {folder}; give --photos FOLDER with the originals"
+            )
         elif name in found:
-            photos.append(found[name])
+            photo = found[name]
+            if photo.gps is None and source.gps:
+                photo = replace(photo, gps=source.gps[row])
+            photos.append(photo)
         else:
             raise IngestError(
                 f"{name}: expected this photo of the model in --photos FOLDER under that name, found "
-                f"{'no such folder given' if options.photos is None else 'none'}; a map names its photos by "
+                f"{'no such folder given' if folder is None else 'none'}; a map names its photos by "
                 "their bytes, and their licence"
             )
     return photos
 
 
 def _told(entry: Mapping[str, Any], options: ModelOptions, file: Photo | None) -> Photo:
-    time, gps = entry.get("capture_time"), entry.get("gps")
+    try:
+        time, gps = entry.get("capture_time"), entry.get("gps")
+        capture_time = None if time is None else datetime.fromisoformat(time)
+        prior = None if gps is None else GeoPrior(**gps)
+    except (TypeError, ValueError) as error:
+        raise IngestError(f"{GEOREFERENCE}: {entry['name']}: broken time or position: {error}") from error
     return Photo(
         name=entry["original_name"],
         path=Path() if file is None else file.path,
         sha256=entry["sha256"],
-        capture_time=None if time is None else datetime.fromisoformat(time),
-        gps=None if gps is None else GeoPrior(**gps),
+        capture_time=capture_time,
+        gps=prior,
         owner=entry.get("owner") or options.owner,
         licence=entry.get("licence") or options.licence,
     )
 
 
 def _identity(
-    folder: Path, database: Path, options: ModelOptions, document: Mapping[str, Any] | None
+    folder: Path,
+    source: ModelSource,
+    photos: Sequence[Photo],
+    options: ModelOptions,
+    document: Mapping[str, Any] | None,
 ) -> MapIdentity:
     """The same files and options are the same map."""
-    files = sorted(model_folder(folder).glob("*.bin")) + sorted(model_folder(folder).glob("*.txt"))
-    files += [path for path in (folder / GEOREFERENCE, database) if path.is_file()]
-    key = digest(*(f"{path.name} {file_sha256(path)}" for path in files), _plain(options))
+    document_file = georeference_file(folder, source.place)
+    files = [*source.files, *([] if document_file is None else [document_file]), *source.feature_files]
+    texts = [f"{path.name} {file_sha256(path)}" for path in files]
+    texts.append(_plain(options))
+    if not source.has_descriptors:  # they are the photos'
+        texts += [photo.sha256 for photo in photos]
+    if options.sigma_m is not None:
+        texts.append(f"sigma {options.sigma_m}")
+    texts += [source.choice] if source.choice else []
     was = (document or {}).get("map", {})
-    imported = {"format": "colmap", "descriptors": options.descriptors or "stored"}
+    descriptors = options.descriptors or ("stored" if source.has_descriptors else "photos")
+    imported = {"format": source.format, "descriptors": descriptors}
     if was:
         imported |= {"map_id": was["id"], "source": was.get("source", "")}
     return MapIdentity(
-        map_id=f"{key[:24]}-m",
+        map_id=f"{digest(*texts)[:24]}-m",
         name=options.name or was.get("name") or folder.absolute().name,
-        source="COLMAP model",
+        source=f"{NAMES[source.format]} model",
         licence=options.licence or was.get("licence", ""),
         provenance={"imported": imported},
     )

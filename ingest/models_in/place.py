@@ -23,6 +23,7 @@ AXES: tuple[Axes, ...] = ("enu", "utm", "ecef")
 # A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the
 # best similarity leaves of that is below a thousandth of the model's size; more means that it is no UTM.
 _MOST_MISFIT = 1e-3
+_MOST_FROM_REFERENCE_M = 100_000.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,11 +113,6 @@ def place_as_stated(model: Model, stated: Stated) -> Place:
     zone_of(stated.epsg)
     centers = model.centers()
     own_from_model, frame, residual_m = _to_local(model, centers, stated)
-    horizontal, vertical = stated.sigma_m
-    placed = own_from_model.act(centers)
-    radius = max(float(np.sqrt(((placed - placed.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
-    relative = horizontal / radius
-    covariance = np.diag([relative**2] * 4 + [horizontal**2, horizontal**2, vertical**2])
     evidence = {"imported": f"axes {stated.axes}, EPSG:{stated.epsg}, origin {list(stated.origin)}"}
     evidence["sigma_m"] = str(list(stated.sigma_m))
     return Place(
@@ -124,11 +120,40 @@ def place_as_stated(model: Model, stated: Stated) -> Place:
         placement=Placement(
             method="gcp",  # a person answers for it
             local_from_sfm=own_from_model,
-            covariance=covariance,
+            covariance=_covariance(own_from_model.act(centers), stated.sigma_m),
             residual_rms_m=residual_m,
             evidence=evidence,
         ),
         epsg=stated.epsg,
+    )
+
+
+def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float, float]) -> Place:
+    """In the frame of the model's own reference, as surely as a person says.
+
+    Raises:
+        IngestError: cameras so far from it that it cannot be theirs.
+    """
+    centers = model.centers()
+    farthest = float(np.linalg.norm(centers, axis=1).max())
+    if farthest > _MOST_FROM_REFERENCE_M:
+        raise IngestError(
+            f"expected cameras within {_MOST_FROM_REFERENCE_M / 1000:.0f} km of the model's reference, "
+            "found one "
+            f"at {farthest / 1000:.0f} km: the coordinates are no metres in its frame; give --epsg, "
+            "--origin and "
+            "--axes with --sigma"
+        )
+    return Place(
+        frame=reference,
+        placement=Placement(
+            method="gcp",  # a person answers for it
+            local_from_sfm=Sim3.identity(),
+            covariance=_covariance(centers, sigma_m),
+            residual_rms_m=0.0,
+            evidence={"imported": "the model's own reference", "sigma_m": str(list(sigma_m))},
+        ),
+        epsg=utm_epsg(reference.latitude_deg, reference.longitude_deg),
     )
 
 
@@ -196,6 +221,14 @@ def _to_local(model: Model, centers: FloatArray, stated: Stated) -> tuple[Sim3, 
             f"{residual:.2f} m are left over {size:.0f} m"
         )
     return fitted, frame, float(residual)
+
+
+def _covariance(centers: FloatArray, sigma_m: tuple[float, float]) -> FloatArray:
+    """(7, 7) of a placement that is known so well, over the spread of its cameras (k, 3)."""
+    horizontal, vertical = sigma_m
+    radius = max(float(np.sqrt(((centers - centers.mean(axis=0)) ** 2).sum(axis=1).mean())), 1.0)
+    relative = horizontal / radius
+    return np.diag([relative**2] * 4 + [horizontal**2, horizontal**2, vertical**2])
 
 
 def _at(utm: FloatArray, epsg: int) -> LocalFrame:

@@ -267,9 +267,13 @@ class TestRefusals:
             map_of_model(tmp_path / "a", ModelOptions(height_datum="egm96"))
         path = tmp_path / "a" / "georeference.json"
         document = json.loads(path.read_text())
+        image = document["images"][0]
         for change, message in (
             ({"format": "other"}, "expected the format"),
             ({"placement": {}}, "broken or incomplete"),
+            ({"images": [{"name": "0.png"}]}, "expected images with name, original_name and sha256"),
+            ({"images": [image | {"gps": {"latitude_deg": "x"}}]}, "0.png: broken time or position"),
+            ({"images": [image | {"capture_time": "noon"}]}, "0.png: broken time or position"),
         ):
             path.write_text(json.dumps(document | change))
             with pytest.raises(IngestError, match=message):

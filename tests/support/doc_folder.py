@@ -8,7 +8,7 @@
 
 The README is run first, and leaves what the other pages begin with: my.db with MAP, of the photos of the
 park, and what it exports. `go_on` adds what comes from elsewhere: OTHER_MAP of another flight, in quarantine,
-and colmap, MAP as a COLMAP model that does not say where it lies.
+and colmap and opensfm, MAP as models of those programs that do not say how surely they lie there.
 """
 
 import csv
@@ -103,6 +103,10 @@ def go_on(folder: Path) -> None:
         database.set_status([values["OTHER_MAP"]], "quarantined", "nobody has confirmed it")
         shutil.copytree(f"town-colmap/{values['MAP']}", "colmap")
         Path("colmap/georeference.json").unlink()
+        assert main(["export", "my.db", "exported", "--format", "opensfm", "--maps", values["MAP"]]) == 0
+        shutil.move(f"exported/{values['MAP']}", "opensfm")
+        Path("exported").rmdir()
+        Path("opensfm/georeference.json").unlink()
         for path in ("town", "town-colmap", "other.db", "third.db"):
             shutil.rmtree(path)
 

@@ -1,0 +1,169 @@
+"""What every format of models gives: the model as arrays, and the keypoints and descriptors of its images."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IngestError
+from featuredb.features.features import DESCRIPTOR_SIZE, Features
+from ingest.colmap_bridge import Model
+from ingest.extract import PhotoFeatures
+
+# RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
+# `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).
+_NORM_RANGE, _MEAN_RANGE = (500.0, 524.0), (33.0, 42.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class StoredModel:
+    """What the model's files hold.
+
+    Attributes:
+        model: `model.rows` are 0, 1, ... of `names`.
+        names: of the registered images, in the order of the files.
+        camera_ids: of `model.cameras`, counted from 1.
+        xy: for each image its keypoints (k, 2), pixels.
+        rgb: (n, 3) uint8 of the points.
+    """
+
+    model: Model
+    names: tuple[str, ...]
+    camera_ids: tuple[int, ...]
+    xy: tuple[NDArray[np.float64], ...]
+    rgb: NDArray[np.uint8]
+
+    def keypoint_colours(self, row: int) -> NDArray[np.uint8]:
+        """(k, 3): each keypoint of an image has the colour of its point; black without one."""
+        colours = np.zeros((len(self.xy[row]), 3), np.uint8)
+        mine = self.model.photo_of == row
+        colours[self.model.keypoint_of[mine]] = self.rgb[self.model.point_of[mine]]
+        return colours
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Keypoints:
+    """Of one image: xy (k, 2) and, in our units, diameter (k,) and degrees (k,), None where the files have no
+    orientations; descriptors (k, 128), None where they have none."""
+
+    xy: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    angle: NDArray[np.float32] | None
+    descriptors: NDArray[np.uint8] | None
+
+
+class StoredFeatures(Sequence[PhotoFeatures], ABC):
+    """Features of the model's images, each read when it is asked for, and not kept."""
+
+    def __init__(self, stored: StoredModel, fingerprint: str) -> None:
+        self.stored, self._fingerprint = stored, fingerprint
+
+    @abstractmethod
+    def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
+        """Of one image, checked against the model; without descriptors where they are not asked for.
+
+        Raises:
+            IngestError: the files have other keypoints than the model, or other descriptors than RootSIFT.
+        """
+
+    @overload
+    def __getitem__(self, index: int) -> PhotoFeatures: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "Sequence[PhotoFeatures]": ...
+
+    def __getitem__(self, index: int | slice) -> "PhotoFeatures | Sequence[PhotoFeatures]":
+        if isinstance(index, slice):
+            return [self[k] for k in range(len(self))[index]]
+        found = self.keypoints(index)
+        if found.descriptors is None or found.angle is None:
+            raise IngestError(
+                f"{self.stored.names[index]}: the model's files have no descriptors of it; give --photos and "
+                "--descriptors photos"
+            )
+        return self.features(index, found, found.angle, found.descriptors)
+
+    def __len__(self) -> int:
+        return len(self.stored.names)
+
+    def features(
+        self,
+        index: int,
+        keypoints: Keypoints,
+        angle: NDArray[np.float32],
+        descriptors: NDArray[np.uint8],
+        shape: tuple[int, ...] | None = None,
+    ) -> PhotoFeatures:
+        """The keypoints with these orientations and descriptors.
+
+        Args:
+            shape: (height, width) of the photo, where it has been read.
+
+        Raises:
+            IngestError: the photo is of another size than the camera.
+        """
+        camera = self.stored.model.cameras[int(self.stored.model.camera_of[index])]
+        if shape is not None and shape[:2] != (camera.height, camera.width):
+            raise IngestError(
+                f"{self.stored.names[index]}: expected {camera.width}x{camera.height} pixels as the model's "
+                f"camera has, found {shape[1]}x{shape[0]}; give the photos that the model was made of"
+            )
+        return PhotoFeatures(
+            features=Features(
+                xy=keypoints.xy,
+                scale=keypoints.scale,
+                angle=angle,
+                response=np.ones(len(keypoints.xy), np.float32),
+                descriptors=descriptors,
+                width=camera.width,
+                height=camera.height,
+                fingerprint=self._fingerprint,
+            ),
+            rgb=self.stored.keypoint_colours(index),
+        )
+
+
+def scale_and_angle(rows: NDArray[np.float32], where: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Diameter in pixels and degrees of keypoints (k, 4 or 6): x, y and COLMAP's scale and radians, or x, y
+    and an affine shape.
+
+    Raises:
+        IngestError: keypoints without scale.
+    """
+    if rows.shape[1] == 4:
+        scale, turn = rows[:, 2], rows[:, 3]
+    elif rows.shape[1] == 6:
+        a11, a12, a21, a22 = rows[:, 2:].T
+        scale, turn = (np.hypot(a11, a21) + np.hypot(a12, a22)) / 2.0, np.arctan2(a21, a11)
+    else:
+        raise IngestError(
+            f"{where}: expected keypoints with scale and orientation (4 or 6 columns), found "
+            f"{rows.shape[1]} columns: these are no SIFT features"
+        )
+    degrees = np.degrees(turn.astype(np.float64)) % 360.0
+    return (2.0 * scale).astype(np.float32), (degrees.astype(np.float32) % np.float32(360.0))
+
+
+def as_rootsift(data: NDArray[np.generic], name: str, count: int) -> NDArray[np.uint8]:
+    """Descriptors (k, 128) that can be compared with ours.
+
+    Raises:
+        IngestError: of another number or size, or not RootSIFT.
+    """
+    if data.shape != (count, DESCRIPTOR_SIZE):
+        raise IngestError(
+            f"{name}: expected descriptors of {count} keypoints with {DESCRIPTOR_SIZE} values, found "
+            f"{data.shape}; give --photos and --descriptors photos"
+        )
+    described = data[data.any(axis=1)].astype(np.float64)
+    if len(described):
+        norm, mean = float(np.median(np.linalg.norm(described, axis=1))), float(described.mean())
+        if not (_NORM_RANGE[0] < norm < _NORM_RANGE[1] and _MEAN_RANGE[0] < mean < _MEAN_RANGE[1]):
+            raise IngestError(
+                f"{name}: expected RootSIFT (COLMAP's normalisation L1_ROOT: length 512, mean about 37), "
+                f"found length {norm:.0f}, mean {mean:.1f}; give --photos and --descriptors photos"
+            )
+    return data.astype(np.uint8)
