@@ -145,8 +145,7 @@ def _keypoint_kind(place: Path, observations: Path) -> KeypointKind:
     if len(kinds) != 1:
         raise IngestError(
             f"{observations}: expected observations of one kind of keypoints, or of one of SIFT among them, "
-            "found "
-            f"{kinds}"
+            f"found {kinds}"
         )
     folder = place / "keypoints" / _plain(kinds[0], observations)
     ((where, (_, dtype, size)),) = _one(folder / "keypoints.txt", 3)
@@ -160,8 +159,7 @@ def _keypoint_kind(place: Path, observations: Path) -> KeypointKind:
     if count not in (4, 6):
         raise IngestError(
             f"{where}: expected keypoints with scale and orientation (4 or 6 values), found {count} values: "
-            "these "
-            "are no SIFT features; ingest the photos instead"
+            "these are no SIFT features; ingest the photos instead"
         )
     return KeypointKind(folder=folder, dtype=_TYPES[dtype.split(".")[-1]], size=count)
 
@@ -248,7 +246,6 @@ def _bytes(path: Path, row: int) -> bytes:
     if len(data) % row:
         raise IngestError(
             f"{path}: expected rows of {row} bytes, found {len(data)} bytes: the file is cut off, or of "
-            "another "
-            "kind than is said"
+            "another kind than is said"
         )
     return data

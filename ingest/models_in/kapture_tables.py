@@ -54,8 +54,7 @@ def table(path: Path, least: int, most: int | None = None) -> Iterator[Row]:
                     expected = f"{least}" if most == least else f"at least {least}"
                     raise IngestError(
                         f"{where}: expected {expected} values, found {len(values)}: the file is cut off or "
-                        "broken; "
-                        "copy or export it again"
+                        "broken; copy or export it again"
                     )
                 yield where, values
     except (OSError, UnicodeDecodeError) as error:

@@ -209,8 +209,8 @@ def photos_of_model(
         elif name in told:
             raise IngestError(
                 f"{name}: expected this photo to make descriptors of, with the hash "
-                f"{told[name]['sha256'][:16]}... "
-                f"that {GEOREFERENCE} has, found none in {folder}; give --photos FOLDER with the originals"
+                f"{told[name]['sha256'][:16]}... that {GEOREFERENCE} has, found none in {folder}; give "
+                "--photos FOLDER with the originals"
             )
         elif name in found:
             photo = found[name]

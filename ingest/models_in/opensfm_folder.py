@@ -209,8 +209,7 @@ def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
     if unseen > _MOST_UNSEEN * count:
         raise IngestError(
             f"{path}: expected the observations of {count} points, found none or one of {unseen} of them: "
-            "it is "
-            "cut off, or belongs to another reconstruction; copy or create the tracks again"
+            "it is cut off, or belongs to another reconstruction; copy or create the tracks again"
         )
     residual = np.full(len(xy), np.inf)
     for row, (pose, mine) in enumerate(
@@ -224,10 +223,9 @@ def _kept(parts: _Parts, xy: FloatArray, path: Path) -> NDArray[np.bool_]:
         seen = residual[np.isfinite(residual)]
         raise IngestError(
             f"{path}: expected observations where the reconstruction's points are, found "
-            f"{len(kept) - kept.sum()} "
-            f"of {len(kept)} far from there (median {np.median(seen) if len(seen) else np.nan:.0f} px): it "
-            "belongs "
-            "to another reconstruction, or to images of another size"
+            f"{len(kept) - kept.sum()} of {len(kept)} far from there (median "
+            f"{np.median(seen) if len(seen) else np.nan:.0f} px): it belongs to another reconstruction, or "
+            "to images of another size"
         )
     kept &= (np.bincount(tracks.track[kept], minlength=count) >= 2)[tracks.track]
     if not kept.any():
@@ -298,8 +296,7 @@ def _reference(document: Mapping[str, Any], place: Path, path: Path) -> LocalFra
     if len(frames) == 2 and not _same(*frames):
         raise IngestError(
             f"{place / REFERENCE}: expected the reference of {path}, {frames[0]}, found {frames[1]}; remove "
-            "the "
-            "file that does not belong to the reconstruction"
+            "the file that does not belong to the reconstruction"
         )
     return frames[0] if frames else None
 

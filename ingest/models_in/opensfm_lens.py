@@ -25,8 +25,7 @@ def camera_from_opensfm(entry: Mapping[str, Any], where: str) -> Camera:
     if kind not in (*_ONE_FOCAL, *_TWO_FOCALS):
         raise IngestError(
             f"{where}: expected a lens of {', '.join((*_ONE_FOCAL, *_TWO_FOCALS))}, found {kind!r}; "
-            "undistort "
-            "the images to a simpler camera first"
+            "undistort the images to a simpler camera first"
         )
     width, height = (number(member(entry, name, where), f"{where}, {name}") for name in ("width", "height"))
     size = max(width, height)

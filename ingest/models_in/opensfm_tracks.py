@@ -68,8 +68,7 @@ def _columns(header: str, path: Path) -> int:
     if not header.startswith(_HEADER) or version not in _COLUMNS:
         raise IngestError(
             f"{path}: expected {_HEADER}1 or {_HEADER}2 in the first line, found {header[:60].strip()!r}: "
-            "other "
-            "versions have no scales to describe keypoints by; create the tracks by a newer OpenSfM"
+            "other versions have no scales to describe keypoints by; create the tracks by a newer OpenSfM"
         )
     return _COLUMNS[version]
 
@@ -83,8 +82,7 @@ def _rows(
         if len(parts) != columns:
             raise IngestError(
                 f"{path}, line {number}: expected {columns} columns, found {len(parts)}: the file is cut "
-                "off or "
-                "broken; copy or export it again"
+                "off or broken; copy or export it again"
             )
         image, track, feature = parts[:3]
         if not (track.isdecimal() and feature.isdecimal()):
@@ -99,8 +97,7 @@ def _rows(
         if not (abs(x) <= _MOST and abs(y) <= _MOST and 0.0 < scale <= 1.0):  # false for NaN too
             raise IngestError(
                 f"{path}, line {number}: expected x and y within -0.5 and 0.5 and a scale in (0, 1], over "
-                "the "
-                f"longer side of the image, found {', '.join(p[:40] for p in parts[3:6])}; export the "
+                f"the longer side of the image, found {', '.join(p[:40] for p in parts[3:6])}; export the "
                 "tracks again"
             )
         yield image, track, (x, y, scale)

@@ -139,10 +139,8 @@ def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float
     if farthest > _MOST_FROM_REFERENCE_M:
         raise IngestError(
             f"expected cameras within {_MOST_FROM_REFERENCE_M / 1000:.0f} km of the model's reference, "
-            "found one "
-            f"at {farthest / 1000:.0f} km: the coordinates are no metres in its frame; give --epsg, "
-            "--origin and "
-            "--axes with --sigma"
+            f"found one at {farthest / 1000:.0f} km: the coordinates are no metres in its frame; give "
+            "--epsg, --origin and --axes with --sigma"
         )
     return Place(
         frame=reference,
