@@ -6,10 +6,12 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from datetime import UTC, date, datetime
 from decimal import Decimal
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from featuredb.errors import InvalidValueError
-from featuredb.store import Database
+
+if TYPE_CHECKING:
+    from featuredb.store import Database
 
 LONGEST_CELL = 72  # a wider cell makes a table unreadable; csv and json give everything
 
@@ -43,8 +45,10 @@ def storage_options(args: argparse.Namespace) -> dict[str, str]:
     return options
 
 
-def open_database(args: argparse.Namespace) -> Database:
+def open_database(args: argparse.Namespace) -> "Database":
     """The existing database that the arguments name."""
+    from featuredb.store import Database  # seconds; many commands need no store
+
     return Database.open(args.db, storage_options=storage_options(args))
 
 

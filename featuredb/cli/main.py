@@ -3,7 +3,8 @@
 A package adds subcommands by an entry point of the group "featuredb.commands" that names a function
 `register(subparsers)`. It calls `subparsers.add_parser(...)` and `parser.set_defaults(run=function)`;
 `function(args)` does the work and returns an exit code, None for 0. It raises FeatureDbError for what a user
-can do something about.
+can do something about. There is an entry point for every subcommand, of its name, so that only the module of
+the one that runs is loaded; several may name the same function.
 
 Exit codes: 0 done; 1 done, and the answer is no (damage found, not localised); 2 wrong usage or a
 FeatureDbError; 70 a defect of the program; 130 interrupted.
@@ -32,13 +33,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return its exit code."""
     common, rest = _common_parser().parse_known_args(sys.argv[1:] if argv is None else list(argv))
     _configure_logging("debug" if common.debug else common.log_level)
-    parser = build_parser(entry_points(group=COMMAND_GROUP))
+    parser = build_parser(needed_for(rest, entry_points(group=COMMAND_GROUP)))
     try:
         args = parser.parse_args(rest)
     except SystemExit as stop:  # argparse has printed help or the error
         return int(stop.code or 0)
     args.debug, args.log_level = common.debug, common.log_level
     return run_command(args.run, args)
+
+
+def needed_for(argv: Sequence[str], commands: Iterable[EntryPoint]) -> list[EntryPoint]:
+    """The commands that the arguments need: those of the name that comes first, all where there are none."""
+    known = list(commands)
+    return [c for c in known if c.name in argv[:1]] or known
 
 
 def build_parser(commands: Iterable[EntryPoint]) -> argparse.ArgumentParser:
@@ -50,7 +57,11 @@ def build_parser(commands: Iterable[EntryPoint]) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"featuredb {_version()}")
     subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    tried = set()
     for command in sorted(commands, key=lambda c: c.name):
+        if command.value in tried:
+            continue
+        tried.add(command.value)
         try:
             register: Register = command.load()
             register(subparsers)

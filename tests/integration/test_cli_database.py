@@ -1,15 +1,18 @@
 """The command line: results on stdout, errors in one line on stderr, exit codes."""
 
+import argparse
 import csv
 import io
 import json
+import subprocess
+import sys
 from collections.abc import Iterator
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import pytest
 
-from featuredb.cli.main import COMMAND_GROUP, build_parser, main
+from featuredb.cli.main import COMMAND_GROUP, build_parser, main, needed_for
 from featuredb.errors import StoreError
 from featuredb.store import Database
 from tests.support.command_line import only_command
@@ -175,6 +178,26 @@ def test_a_broken_plugin_does_not_take_the_others_down(caplog: pytest.LogCapture
         "absent",
         "broken",
     ]
+
+
+def test_every_command_has_an_entry_point_of_its_name() -> None:
+    installed = list(entry_points(group=COMMAND_GROUP))
+    parser = build_parser(installed)
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    assert sorted(commands.choices) == sorted(entry.name for entry in installed)
+
+
+def test_what_a_command_does_not_need_is_not_loaded() -> None:
+    other = EntryPoint("view", "no_such_module_here:register", COMMAND_GROUP)
+    one = EntryPoint("maps", "featuredb.cli.database:register", COMMAND_GROUP)
+    assert needed_for(["maps", "my.db"], [other, one]) == [one]
+    for argv in ([], ["--help"], ["gone", "maps"], ["-h", "maps"]):
+        assert needed_for(argv, [other, one]) == [other, one]
+    code = (
+        "import sys; from featuredb.cli.main import main; main(['query', '--help']); "
+        "sys.exit('featuredb.store' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
 
 
 def broken_register(subparsers: object) -> None:
