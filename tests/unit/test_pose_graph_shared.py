@@ -54,7 +54,7 @@ def test_the_end_of_a_chain_is_off_as_far_as_is_said() -> None:
     rng = np.random.default_rng(0)
     jacobian = point_jacobian(np.array([STEP_M * MAPS, 0.0, 0.0]))
     lengths: dict[bool, list[float]] = {True: [], False: []}
-    for _ in range(30):
+    for _ in range(12):
         errors = drawn(rng)
         for said, found in lengths.items():
             solution = chain(errors, said)
