@@ -33,7 +33,8 @@ class ScaleOptions:
     Attributes:
         seed: of everything. districts: number of towns. per_district: photos of each.
         town_size_m: of a district. sights: that people visit in each.
-        width: of the widest camera, pixels. texel_m: resolution of the painted ground.
+        width: of the widest camera, pixels.
+        texel_m: resolution of the painted ground. pieces: of walls and roofs (see `make_town`).
         geotags: how wrong they are.
     """
 
@@ -44,6 +45,7 @@ class ScaleOptions:
     sights: int = 24
     width: int = 640
     texel_m: float = 0.1
+    pieces: int = 16
     geotags: GeotagOptions = field(default_factory=lambda: GeotagOptions(sigma_m=8.0, far_share=0.03))
 
     def __post_init__(self) -> None:
@@ -53,7 +55,7 @@ class ScaleOptions:
     @classmethod
     def short(cls, seed: int = 3) -> "ScaleOptions":
         """Four small districts of 60 photos."""
-        return cls(seed=seed, districts=4, per_district=60, town_size_m=(200.0, 180.0), sights=6)
+        return cls(seed=seed, districts=4, per_district=60, town_size_m=(200.0, 180.0), sights=6, pieces=4)
 
     def scene(self, key: str) -> Scene:
         """Scenes "d<district>/light/week"; one light in all, since each is painted anew."""
@@ -71,6 +73,7 @@ def _district(options: ScaleOptions, number: int) -> Scene:
         size_m=options.town_size_m,
         place=place,
         texel_m=options.texel_m,
+        pieces=options.pieces,
     )
 
 
