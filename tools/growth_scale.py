@@ -160,7 +160,7 @@ def content(database: Path) -> set[tuple[str, str]]:
 
 
 def apart(database: Path, album: Album) -> int:
-    """Photos more than a metre from where the rest of their map is, by robust fits of the maps to the truth."""
+    """Photos over a metre from where the rest of their map is, by robust fits of the maps to the truth."""
     snapshot, count = Database.open(database).snapshot(), 0
     for summary in snapshot.maps():
         images = snapshot.load_map(summary.map_id).images
