@@ -21,7 +21,9 @@ from ingest.reconstruction import (
     reconstruct_photos,
 )
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
-from ingest.register.gps import GpsPlacement, place_by_gps
+from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.submodel import keep_photos, select_photos
+from ingest.tagged_elsewhere import Elsewhere, tagged_elsewhere
 from ingest.workspace import Workspace
 
 
@@ -72,13 +74,57 @@ def place_models(
 ) -> Iterator[Component]:
     """Place every model and build its map; one at a time, so that the caller can commit and forget it.
 
+    Photos whose GPS together contradicts that of the others of their model follow as components without map.
+
     Args:
         identity: of the map of the component with that number.
         survey: control points, which then place the maps instead of GPS.
     """
     for number, model in enumerate(done.reconstruction.models()):
-        features = done.features.of(model.rows)
-        yield _component(model, done.usable, features, identity(number), options, survey)
+        groups = [] if survey is not None else _elsewhere(model, done.usable, options)
+        gone = {int(model.rows[k]) for group in groups for k in group.photos}
+        kept = keep_photos(model, set(model.rows.tolist()) - gone) if groups else model
+        if kept is not None:
+            features = done.features.of(kept.rows)
+            yield _component(kept, done.usable, features, identity(number), options, survey)
+        for group in groups:
+            yield _left_out(model, group, done.usable, options)
+
+
+def placed_by_gps(
+    model: Model, chosen: Sequence[Photo], options: GpsOptions
+) -> tuple[LocalFrame | None, tuple[int, ...], GpsPlacement]:
+    """A model by the GPS of its photos: the frame, photos with GPS by place in the model, the placement."""
+    frame = local_frame_of(chosen)  # its own: models may lie in different towns
+    positions, sigmas = gps_priors(chosen, frame)
+    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
+    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options)
+    return frame, tuple(with_gps.tolist()), placed
+
+
+def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[Elsewhere]:
+    """Groups of photos whose GPS contradicts a placement that is accepted."""
+    _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
+    return tagged_elsewhere(model, with_gps, placed, options.elsewhere) if placed.reason is None else []
+
+
+def _left_out(
+    model: Model, group: Elsewhere, photos: Sequence[Photo], options: MapMakingOptions
+) -> Component:
+    """Photos that are in no map, since their GPS agrees on another place."""
+    part = select_photos(model, model.rows[list(group.photos)].tolist())
+    chosen = [photos[r] for r in part.rows]
+    _, with_gps, placed = placed_by_gps(part, chosen, options.gps)
+    return Component(
+        model=part,
+        photos=tuple(chosen),
+        with_gps=with_gps,
+        placement=placed,
+        feature_map=None,
+        reason_code="ELSEWHERE",
+        reason=f"their GPS agrees on a place {group.offset_m:.0f} m from where their matches put them: they "
+        "show another place that looks like it, or their positions have one error",
+    )
 
 
 def _component(
@@ -99,14 +145,11 @@ def _component(
         features: of the model's.
     """
     chosen = [photos[r] for r in model.rows]
-    frame = local_frame_of(chosen)  # its own: components may lie in different towns
-    positions, sigmas = gps_priors(chosen, frame)
-    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
-    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options.gps)
+    frame, with_gps, placed = placed_by_gps(model, chosen, options.gps)
     component = Component(
         model=model,
         photos=tuple(chosen),
-        with_gps=tuple(int(i) for i in with_gps),
+        with_gps=with_gps,
         placement=placed,
         feature_map=None,
         reason_code=placed.reason or "",

@@ -34,6 +34,7 @@ from ingest.register.gps import GpsOptions
 from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm import SfmOptions, SfmView
 from ingest.stage_clock import StageClock
+from ingest.tagged_elsewhere import ElsewhereOptions
 from ingest.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -57,6 +58,7 @@ class MapMakingOptions:
     joining: JoinOptions = field(default_factory=JoinOptions)
     sfm: SfmOptions = field(default_factory=SfmOptions)
     gps: GpsOptions = field(default_factory=GpsOptions)
+    elsewhere: ElsewhereOptions = field(default_factory=ElsewhereOptions)
     maps: MapOptions = field(default_factory=MapOptions)
     cameras: CameraSharing = "shared"
 

@@ -32,6 +32,11 @@ def keep_photos(model: Model, rows: Collection[int], least: int = 2) -> Model | 
     return _cut(model, kept)
 
 
+def select_photos(model: Model, rows: Collection[int]) -> Model:
+    """The model with these photos, whether they hang together or not."""
+    return _cut(model, np.isin(model.rows, np.array(sorted(rows), dtype=np.int64)))
+
+
 def _cut(model: Model, kept: "np.ndarray") -> Model:
     """The model with the photos of the mask (k,) and the points that two of them still see."""
     here = kept[model.photo_of]

@@ -5,7 +5,7 @@
 ALBUM is a folder of `featuredb.simworld` albums, DB a database that has grown by its photos
 (tools/growth_community.py; its `--min-link` admits more than the default, so that wrong ones are there to be
 seen). Prints each photo of its living grown maps that no existing map localised: its `firmness`
-(`ingest/growth/links.py`) and its error. The limit `SettleOptions.min_link` belongs between the two kinds.
+(`ingest/links.py`) and its error. The limit `SettleOptions.min_link` belongs between the two kinds.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.store import Database
 from ingest.colmap_bridge import Model
-from ingest.growth.links import firmness
+from ingest.links import firmness
 from tools.growth_common import open_album, registered, table
 
 

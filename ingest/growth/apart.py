@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from ingest.colmap_bridge import Model
-from ingest.growth.links import firm_parts
+from ingest.links import firm_parts
 from ingest.submodel import keep_photos
 
 # What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until

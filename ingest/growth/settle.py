@@ -18,7 +18,6 @@ from ingest.growth import gates
 from ingest.growth.anchors import Anchors
 from ingest.growth.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.drift import DriftOptions, photo_covariances
-from ingest.growth.links import firmness
 from ingest.growth.model_parts import only_photos, with_existing, without_photos
 from ingest.growth.parents import edges_of
 from ingest.growth.photo_spread import (
@@ -32,6 +31,7 @@ from ingest.growth.placement import Held, PlacementOptions
 from ingest.growth.refine import Lenses, RefineOptions, refine_with_maps
 from ingest.growth.similarity_fit import Fit, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
+from ingest.links import firmness
 
 # Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
 # their own localisation has elsewhere.

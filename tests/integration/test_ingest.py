@@ -114,6 +114,25 @@ def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
     assert report.maps[0].residual_rms_m < 0.1
 
 
+def test_positions_that_agree_on_another_place_keep_their_photos_out(tmp_path: Path) -> None:
+    folder = tmp_path / "photos"
+    write_hill_photos(folder, gps_noise_m=0.01)
+    strays = write_hill_photos(tmp_path / "stray", east_m=30.0)[3:5]
+    for stray in strays:
+        (tmp_path / "stray" / stray.name).replace(folder / stray.name)
+    database = Database.create(tmp_path / "db")
+    report = ingest_photos(database, folder, _TRUTH)
+    assert [(m.status, m.photos, m.reason_code) for m in report.maps] == [
+        ("committed", 7, ""),
+        ("refused", 2, "ELSEWHERE"),
+    ]
+    out = {p.name: p.reason for p in report.photos if p.status != "registered"}
+    assert list(out) == [stray.name for stray in strays]
+    assert all("30 m from where their matches put them" in reason for reason in out.values())
+    (summary,) = database.snapshot().maps()
+    assert summary.images == 7
+
+
 def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
     for seed in (1, 2, 3):
         write_hill_photos(tmp_path / "photos", columns=1, rows=1, texture_seed=seed, prefix=f"p{seed}")

@@ -4,7 +4,7 @@ import numpy as np
 
 from ingest.colmap_bridge import Model
 from ingest.growth.apart import taken_apart
-from ingest.growth.links import firm_parts, firmness
+from ingest.links import firm_parts, firmness
 from tests.support.posed_models import model_of
 
 

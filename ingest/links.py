@@ -16,10 +16,21 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import Model
 
 
+def link_shares(model: Model) -> FloatArray:
+    """(k, k): the share of the points of the photo that sees fewer which both see; 0 on the diagonal."""
+    seen: NDArray[np.float64] = np.ones(len(model.point_of))
+    sees = sparse.csr_array(
+        (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
+    )
+    common = (sees @ sees.T).toarray()
+    counts = np.maximum(np.diag(common), 1.0)
+    shares = common / np.minimum.outer(counts, counts)
+    np.fill_diagonal(shares, 0.0)
+    return np.asarray(shares)
+
+
 def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> FloatArray:
     """(k,) of every photo: the weakest link of its firmest chain of photos to one that is held.
-
-    The link of two photos is the share of the points of the one that sees fewer which both see.
 
     Args:
         held: photos of the model, by place among its rows, that need no link; they have infinity.
@@ -28,7 +39,7 @@ def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> 
     Returns:
         0 for photos without a chain.
     """
-    shares = _links(model)
+    shares = link_shares(model)
     shares[:, list(without)] = 0.0
     firm = np.zeros(len(model.rows))
     firm[list(held)] = np.inf
@@ -46,20 +57,7 @@ def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> 
 
 def firm_parts(model: Model, least_share: float) -> list[list[int]]:
     """Rows of the photos that hang together by links of at least `least_share`, largest part first."""
-    links = sparse.csr_array((_links(model) >= least_share).astype(np.int8))
+    links = sparse.csr_array((link_shares(model) >= least_share).astype(np.int8))
     count, label = connected_components(links, directed=False)
     parts = [model.rows[label == part].tolist() for part in range(count)]
     return sorted(parts, key=lambda rows: (-len(rows), rows))
-
-
-def _links(model: Model) -> FloatArray:
-    """(k, k) share of common points, 0 on the diagonal."""
-    seen: NDArray[np.float64] = np.ones(len(model.point_of))
-    sees = sparse.csr_array(
-        (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
-    )
-    common = (sees @ sees.T).toarray()
-    counts = np.maximum(np.diag(common), 1.0)
-    shares = common / np.minimum.outer(counts, counts)
-    np.fill_diagonal(shares, 0.0)
-    return np.asarray(shares)
