@@ -5,8 +5,8 @@
 WORLD is an album of `featuredb.simworld` (tools/growth_scale.py writes one), FOLDER its photos or some of
 them, WORK the work folder of an ingest of these (`featuredb ingest photos DB FOLDER`: DB/_work), which is not
 done again. Prints, for each model that GPS places, each group of photos outside it whose positions agree:
-their common offset in metres and over the limit of `ingest.tagged_elsewhere.ElsewhereOptions`, and how many of them
-are where the rest of the model is by the truth. The limit belongs between the two kinds.
+their common offset in metres and over the limit of `ElsewhereOptions`, and how many of them are where the
+rest of the model is by the truth. The limit belongs between the two kinds.
 """
 
 import argparse
