@@ -1,6 +1,6 @@
 """How the time of an ingest grows: 500 and 5,000 simulated photos, wall time per photo and peak memory.
 
-    python -m tools.growth_scale --out DIR [--size full] [--seed 3] [--dask ADDRESS]
+    python -m tools.growth_scale --out DIR [--size full] [--seed 3] [--max-features 2000] [--dask ADDRESS]
 
 The world is that of `featuredb.simworld.scale_world`: ten districts of 500 photos. The first district alone
 and all of them are ingested by `featuredb ingest photos` in a process of its own, from empty databases. With
@@ -191,7 +191,8 @@ def ingested(
     spent.parts += 1
     command = [
         *(sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)),
-        *("--workers", str(args.workers), "--quiet", *extra, *args.ingest_option),
+        *("--workers", str(args.workers), "--max-features", str(args.max_features)),
+        *("--quiet", *extra, *args.ingest_option),
     ]
     said = out / f"{name}.txt"  # a line for each photo that is in no map
     with said.open("wb") as file, subprocess.Popen(command, stdout=file) as process:
@@ -281,6 +282,9 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument(
+        "--max-features", type=int, default=2000, help="of a photo of 640 pixels; default: 2000"
+    )
     parser.add_argument("--dask", default="", metavar="ADDRESS", help="ingest once more on this scheduler")
     parser.add_argument(
         "--ingest-option",
