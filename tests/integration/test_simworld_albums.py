@@ -138,6 +138,7 @@ def test_more_districts_keep_the_photos_of_the_first(tmp_path: Path) -> None:
         sights=1,
         width=160,
         texel_m=0.3,
+        pieces=1,
     )
     exact = replace(options, geotags=replace(options.geotags, sigma_m=0.0, far_share=0.0))
     one = write_scale(tmp_path / "one", replace(exact, districts=1), workers=1)
