@@ -16,13 +16,18 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import Model
 
 
-def link_shares(model: Model) -> FloatArray:
-    """(k, k): the share of the points of the photo that sees fewer which both see; 0 on the diagonal."""
+def points_in_common(model: Model) -> sparse.csr_array:
+    """(k, k): how many points both photos see; on the diagonal those of one."""
     seen: NDArray[np.float64] = np.ones(len(model.point_of))
     sees = sparse.csr_array(
         (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
     )
-    common = (sees @ sees.T).toarray()
+    return sparse.csr_array(sees @ sees.T)
+
+
+def link_shares(model: Model) -> FloatArray:
+    """(k, k): the share of the points of the photo that sees fewer which both see; 0 on the diagonal."""
+    common = points_in_common(model).toarray()
     counts = np.maximum(np.diag(common), 1.0)
     shares = common / np.minimum.outer(counts, counts)
     np.fill_diagonal(shares, 0.0)
@@ -57,7 +62,15 @@ def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> 
 
 def firm_parts(model: Model, least_share: float) -> list[list[int]]:
     """Rows of the photos that hang together by links of at least `least_share`, largest part first."""
-    links = sparse.csr_array((link_shares(model) >= least_share).astype(np.int8))
-    count, label = connected_components(links, directed=False)
+    return _parts(model, sparse.csr_array(link_shares(model) >= least_share))
+
+
+def tied_parts(model: Model, least_points: int) -> list[list[int]]:
+    """Rows of the photos that hang together by pairs with so many points in common, largest part first."""
+    return _parts(model, points_in_common(model) >= least_points)
+
+
+def _parts(model: Model, tied: sparse.csr_array) -> list[list[int]]:
+    count, label = connected_components(tied.astype(np.int8), directed=False)
     parts = [model.rows[label == part].tolist() for part in range(count)]
     return sorted(parts, key=lambda rows: (-len(rows), rows))

@@ -1,5 +1,6 @@
 """From reconstructions to placed feature maps: by GPS or control points, one map at a time."""
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -11,6 +12,7 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.colmap_bridge import Model
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import PhotoFeatures
+from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
 from ingest.reconstruction import (
@@ -25,6 +27,15 @@ from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.submodel import keep_photos, select_photos
 from ingest.tagged_elsewhere import Elsewhere, tagged_elsewhere
 from ingest.workspace import Workspace
+
+_WEAKLY_TIED = (
+    "fewer than {least} points tie them to any other photo of their reconstruction: buildings that look "
+    "alike have as many in common"
+)
+_ELSEWHERE = (
+    "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
+    "that looks like it, or their positions have one error"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,21 +85,34 @@ def place_models(
 ) -> Iterator[Component]:
     """Place every model and build its map; one at a time, so that the caller can commit and forget it.
 
-    Photos whose GPS together contradicts that of the others of their model follow as components without map.
+    What hangs on the rest of its model by little is placed by itself. Where that is a photo or two, and where
+    the GPS of photos together contradicts that of the others, they follow as components without map.
 
     Args:
         identity: of the map of the component with that number.
         survey: control points, which then place the maps instead of GPS.
     """
-    for number, model in enumerate(done.reconstruction.models()):
-        groups = [] if survey is not None else _elsewhere(model, done.usable, options)
-        gone = {int(model.rows[k]) for group in groups for k in group.photos}
-        kept = keep_photos(model, set(model.rows.tolist()) - gone) if groups else model
-        if kept is not None:
-            features = done.features.of(kept.rows)
-            yield _component(kept, done.usable, features, identity(number), options, survey)
-        for group in groups:
-            yield _left_out(model, group, done.usable, options)
+    number = itertools.count()
+    for whole in done.reconstruction.models():
+        loose: list[int] = []
+        for rows in tied_parts(whole, options.min_tie):
+            if len(rows) < options.sfm.min_model_photos:
+                loose += rows
+                continue
+            model = select_photos(whole, rows)
+            groups = [] if survey is not None else _elsewhere(model, done.usable, options)
+            gone = {int(model.rows[k]) for group in groups for k in group.photos}
+            kept = keep_photos(model, set(rows) - gone) if groups else model
+            if kept is not None:
+                features = done.features.of(kept.rows)
+                yield _component(kept, done.usable, features, identity(next(number)), options, survey)
+            for group in groups:
+                part = select_photos(model, model.rows[list(group.photos)].tolist())
+                reason = _ELSEWHERE.format(offset_m=group.offset_m)
+                yield _left_out(part, done.usable, options, "ELSEWHERE", reason)
+        if loose:
+            reason = _WEAKLY_TIED.format(least=options.min_tie)
+            yield _left_out(select_photos(whole, loose), done.usable, options, "WEAKLY_TIED", reason)
 
 
 def placed_by_gps(
@@ -109,21 +133,19 @@ def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions)
 
 
 def _left_out(
-    model: Model, group: Elsewhere, photos: Sequence[Photo], options: MapMakingOptions
+    model: Model, photos: Sequence[Photo], options: MapMakingOptions, code: str, reason: str
 ) -> Component:
-    """Photos that are in no map, since their GPS agrees on another place."""
-    part = select_photos(model, model.rows[list(group.photos)].tolist())
-    chosen = [photos[r] for r in part.rows]
-    _, with_gps, placed = placed_by_gps(part, chosen, options.gps)
+    """Photos that are in no map."""
+    chosen = [photos[r] for r in model.rows]
+    _, with_gps, placed = placed_by_gps(model, chosen, options.gps)
     return Component(
-        model=part,
+        model=model,
         photos=tuple(chosen),
         with_gps=with_gps,
         placement=placed,
         feature_map=None,
-        reason_code="ELSEWHERE",
-        reason=f"their GPS agrees on a place {group.offset_m:.0f} m from where their matches put them: they "
-        "show another place that looks like it, or their positions have one error",
+        reason_code=code,
+        reason=reason,
     )
 
 

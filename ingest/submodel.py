@@ -34,7 +34,8 @@ def keep_photos(model: Model, rows: Collection[int], least: int = 2) -> Model | 
 
 def select_photos(model: Model, rows: Collection[int]) -> Model:
     """The model with these photos, whether they hang together or not."""
-    return _cut(model, np.isin(model.rows, np.array(sorted(rows), dtype=np.int64)))
+    wanted = np.isin(model.rows, np.array(sorted(rows), dtype=np.int64))
+    return model if wanted.all() else _cut(model, wanted)
 
 
 def _cut(model: Model, kept: "np.ndarray") -> Model:

@@ -13,12 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_bridge import Model
+from ingest.links import tied_parts
 from ingest.register.structure.similarity import similarities
 
 _LOG = logging.getLogger(__name__)
@@ -260,11 +259,5 @@ def hangs_together(model: Model, parts: Sequence[Sequence[int]], least_points: i
     Args:
         model: of all of them. parts: rows of the models that were joined; others do not count.
     """
-    sees = csr_array(
-        (np.ones(len(model.point_of)), (model.photo_of, model.point_of)),
-        shape=(len(model.rows), max(len(model.xyz), 1)),
-    )
-    tied = ((sees @ sees.T) >= least_points).astype(np.int8)
-    _, label = connected_components(tied, directed=False)
-    whole = label == np.bincount(label).argmax()
+    whole = np.isin(model.rows, tied_parts(model, least_points)[0])
     return all(float(whole[here].mean()) > 0.5 for part in parts if (here := np.isin(model.rows, part)).any())

@@ -1,0 +1,66 @@
+"""What hangs on a reconstruction by little is placed by itself, or in no map."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from ingest.clusters.reconstruct import Reconstruction
+from ingest.colmap_bridge import Model
+from ingest.extract import FeatureFiles
+from ingest.map_builder import MapIdentity
+from ingest.photo import Photo
+from ingest.placed_models import Component, place_models
+from ingest.reconstruction import MapMakingOptions, Reconstructed
+from tests.support.posed_models import model_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Made(Reconstruction):
+    model: Model
+
+    def models(self) -> Iterator[Model]:
+        yield self.model
+
+
+def _identity(number: int) -> MapIdentity:
+    return MapIdentity(map_id=f"map-{number}", name=f"map {number}", source="", licence="", provenance={})
+
+
+def _placed(model: Model, options: MapMakingOptions | None = None) -> list[Component]:
+    photos = [
+        Photo(name=f"{k}.jpg", path=Path(f"{k}.jpg"), width=640, height=480, sha256=f"{k:02}")
+        for k in range(len(model.rows))
+    ]
+    done = Reconstructed(
+        usable=tuple(photos),
+        features=FeatureFiles(tuple(p.path for p in photos)),
+        reconstruction=_Made(model=model),
+    )
+    return list(place_models(done, options or MapMakingOptions(), identity=_identity))
+
+
+def _said(components: list[Component]) -> list[tuple[str, list[str]]]:
+    return [(c.reason_code, [p.name.removesuffix(".jpg") for p in c.photos]) for c in components]
+
+
+def test_photos_that_little_ties_are_in_no_map() -> None:
+    one = range(200)
+    tied = model_of(one, one, one, range(170, 300), range(171, 200))
+    assert _said(_placed(tied)) == [("TOO_FEW", ["0", "1", "2", "3"]), ("WEAKLY_TIED", ["4"])]
+
+
+def test_two_houses_that_little_ties_are_two_maps() -> None:
+    one, other = range(200), range(171, 371)
+    model = model_of(one, one, one, other, other, other)
+    parts = _placed(model)
+    assert _said(parts) == [("TOO_FEW", ["0", "1", "2"]), ("TOO_FEW", ["3", "4", "5"])]
+    assert [len(c.model.xyz) for c in parts] == [200, 200]
+    # With as many points in common as are asked for they are one.
+    (whole,) = _placed(model, MapMakingOptions(min_tie=29))
+    assert whole.model is model
+
+
+def test_photos_that_are_too_few_for_a_map_are_named_together() -> None:
+    one = range(200)
+    model = model_of(one, one, one, range(180, 400), range(300, 400), range(10))
+    assert _said(_placed(model)) == [("TOO_FEW", ["0", "1", "2"]), ("WEAKLY_TIED", ["3", "4", "5"])]
