@@ -10,7 +10,8 @@ Prints seconds and processor seconds per photo, images per hour, registered phot
 than a metre from where the rest of their map is by the truth (their map was joined wrongly), and the peak of
 the memory of all processes together (proportional shares, sampled twice a second). Writes scale.json. Exit
 code 0 if the wall time per photo at the large size is at most 1.3 times that at the small one, the peak is
-under 6 GiB, and the large one registers as large a share of its photos: what fails early takes no time.
+under 6 GiB, and the large one registers at least half as large a share of its photos: what fails early takes
+no time.
 
 A run that is killed goes on where it was, as the ingest does. The times of its parts add up; what was done
 twice counts twice.
@@ -37,7 +38,9 @@ from ingest.register.gps import GpsOptions, place_by_gps
 from tools.growth_common import Album, Verdict, conclude, made, say, table
 
 _RATIO, _PEAK_GIB = 1.3, 6.0
-_REGISTERED = 0.9  # of the share that the small one registers: districts differ
+# Of the share that the small one registers. Of 500 photos, single districts of the large one had 86 to 288 in
+# maps; the small one is a single draw of that.
+_REGISTERED = 0.5
 _APART_M, _FIT_SIGMA_M = 1.0, 0.3
 _SAMPLE_S = 0.5
 _TICKS = os.sysconf("SC_CLK_TCK")

@@ -106,18 +106,11 @@ def every_nth(folder: Path) -> tuple[str, ...]:
     return tuple(names[_EVERY // 2 :: _EVERY])
 
 
-def ingest(
-    database: Path,
-    photos: Path,
-    exclude: Sequence[str],
-    work: Path | None = None,
-    max_features: int | None = None,
-) -> Ingest:
+def ingest(database: Path, photos: Path, exclude: Sequence[str], work: Path | None = None) -> Ingest:
     """Run `featuredb ingest photos` in a process of its own on a database that is not there yet.
 
     Args:
         work: work folder, which may hold what another ingest of these photos has done; default: a new one.
-        max_features: of a photo; default: the command's.
 
     Raises:
         SystemExit: there is a database already, or the command failed.
@@ -128,7 +121,6 @@ def ingest(
     command = [sys.executable, "-m", "featuredb.cli", "ingest", "photos", str(database), str(photos)]
     command += ["--quiet", "--report", str(report), *(f"--exclude={name}" for name in exclude)]
     command += [] if work is None else ["--work", str(work)]
-    command += [] if max_features is None else ["--max-features", str(max_features)]
     cpu_before, start = _children_cpu_s(), time.perf_counter()
     done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True, check=False)
     wall_s = time.perf_counter() - start

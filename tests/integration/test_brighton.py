@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
 from ingest.pipeline import IngestOptions, ingest_photos
@@ -16,7 +15,6 @@ pytestmark = [pytest.mark.real_data, pytest.mark.slow]
 
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
 _MAX_M, _MAX_DEG = 1.0, 0.5
-_FEATURES = 5000  # of a photo, to be sooner done; tools/real_photos.py takes as many as the command does
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +34,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def part(photos: Path, work: Path, tmp_path_factory: pytest.TempPathFactory) -> Ingest:
     """A database without the held-out photos."""
-    return ingest(tmp_path_factory.mktemp("part") / "db", photos, _HELD_OUT, work, _FEATURES)
+    return ingest(tmp_path_factory.mktemp("part") / "db", photos, _HELD_OUT, work)
 
 
 def test_cameras_are_where_their_gps_says(part: Ingest) -> None:
@@ -58,8 +56,7 @@ def test_cameras_are_where_their_gps_says(part: Ingest) -> None:
 
 
 def test_the_same_ingest_again_changes_nothing(part: Ingest, photos: Path, work: Path) -> None:
-    extractor = ExtractorOptions(max_features=_FEATURES)
-    options = IngestOptions(scan=ScanOptions(exclude=_HELD_OUT), extractor=extractor, work=work, workers=1)
+    options = IngestOptions(scan=ScanOptions(exclude=_HELD_OUT), work=work, workers=1)
     again = ingest_photos(Database.open(part.database), photos, options)
     assert {p.name for p in again.photos if p.status == "skipped"} == set(_HELD_OUT)
     assert [m.status for m in again.maps] == ["already_there"]
@@ -69,7 +66,7 @@ def test_the_same_ingest_again_changes_nothing(part: Ingest, photos: Path, work:
 def test_held_out_photos_lie_where_a_map_of_all_photos_has_them(
     part: Ingest, photos: Path, work: Path, tmp_path: Path
 ) -> None:
-    whole = ingest(tmp_path / "whole", photos, (), work, _FEATURES)
+    whole = ingest(tmp_path / "whole", photos, (), work)
     assert (whole.usable, whole.registered) == (18, 18)
 
     database, truth = Database.open(part.database), reference(tmp_path / "whole")
