@@ -4,7 +4,6 @@ The body is the camera with axes x forward, y left, z up. Heights are above the 
 wants, where the map's datum can be converted here; `manifest.json` says of each map what its heights are.
 """
 
-import hashlib
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -15,13 +14,10 @@ from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attributi
 from featuredb.export.job import Exported, ExportJob
 from featuredb.export.shots import Shot, shots_of
 from featuredb.export.tally import folder_for_each_map
-from featuredb.geo.geopose import GeoPose
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
 BASIC, ADVANCED, SERIES, MANIFEST = "basic_ypr", "advanced", "series.json", "manifest.json"
-_AUTHORITY = "/geopose/1.0"
 
 
 def write_geopose(job: ExportJob) -> Exported:
@@ -44,8 +40,9 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     if timed:
         (folder / ADVANCED).mkdir()
         for shot, name in timed:
-            _write(folder / ADVANCED / name, advanced(shot))
-        _write(folder / SERIES, irregular_series([shot for shot, _ in timed]))
+            _write(folder / ADVANCED / name, advanced(shot.geopose, _time(shot)))
+        in_time = sorted((_time(shot), shot.number, shot.geopose) for shot, _ in timed)
+        _write(folder / SERIES, irregular_series([(unix_ms, pose) for unix_ms, _, pose in in_time]))
     manifest = {
         "map_id": feature_map.map_id,
         "height_datum": shots[0].height_datum if shots else feature_map.height_datum,
@@ -59,81 +56,6 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     }
     _write(folder / MANIFEST, manifest)
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
-
-
-def basic_ypr(pose: GeoPose) -> dict[str, Any]:
-    """A Basic-YPR GeoPose."""
-    yaw, pitch, roll = pose.yaw_pitch_roll_deg
-    return {
-        "position": {"lat": pose.latitude_deg, "lon": pose.longitude_deg, "h": pose.height_m},
-        "angles": {"yaw": yaw, "pitch": pitch, "roll": roll},
-    }
-
-
-def advanced(shot: Shot) -> dict[str, Any]:
-    """An Advanced GeoPose: Unix milliseconds, frame at the camera, quaternion."""
-    pose = shot.geopose
-    x, y, z, w = pose.quaternion_xyzw
-    return {
-        "validTime": shot.unix_ms,
-        "frameSpecification": _tangent(
-            LocalFrame(
-                latitude_deg=pose.latitude_deg, longitude_deg=pose.longitude_deg, height_m=pose.height_m
-            )
-        ),
-        "quaternion": {"x": x, "y": y, "z": z, "w": w},
-    }
-
-
-def irregular_series(shots: Sequence[Shot]) -> dict[str, Any]:
-    """The photos in the order of their times; the outer frame is east-north-up at the first of them.
-
-    Raises:
-        ValueError: no shots, or one without its time.
-    """
-    ordered = sorted((_time(shot), shot.number, shot) for shot in shots)
-    first = ordered[0][2].geopose
-    outer = LocalFrame(
-        latitude_deg=first.latitude_deg, longitude_deg=first.longitude_deg, height_m=first.height_m
-    )
-    series = [{"frame": _inner(outer, shot.geopose), "validTime": time} for time, _, shot in ordered]
-    digest = hashlib.sha256(json.dumps(series, separators=(",", ":")).encode()).hexdigest()
-    check = {"poseCount": len(series), "integrityCheck": json.dumps({"SHA256": digest})}
-    return {
-        "header": {
-            **check,
-            "startInstant": ordered[0][0],
-            "stopInstant": ordered[-1][0],
-            "transitionModel": "none",
-        },
-        "outerFrame": _tangent(outer),
-        "innerFrameAndTimeSeries": series,
-        "trailer": check,
-    }
-
-
-def _tangent(frame: LocalFrame) -> dict[str, str]:
-    return {
-        "authority": _AUTHORITY,
-        "id": "LTP-ENU",
-        "parameters": f"longitude={frame.longitude_deg:.10f}&latitude={frame.latitude_deg:.10f}"
-        f"&height={frame.height_m:.4f}",
-    }
-
-
-def _inner(outer: LocalFrame, pose: GeoPose) -> dict[str, str]:
-    here = LocalFrame(
-        latitude_deg=pose.latitude_deg, longitude_deg=pose.longitude_deg, height_m=pose.height_m
-    )
-    outer_from_here = outer.enu_from(here)
-    turned = quaternion_from_matrix(outer_from_here.rotation @ pose.true_enu_from_body)
-    translation = ", ".join(f"{v:.4f}" for v in outer_from_here.translation)
-    rotation = ", ".join(f"{v:.9f}" for v in turned)
-    return {
-        "authority": _AUTHORITY,
-        "id": "RotateTranslate",
-        "parameters": f"translation=[{translation}]&rotation=[{rotation}]",
-    }
 
 
 def _time(shot: Shot) -> int:

@@ -5,7 +5,6 @@ appears whole or not at all.
 """
 
 import csv
-import hashlib
 import io
 import json
 import os
@@ -18,15 +17,13 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+from featuredb.geo.geopose_documents import irregular_series
 from reloc.tracking.trajectory import EarthPose, Trajectory, TrajectoryPoint
 
 _POSE = (
     *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
     *("heading_deg", "pitch_deg", "roll_deg", "epsg", "height_datum", "map_id"),
 )
-_AUTHORITY = {"authority": "/geopose/1.0"}
 _AXES = ("re", "rn", "ru", "e", "n", "u")
 _UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
 CSV_COLUMNS = (
@@ -184,38 +181,9 @@ def geopose_text(trajectory: Trajectory) -> str:
     """
     found = _known(trajectory, "GeoPose")
     _one_datum(trajectory, found)
-    outer = _frame_at(found[0][1])
     start_ms = 0.0 if trajectory.start is None else 1000.0 * trajectory.start.timestamp()
-    series = [
-        {
-            "frame": {
-                "authority": "/geopose/1.0",
-                "id": "RotateTranslate",
-                "parameters": _inner(outer, pose),
-            },
-            "validTime": round(start_ms + 1000.0 * point.time_s),
-        }
-        for point, pose in found
-    ]
-    digest = hashlib.sha256(json.dumps(series, separators=(",", ":")).encode()).hexdigest()
-    check = {"poseCount": len(series), "integrityCheck": json.dumps({"SHA256": digest})}
-    document = {
-        "header": {
-            **check,
-            "startInstant": series[0]["validTime"],
-            "stopInstant": series[-1]["validTime"],
-            "transitionModel": "none",
-        },
-        "outerFrame": {
-            **_AUTHORITY,
-            "id": "LTP-ENU",
-            "parameters": f"longitude={outer.longitude_deg:.10f}&latitude={outer.latitude_deg:.10f}"
-            f"&height={outer.height_m:.4f}",
-        },
-        "innerFrameAndTimeSeries": series,
-        "trailer": check,
-    }
-    return json.dumps(document, indent=1) + "\n"
+    poses = [(round(start_ms + 1000.0 * point.time_s), pose.geopose) for point, pose in found]
+    return json.dumps(irregular_series(poses), indent=1) + "\n"
 
 
 def srt_text(trajectory: Trajectory) -> str:
@@ -293,21 +261,6 @@ def _place(pose: EarthPose) -> list[float]:
         round(pose.geopose.latitude_deg, 10),
         round(float(pose.utm[2]), 4),
     ]
-
-
-def _frame_at(pose: EarthPose) -> LocalFrame:
-    place = pose.geopose
-    return LocalFrame(
-        latitude_deg=place.latitude_deg, longitude_deg=place.longitude_deg, height_m=place.height_m
-    )
-
-
-def _inner(outer: LocalFrame, pose: EarthPose) -> str:
-    outer_from_here = outer.enu_from(_frame_at(pose))
-    turned = outer_from_here.rotation @ matrix_from_quaternion(pose.geopose.quaternion_xyzw)
-    translation = ", ".join(f"{v:.4f}" for v in outer_from_here.translation)
-    rotation = ", ".join(f"{v:.9f}" for v in quaternion_from_matrix(turned))
-    return f"translation=[{translation}]&rotation=[{rotation}]"
 
 
 def _srt_time(time_s: float) -> str:
