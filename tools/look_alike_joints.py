@@ -23,21 +23,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.geometry.arrays import FloatArray
 from ingest.colmap_bridge import Model
 from ingest.executor import PoolExecutor
 from ingest.links import tied_parts
 from ingest.photo import Photo
 from ingest.placed_models import placed_by_gps
 from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.register.gps import GpsOptions, place_by_gps
 from ingest.scan import require_usable, scan_folder
 from ingest.submodel import select_photos
 from ingest.tagged_elsewhere import agreeing_groups, least_offset_m
 from ingest.workspace import Workspace
-from tools.growth_common import open_album, table
+from tools.growth_common import open_album, table, with_the_rest
 
-_APART_M, _FIT_SIGMA_M = 1.0, 0.3
 _TIES = (15, 20, 30, 40, 50, 75, 100, 150)
 _TIES_HEAD = ("points", "right photos outside", "in parts for a map", "wrong photos outside", "wrong inside")
 _POSITIONS_HEAD = ("photos", "right", "offset m", "over limit")
@@ -56,7 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     def right(model: Model) -> NDArray[np.bool_]:
         names = [(Path(prefix) / done.usable[row].name).as_posix() for row in model.rows]
-        return is_right(model, np.array([truth.images[name].cam_from_local.center for name in names]))
+        true = np.array([truth.images[name].cam_from_local.center for name in names])
+        return with_the_rest(model.centers(), true)
 
     judged = [(model, right(model)) for model in models]
     _show(by_ties(judged, options), _TIES_HEAD)
@@ -64,15 +62,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     groups.sort(key=lambda group: group[-1])
     _show(groups, _POSITIONS_HEAD)
     return 0
-
-
-def is_right(model: Model, true_centers: FloatArray) -> NDArray[np.bool_]:
-    """Which photos (k,) a robust fit of the model to the truth has within a metre."""
-    if len(true_centers) < 3:
-        return np.ones(len(true_centers), dtype=bool)
-    sigmas = np.full(true_centers.shape, _FIT_SIGMA_M)
-    fit = place_by_gps(model.centers(), true_centers, sigmas, GpsOptions())
-    return np.asarray(np.linalg.norm(fit.residuals_m, axis=1) <= _APART_M)
 
 
 def by_ties(

@@ -44,7 +44,12 @@ def irregular_series(poses: Sequence[tuple[int, GeoPose]]) -> dict[str, Any]:
 
     Args:
         poses: at least one, in the order of their times, Unix milliseconds.
+
+    Raises:
+        ValueError: no poses.
     """
+    if not poses:
+        raise ValueError("an Irregular Series has at least one pose, found none")
     outer = _frame_at(poses[0][1])
     series = [{"frame": _inner(outer, pose), "validTime": unix_ms} for unix_ms, pose in poses]
     digest = hashlib.sha256(json.dumps(series, separators=(",", ":")).encode()).hexdigest()
