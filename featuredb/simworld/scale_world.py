@@ -6,6 +6,9 @@ geotags that are wrong by kilometres point into other districts. Kinds: street, 
 is the district.
 """
 
+import multiprocessing
+import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -87,8 +90,19 @@ def write_scale(
     """
     if album_is_complete(folder):
         return Path(folder)
-    photos = [p for number in range(options.districts) for p in plan_district(options, number)]
+    photos = _plan(options, workers)
     return write_album(folder, options, options.scene("d0/0/000"), photos, workers, progress)
+
+
+def _plan(options: ScaleOptions, workers: int) -> list[PlannedPhoto]:
+    """The photos of all districts, planned in a pool of processes: finding the sights of one takes a minute."""
+    count = min(workers or os.cpu_count() or 1, options.districts)
+    if count <= 1:
+        return [p for number in range(options.districts) for p in plan_district(options, number)]
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context) as pool:
+        districts = pool.map(plan_district, [options] * options.districts, range(options.districts))
+        return [photo for district in districts for photo in district]
 
 
 def plan_district(options: ScaleOptions, number: int) -> list[PlannedPhoto]:
