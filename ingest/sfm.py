@@ -202,8 +202,8 @@ def mapping_settings(options: SfmOptions, side_px: int) -> dict[str, Any]:
         "ba_refine_focal_length": options.refine_focal,
         "min_num_matches": options.min_inliers,
         "min_model_size": options.min_model_photos,
-        # For photos that see too few points: a generalised relative pose, whose trials are not bounded (COLMAP
-        # issue 4079). One photo of 22 took over ten minutes, where the whole block takes five seconds without.
+        # A generalised relative pose for photos that see too few points; its trials are not bounded (COLMAP's
+        # issue 4079): one photo of 22 took over ten minutes, where the block takes five seconds without it.
         "structure_less_registration_fallback": False,
         "use_prior_position": options.position_priors == "bundle",
         "use_robust_loss_on_prior_position": options.position_priors == "bundle",

@@ -191,7 +191,8 @@ def ingested(
     log = out / f"{name}.json"
     if log.exists():
         return Ingest(**json.loads(log.read_text(encoding="utf-8")))
-    photos, database, so_far = out / f"photos-{name}", out / name, out / f"{name}-so-far.json"
+    # The folder's name is in the maps, so that it is the same for all that are compared.
+    photos, database, so_far = out / f"{name}-files" / "photos", out / name, out / f"{name}-so-far.json"
     spent = Spent.read(so_far)
     if not spent.parts:
         link(album.folder, photos, (f.name for f in facts))

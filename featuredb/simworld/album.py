@@ -9,6 +9,7 @@ import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -101,7 +102,7 @@ def write_album(
         raise InvalidValueError("write_album: expected names that differ, found one twice")
     for parent in {(folder / name).parent for name in names}:
         parent.mkdir(parents=True, exist_ok=True)
-    # The same scenes lie together, so that a process paints few of them.
+    # The same scenes lie together: a process takes a part of the list, and paints few scenes.
     todo = sorted((p for p in photos if not (folder / p.shot.name).exists()), key=lambda p: p.scene)
     there = len(photos) - len(todo)
     for done, _ in enumerate(_run(folder, world, todo, workers), start=there + 1):
@@ -178,8 +179,14 @@ def _run(folder: Path, world: SceneSource, todo: list[PlannedPhoto], workers: in
             yield _write(folder, world, photo)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
-        for future in as_completed([pool.submit(_write, folder, world, photo) for photo in todo]):
+    with ExitStack() as stack:
+        futures = []
+        for share in range(count):  # a row of its own for each process: few scenes are painted twice
+            pool = ProcessPoolExecutor(1, mp_context=context, initializer=_one_thread)
+            stack.enter_context(pool)
+            start, stop = (len(todo) * edge // count for edge in (share, share + 1))
+            futures += [pool.submit(_write, folder, world, photo) for photo in todo[start:stop]]
+        for future in as_completed(futures):
             yield future.result()
 
 

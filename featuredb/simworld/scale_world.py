@@ -95,7 +95,7 @@ def write_scale(
 
 
 def _plan(options: ScaleOptions, workers: int) -> list[PlannedPhoto]:
-    """The photos of all districts, planned in a pool of processes: finding the sights of one takes a minute."""
+    """The photos of all districts, planned in a pool of processes, since finding sights takes long."""
     count = min(workers or os.cpu_count() or 1, options.districts)
     if count <= 1:
         return [p for number in range(options.districts) for p in plan_district(options, number)]

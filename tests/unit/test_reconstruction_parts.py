@@ -5,6 +5,7 @@ from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
@@ -113,6 +114,14 @@ def test_pixel_thresholds_grow_with_the_image() -> None:
     for name in ("mapper.filter_max_reproj_error", "mapper.init_max_error", "mapper.abs_pose_max_error"):
         assert large[name] == pytest.approx(2.5 * small[name])
     assert mapping_settings(SfmOptions(refine_focal=False), 800)["ba_refine_focal_length"] is False
+
+
+def test_no_photo_is_registered_without_points() -> None:
+    """COLMAP tries that by default, and can take longer for one photo than for all others together."""
+    options = pycolmap.IncrementalPipelineOptions()
+    name = "structure_less_registration_fallback"
+    assert getattr(options, name) is True  # else the setting is of no more use, or has another name
+    assert mapping_settings(SfmOptions(), 800)[name] is False
 
 
 def test_keys_follow_the_content() -> None:
