@@ -6,7 +6,7 @@ In come photos as values, out go reconstructions as plain arrays.
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -264,7 +264,7 @@ def read_model(folder: Path) -> Model:
 
 
 def model_of(reconstruction: Any) -> Model:
-    """The registered images and the points of a pycolmap.Reconstruction.
+    """The registered images and the points of a pycolmap.Reconstruction; see `without_impossible`.
 
     Raises:
         InvalidValueError: a lens that maps do not have.
@@ -283,7 +283,7 @@ def model_of(reconstruction: Any) -> Model:
         photo_of.extend(e[0] for e in elements)
         keypoint_of.extend(e[1] for e in elements)
         xyz.append(point.xyz)
-    return Model(
+    model = Model(
         cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c)) for c in camera_ids),
         rows=np.array(image_ids, dtype=np.int64) - 1,
         camera_of=np.array([camera_ids.index(reconstruction.image(i).camera_id) for i in image_ids]),
@@ -292,6 +292,32 @@ def model_of(reconstruction: Any) -> Model:
         point_of=np.array(point_of, dtype=np.int64),
         photo_of=np.array(photo_of, dtype=np.int64),
         keypoint_of=np.array(keypoint_of, dtype=np.int64),
+    )
+    return without_impossible(model)
+
+
+def without_impossible(model: Model) -> Model:
+    """The model without observations of points that their camera cannot see, and points then seen once.
+
+    COLMAP keeps observations past the angle where a lens's distortion turns back. There is no pixel to
+    compare them with, and one of them would make all covariances of the map NaN.
+    """
+    seen = np.zeros(len(model.point_of), dtype=bool)
+    for photo, (camera, pose) in enumerate(zip(model.camera_of.tolist(), model.cam_from_sfm, strict=True)):
+        rows = np.flatnonzero(model.photo_of == photo)
+        pixels = model.cameras[camera].project(pose.act(model.xyz[model.point_of[rows]]))
+        seen[rows] = np.isfinite(pixels).all(axis=1)
+    if seen.all():
+        return model
+    seen &= np.bincount(model.point_of[seen], minlength=len(model.xyz))[model.point_of] >= 2
+    points, point_of = np.unique(model.point_of[seen], return_inverse=True)
+    _LOG.warning("%d of %d observations are of points that their camera cannot see", (~seen).sum(), len(seen))
+    return replace(
+        model,
+        xyz=model.xyz[points],
+        point_of=point_of.reshape(-1).astype(np.int64),
+        photo_of=model.photo_of[seen],
+        keypoint_of=model.keypoint_of[seen],
     )
 
 

@@ -8,9 +8,10 @@ import numpy as np
 import pycolmap
 import pytest
 
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model
+from ingest.colmap_bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.photo import Photo
 from ingest.photo_cameras import photo_cameras
@@ -114,6 +115,30 @@ def test_pixel_thresholds_grow_with_the_image() -> None:
     for name in ("mapper.filter_max_reproj_error", "mapper.init_max_error", "mapper.abs_pose_max_error"):
         assert large[name] == pytest.approx(2.5 * small[name])
     assert mapping_settings(SfmOptions(refine_focal=False), 800)["ba_refine_focal_length"] is False
+
+
+def test_what_no_pixel_is_of_is_no_observation() -> None:
+    """Past 46 degrees this lens's distortion turns back; behind the camera there is no picture."""
+    lens = Camera(model="SIMPLE_RADIAL", width=640, height=480, params=(300.0, 320.0, 240.0, -0.3))
+    poses = (Rigid3.identity(), Rigid3.from_matrix(np.c_[np.eye(3), [-1.0, 0.0, 0.0]]))
+    xyz = np.array([[0.2, 0.1, 2.0], [2.6, 0.0, 2.0], [0.3, 0.0, -2.0], [0.4, -0.2, 3.0]])
+    model = Model(
+        cameras=(lens,),
+        rows=np.arange(2),
+        camera_of=np.zeros(2, dtype=np.int64),
+        cam_from_sfm=poses,
+        xyz=xyz,
+        point_of=np.repeat(np.arange(4), 2),
+        photo_of=np.tile(np.arange(2), 4),
+        keypoint_of=np.arange(8),
+    )
+    assert np.isfinite(lens.project(poses[1].act(xyz[1:2]))).all()  # one photo does see the second point
+    left = without_impossible(model)
+    np.testing.assert_array_equal(left.xyz, xyz[[0, 3]])
+    assert left.point_of.tolist() == [0, 0, 1, 1]
+    assert left.photo_of.tolist() == [0, 1, 0, 1]
+    assert left.keypoint_of.tolist() == [0, 1, 6, 7]
+    assert without_impossible(left) is left
 
 
 def test_no_photo_is_registered_without_points() -> None:
