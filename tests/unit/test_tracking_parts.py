@@ -70,9 +70,20 @@ def test_points_behind_the_camera_do_not_count() -> None:
 def test_too_few_points_give_no_pose(count: int) -> None:
     points, pixels = scene(np.random.default_rng(4))
     assert fit_pose(CAMERA, pixels[:count], points[:count], POSE, FIT) is None
-    # One point over and over says nothing of a pose either.
-    same = np.repeat(points[:1], 20, axis=0)
-    assert fit_pose(CAMERA, np.repeat(pixels[:1], 20, axis=0), same, POSE, FIT) is None
+
+
+def test_points_that_do_not_determine_a_pose_give_none() -> None:
+    points, _ = scene(np.random.default_rng(4))
+    along = np.linspace(0.0, 1.0, 20)[:, None]
+    for few in (
+        np.repeat(points[:1], 20, axis=0),
+        np.repeat(points[:2], 20, axis=0),
+        points[0] + along * (points[1] - points[0]),
+    ):
+        assert fit_pose(CAMERA, CAMERA.project(POSE.act(few)), few, POSE, FIT) is None
+    # A patch of ten centimetres, fifty metres away, does.
+    small = points.mean(axis=0) + np.random.default_rng(5).uniform(-0.05, 0.05, (50, 3))
+    assert fit_pose(CAMERA, CAMERA.project(POSE.act(small)), small, POSE, FIT) is not None
 
 
 def picture(rng: np.random.Generator) -> np.ndarray:
