@@ -42,9 +42,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         world = make_scan_world(work / f"world-{args.size}-{args.seed}", args.seed, args.size, args.workers)
         mapped = work / f"mapped-{args.size}-{args.seed}"
         if not mapped.exists():
-            _featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-        refused = _anchored(work, mapped, world, args.ortho, other=True)[1]
-        database, placed = _anchored(work, mapped, world, args.ortho, other=False)
+            featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
+        refused = anchored(work, mapped, world, args.ortho, other=True)[1]
+        database, placed = anchored(work, mapped, world, args.ortho, other=False)
         queries = world.world.images("queries") if args.queries else []
         say = sys.stdout.write
         say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
@@ -53,18 +53,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if placed and not refused else 1
 
 
-def _anchored(work: Path, mapped: Path, world: ScanWorld, ortho: bool, *, other: bool) -> tuple[Path, bool]:
+def anchored(work: Path, mapped: Path, world: ScanWorld, ortho: bool, *, other: bool) -> tuple[Path, bool]:
     """A copy of the database with one of the scans, anchored; and whether the map was placed."""
     database = work / f"anchored-{'other' if other else 'own'}-{'ortho' if ortho else 'intensity'}"
     shutil.rmtree(database, ignore_errors=True)
     shutil.copytree(mapped, database)
     scan, image = (world.other_scan, world.other_ortho) if other else (world.scan, world.ortho)
     coloured = ("--ortho", str(image)) if ortho else ()
-    _featuredb("lidar", "add", str(database), str(scan), *coloured)
+    featuredb("lidar", "add", str(database), str(scan), *coloured)
     map_id = Database.open(database).snapshot().maps()[0].map_id
     photos, out = world.world.folder / "drone", work / f"{database.name}-report"
     words = ("anchor", str(database), map_id, "--photos", str(photos), "--out", str(out), "--auto", "--quiet")
-    return database, _featuredb(*words, may_refuse=True) == 0
+    return database, featuredb(*words, may_refuse=True) == 0
 
 
 def _tell(name: str, database: Database, truth: Truth, queries: Sequence[Path]) -> None:
@@ -114,7 +114,7 @@ def _ask(database: Database, truth: Truth, queries: Sequence[Path]) -> list[Pose
     return errors
 
 
-def _featuredb(*words: str, may_refuse: bool = False) -> int:
+def featuredb(*words: str, may_refuse: bool = False) -> int:
     """Run a command of featuredb and show what it says; 1 is an answer where it may refuse."""
     sys.stdout.write(f"$ featuredb {' '.join(words)}\n")
     sys.stdout.flush()

@@ -52,7 +52,9 @@ class FlowTrack:
         )
         guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
         pixels, good = follow(before.gray, now.gray, marks.pixels, guess, self._options.flow)
-        fitted = self._agreed(replace(marks, pixels=pixels), good, predicted)
+        height, width = now.gray.shape
+        in_view = int(((guess >= 0) & (guess < (width, height))).all(axis=1).sum())
+        fitted = self._agreed(replace(marks, pixels=pixels), good, predicted, in_view)
         if fitted is not None:
             self._poses.append((now.time_s, fitted.cam_from_local))
         return fitted
@@ -81,9 +83,13 @@ class FlowTrack:
         return fitted
 
     def _agreed(
-        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3
+        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3, in_view: int = 0
     ) -> FittedPose | None:
-        """The pose of the landmarks that were followed (None: all); what agrees with it stays."""
+        """The pose of the landmarks that were followed (None: all); what agrees with it stays.
+
+        Args:
+            in_view: how many should be in the picture, of which some may not have been followed.
+        """
         options, followed = self._options, marks if good is None else marks.take(np.flatnonzero(good))
         if len(followed) < options.min_landmarks:
             self.why = f"{len(followed)} of {len(marks)} landmarks are found again"
@@ -92,6 +98,9 @@ class FlowTrack:
         agree = 0 if fitted is None else int(fitted.inlier.sum())
         if fitted is None or agree < max(options.min_landmarks, options.least_share * len(followed)):
             self.why = f"{agree} of {len(followed)} landmarks agree with a pose"
+            return None
+        if agree < options.least_kept * in_view:
+            self.why = f"{agree} of {in_view} landmarks that should be in view agree with a pose: a cut?"
             return None
         self.landmarks = followed.take(fitted.inlier)
         return fitted

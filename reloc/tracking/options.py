@@ -45,7 +45,9 @@ class TrackOptions:
         landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
         columns, rows: of the grid over which they are spread.
         min_landmarks: that agree with a pose; fewer are a lost track. least_share: of those that the flow
-            followed.
+            followed. least_kept: of those that should be in view of the next frame; a film that is cut to a
+            look-alike keeps a few. On the simulated flights smooth frames keep 99 %, turns on the spot of 95
+            degrees in 0.8 s 68 % and more; cuts to a town of the same plan kept 10 %, and back 43 %.
         keyframe_every: frames from one that is matched against the map to the next. On the simulated flights
             12 and 24 are alike (means of 0.044 and 0.047 m, 0.050 twice), and matching one takes a core as
             long as following 24 frames.
@@ -67,6 +69,7 @@ class TrackOptions:
     rows: int = 9
     min_landmarks: int = 20
     least_share: float = 0.4
+    least_kept: float = 0.5
     keyframe_every: int = 24
     keyframe_soonest: int = 6
     few_landmarks: float = 0.5

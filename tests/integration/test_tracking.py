@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,19 @@ def test_every_pose_is_right_and_what_is_lost_is_said(
     found = states.index("relocalised", 20)
     assert found <= 24 + 2 * (_OPTIONS.lost_answer_after + 1)
     assert states[found + 1 :] == ["tracking"] * (_FRAMES - found - 1)
+
+
+def test_a_cut_to_a_look_alike_is_a_loss(areas: tuple[IndexedArea, ...], film: list[np.ndarray]) -> None:
+    """A fifth of the picture stays as it was: its landmarks agree with a pose, and are too few to believe."""
+    alike = [frame.copy() for frame in film[:24]]
+    for i in _CUT:
+        width = alike[i].shape[1] // 5
+        alike[i][:, :width] = _render(field_texture(1), pose_at(i), i)[:, :width]
+    track = tracked(areas, alike)
+    assert [frame.state for frame in track[7:]] == ["tracking"] * 13 + ["lost"] * 4
+    assert "should be in view" in track[20].detail
+    without = tracked(areas, alike, replace(_OPTIONS, least_kept=0.0))
+    assert without[20].state == "tracking"
 
 
 def test_the_same_film_gives_the_same_poses(

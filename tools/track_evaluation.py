@@ -1,0 +1,256 @@
+"""How right tracked films are: flights over the simulated town, anchored on its scan, against true poses.
+
+    python -m tools.track_evaluation --out DIR [--size full] [--films smooth jerky cut] [--overlay]
+
+1. The world of `featuredb.simworld.scan_world`: `featuredb ingest photos` maps the drone's photos,
+   `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
+2. Films of the same town at 1280x720 and 30 Hz: smooth; jerky, with gusts and turns on the spot; cut, which
+   shows another town for a while. All pass over water. They are drawn once and kept.
+3. Each is tracked as `featuredb track` does, with the lens of its camera (--lens estimated: without), and
+   once more with an overlay if asked for.
+
+Prints for each film the errors of position and orientation over all frames with a pose, the first and the
+last 200 of them, lost frames, what was invented where the film shows another town, and how long it took to
+be found again; frames per second, the longest time between two poses, and the machine's load, since a busy
+machine's speed is not the program's. Writes track.json and errors.png. Exit code 0 if everything holds.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
+from featuredb.simworld.flight_path import PathOptions
+from featuredb.simworld.scan_world import make_scan_world
+from featuredb.simworld.scoring import pose_difference
+from featuredb.simworld.world import WorldOptions
+from featuredb.store import Database
+from reloc.localiser import Localiser
+from reloc.tracking.track_video import TrackedVideo, track_video
+from tools.anchor_simworld import anchored, featuredb
+from tools.growth_common import Verdict, conclude, say, table
+
+_FILMS = ("smooth", "jerky", "cut")
+_MEAN_M, _P95_M, _MEAN_DEG, _DRIFT = 0.10, 0.25, 0.10, 1.3
+_JERKY_MEAN_M = 0.25
+_RATE_HZ, _OVERLAY_HZ, _GAP_S = 60.0, 20.0, 0.150
+_FOUND_S = 1.0
+_END = 200  # frames at each end whose errors are compared
+_WRONG_M = 1.0  # a pose that is farther off is no inaccuracy
+_CUT = (0.4, 0.55)  # of the film
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Tracked:
+    """What became of a film.
+
+    Attributes:
+        frames, lost: of the frames that show the town. invented: poses of frames that do not.
+        mean_m, p95_m, largest_m, mean_deg: errors of the frames that have poses.
+        first_m, last_m: means over the first and the last 200 of them.
+        found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
+        rate_hz, gap_s: frames a second over the whole run, and the longest time between two poses.
+        overlay_hz: frames a second with an overlay; 0: not run. load: of the machine, when the run ended.
+    """
+
+    frames: int
+    lost: int
+    invented: int
+    mean_m: float
+    p95_m: float
+    largest_m: float
+    mean_deg: float
+    first_m: float
+    last_m: float
+    found_s: float
+    rate_hz: float
+    gap_s: float
+    overlay_hz: float
+    load: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    database = anchored_map(args.out, args.size, args.seed, args.workers)
+    areas = Localiser.open(Database.open(database)).areas
+    results: dict[str, Tracked] = {}
+    figure, axes = plt.subplots(len(args.films), 1, figsize=(9, 2.4 * len(args.films)), squeeze=False)
+    for name, ax in zip(args.films, axes[:, 0], strict=True):
+        options = film_options(name, args.size, args.seed, args.frames)
+        folder = write_film(args.out / f"film-{name}", options, args.workers, _progress(name))
+        truth = read_film_truth(folder)
+        camera = None if args.lens == "estimated" else truth.camera
+        tracked = track_video(folder / FILM_FILE, areas, camera=camera)
+        load, overlay_hz = os.getloadavg()[0], 0.0
+        if args.overlay:
+            drawn = track_video(folder / FILM_FILE, areas, camera=camera, overlay=args.out / f"{name}.mp4")
+            overlay_hz = len(drawn.trajectory.points) / drawn.seconds.total
+        metres, degrees = errors(tracked, truth)
+        results[name] = judge_film(tracked, truth, metres, degrees, overlay_hz, load)
+        _draw(ax, name, truth, metres)
+        say(f"{name}: {results[name]}; stages {tracked.seconds}")
+    figure.tight_layout()
+    figure.savefig(args.out / "errors.png", dpi=110)
+    plt.close(figure)
+    head = ("film", *asdict(next(iter(results.values()))))
+    sys.stdout.write(table([(n, *asdict(r).values()) for n, r in results.items()], head) + "\n")
+    return conclude(args.out, "track", verdicts(results), {n: asdict(r) for n, r in results.items()})
+
+
+def anchored_map(out: Path, size: str, seed: int, workers: int) -> Path:
+    """A database with the map of the drone's photos, placed on the scan; kept in `out`."""
+    world = make_scan_world(out / "world", seed, "short" if size == "short" else "full", workers)
+    done = out / "anchored.txt"
+    if not done.exists():
+        mapped = out / "mapped"
+        featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
+        database, placed = anchored(out, mapped, world, ortho=False, other=False)
+        if not placed:
+            raise SystemExit("track_evaluation: the map was not placed on its scan; its report is in DIR")
+        done.write_text(database.name)
+    return out / done.read_text()
+
+
+def film_options(name: str, size: str, seed: int, frames: int) -> FilmOptions:
+    world = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
+    extent = (32.0, 26.0) if size == "short" else PathOptions().half_extent_m
+    path = PathOptions(seed=seed, style="jerky" if name == "jerky" else "smooth", half_extent_m=extent)
+    cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
+    return FilmOptions(world=world, path=path, frames=frames, cut=None if cut is None else (cut[0], cut[1]))
+
+
+def errors(tracked: TrackedVideo, truth: FilmTruth) -> tuple[FloatArray, FloatArray]:
+    """Metres and degrees (n,) of every frame that shows the town; NaN without a pose, inf where invented."""
+    metres, degrees = np.full(len(truth.times_s), np.nan), np.full(len(truth.times_s), np.nan)
+    for point in tracked.trajectory.points:
+        if point.pose is None:
+            continue
+        true = truth.cam_from_local[point.index]
+        if true is None:
+            metres[point.index] = degrees[point.index] = np.inf
+            continue
+        off = pose_difference(
+            truth.frame, true, point.pose.epsg, point.pose.utm, point.pose.cam_from_utm_xyzw
+        )
+        metres[point.index], degrees[point.index] = off.position_m, off.angle_deg
+    return metres, degrees
+
+
+def judge_film(
+    tracked: TrackedVideo,
+    truth: FilmTruth,
+    metres: FloatArray,
+    degrees: FloatArray,
+    overlay_hz: float,
+    load: float,
+) -> Tracked:
+    known = np.isfinite(metres)
+    if not known.any():
+        raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
+    m = metres[known]
+    return Tracked(
+        frames=int(truth.at_home.sum()),
+        lost=int((truth.at_home & np.isnan(metres)).sum()),
+        invented=int(np.isinf(metres).sum()),
+        mean_m=float(m.mean()),
+        p95_m=float(np.quantile(m, 0.95)),
+        largest_m=float(m.max()),
+        mean_deg=float(degrees[known].mean()),
+        first_m=float(m[:_END].mean()),
+        last_m=float(m[-_END:].mean()),
+        found_s=_found_s(truth, known),
+        rate_hz=len(metres) / tracked.seconds.total,
+        gap_s=tracked.seconds.longest_gap,
+        overlay_hz=overlay_hz,
+        load=load,
+    )
+
+
+def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:
+    """From the town's return to the first frame with a pose; infinite if there is none."""
+    away = np.flatnonzero(~truth.at_home)
+    if len(away) == 0:
+        return 0.0
+    back = int(away[-1]) + 1
+    again = np.flatnonzero(known[back:])
+    return float(truth.times_s[back + again[0]] - truth.times_s[back]) if len(again) else float("inf")
+
+
+def verdicts(results: dict[str, Tracked]) -> list[Verdict]:
+    found = []
+
+    def line(name: str, text: str, holds: bool) -> None:
+        found.append(Verdict(name=name, text=text, holds=holds))
+
+    for name, r in results.items():
+        mean_m = _JERKY_MEAN_M if name == "jerky" else _MEAN_M
+        line(f"{name}, position", f"{r.mean_m:.3f} m mean, {mean_m} wanted", r.mean_m <= mean_m)
+        line(
+            f"{name}, wrong", f"largest {r.largest_m:.2f} m, under {_WRONG_M} wanted", r.largest_m < _WRONG_M
+        )
+        if name == "smooth":
+            line("smooth, 95 %", f"{r.p95_m:.3f} m, {_P95_M} wanted", r.p95_m <= _P95_M)
+            line("smooth, orientation", f"{r.mean_deg:.3f} deg, {_MEAN_DEG} wanted", r.mean_deg <= _MEAN_DEG)
+            ratio = r.last_m / r.first_m
+            line(
+                "smooth, drift", f"last {_END} {ratio:.2f} times the first, {_DRIFT} wanted", ratio <= _DRIFT
+            )
+            line("smooth, lost", f"{r.lost} of {r.frames} frames, none wanted", r.lost == 0)
+            fast = r.rate_hz >= _RATE_HZ and r.gap_s <= _GAP_S
+            text = f"{r.rate_hz:.1f} frames/s, longest gap {1000 * r.gap_s:.0f} ms, load {r.load:.1f}"
+            line("smooth, speed", f"{text}; {_RATE_HZ:g} and {1000 * _GAP_S:g} wanted", fast)
+            if r.overlay_hz > 0:
+                text = f"{r.overlay_hz:.1f} frames/s, {_OVERLAY_HZ:g} wanted"
+                line("smooth, with overlay", text, r.overlay_hz >= _OVERLAY_HZ)
+        if name == "cut":
+            line("cut, invented", f"{r.invented} poses of another town, none wanted", r.invented == 0)
+            text = f"{r.found_s:.2f} s of film after the cut, {_FOUND_S:g} wanted"
+            line("cut, found again", text, r.found_s <= _FOUND_S)
+    return found
+
+
+def _draw(ax: plt.Axes, name: str, truth: FilmTruth, metres: FloatArray) -> None:
+    ax.plot(truth.times_s, np.where(np.isfinite(metres), metres, np.nan), lw=0.8)
+    lost = truth.at_home & np.isnan(metres)
+    ax.plot(
+        truth.times_s[lost], np.zeros(int(lost.sum())), "|", color="tab:red", label=f"lost ({lost.sum()})"
+    )
+    if not truth.at_home.all():
+        away = truth.times_s[~truth.at_home]
+        ax.axvspan(float(away[0]), float(away[-1]), color="0.9", label="another town")
+    ax.set(title=name, xlabel="time, s", ylabel="position error, m", ylim=(0, None))
+    ax.legend(loc="upper right")
+
+
+def _progress(name: str) -> Callable[[int, int], None]:
+    def told(done: int, total: int) -> None:
+        if done % 100 == 0 or done == total:
+            say(f"{name}: {done} of {total} frames drawn")
+
+    return told
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path("track-evaluation"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--frames", type=int, default=1200)
+    parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
+    parser.add_argument("--lens", choices=("known", "estimated"), default="known")
+    parser.add_argument("--overlay", action="store_true", help="track once more and draw it")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
