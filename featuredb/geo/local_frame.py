@@ -89,7 +89,7 @@ class LocalFrame:
         """
         zone, hemisphere = zone_of(epsg)
         points = as_points("LocalFrame.utm_from_enu", enu)
-        geodetic = geodetic_from_ecef(self._ecef_from_enu(points.rows))
+        geodetic = self._geodetic(points.rows)
         return points.shaped_like_input(utm_from_lat_lon_h(geodetic, zone, hemisphere == "south"))
 
     def enu_from_geodetic(self, lat_lon_h: ArrayLike) -> FloatArray:
@@ -105,7 +105,7 @@ class LocalFrame:
     def geodetic_from_enu(self, enu: ArrayLike) -> FloatArray:
         """Latitude, longitude (degrees), height (m) of points (n, 3) or (3,) of this frame, same shape."""
         points = as_points("LocalFrame.geodetic_from_enu", enu)
-        return points.shaped_like_input(geodetic_from_ecef(self._ecef_from_enu(points.rows)))
+        return points.shaped_like_input(self._geodetic(points.rows))
 
     def enu_from(self, other: "LocalFrame") -> Rigid3:
         """The transform this_enu_from_other_enu: exact, since both frames are rigid in geocentric space."""
@@ -146,6 +146,12 @@ class LocalFrame:
         grid_from_true = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         return np.asarray(grid_from_true @ self.true_enu_from_enu(point), dtype=np.float64)
 
+    def _geodetic(self, rows: FloatArray) -> FloatArray:
+        """Latitude, longitude (degrees), height (m) of points (n, 3) of this frame."""
+        if len(rows) == 1:
+            return np.array([_geodetic_of_point(self, *rows[0].tolist())])
+        return geodetic_from_ecef(self._ecef_from_enu(rows))
+
     def _enu_from_ecef(self, ecef: FloatArray) -> FloatArray:
         origin, rotation = _origin_and_axes(self)
         return np.asarray((ecef - origin) @ rotation.T, dtype=np.float64)
@@ -171,3 +177,9 @@ def _origin_and_axes(frame: LocalFrame) -> tuple[FloatArray, FloatArray]:
     origin.setflags(write=False)
     rotation.setflags(write=False)
     return origin, rotation
+
+
+@lru_cache(maxsize=64)
+def _geodetic_of_point(frame: LocalFrame, east: float, north: float, up: float) -> tuple[float, ...]:
+    """One point is asked for again and again: a pose needs its place, true axes and grid axes there."""
+    return tuple(geodetic_from_ecef(frame._ecef_from_enu(np.array([[east, north, up]])))[0].tolist())

@@ -10,7 +10,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.options import FitOptions
 
-_STILL = 1e-8  # radians and metres over distance: the pose does not move any more
+_STILL = 1e-6  # radians, and metres over distance: a thousandth of a pixel
 # Least eigenvalue of scaled normal equations that have no one solution: one or two points over and over and
 # points on a line have 2e-15 and less; a patch of 10 cm, seen from 50 m, still has 2e-7.
 _SINGULAR = 1e-12
@@ -48,6 +48,8 @@ def fit_pose(
     seen = camera.unproject(pixels)
     focal, loss = camera.focal_px, options.loss_px * scale
     pose = start
+    depth = max(float(np.median(start.act(points)[:, 2])), 1e-6)
+    still = np.repeat([1.0, 1.0 / depth], 3)
     for _ in range(options.iterations):
         residual, jacobian = _linearised(pose, points, seen, focal)
         squared = np.einsum("ij,ij->i", residual, residual)
@@ -59,7 +61,7 @@ def fit_pose(
             return None
         step = -np.linalg.solve(normal, gradient)
         pose = Rigid3.exp(step) @ pose
-        if np.abs(step).max() < _STILL:
+        if np.abs(step * still).max() < _STILL:
             break
     residual, jacobian = _linearised(pose, points, seen, focal)
     distance = np.sqrt(np.einsum("ij,ij->i", residual, residual))
@@ -100,12 +102,15 @@ def _linearised(
     x, y, z = pose.act(points).T
     front = z > 1e-6
     inverse = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
-    u, v, zero = x * inverse, y * inverse, np.zeros_like(z)
-    by_u = [-u * v, 1.0 + u * u, -v, inverse, zero, -u * inverse]
-    by_v = [-(1.0 + v * v), u * v, u, zero, inverse, -v * inverse]
-    jacobian = np.stack([np.stack(by_u, axis=1), np.stack(by_v, axis=1)], axis=1)
+    u, v = x * inverse, y * inverse
+    jacobian = np.zeros((len(z), 2, 6))
+    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = -u * v, 1.0 + u * u, -v
+    jacobian[:, 0, 3], jacobian[:, 0, 5] = inverse, -u * inverse
+    jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = -(1.0 + v * v), u * v, u
+    jacobian[:, 1, 4], jacobian[:, 1, 5] = inverse, -v * inverse
     jacobian *= (focal * front)[:, None, None]
-    residual = focal * (np.stack([u, v], axis=1) - seen)
+    residual = np.empty((len(z), 2))
+    residual[:, 0], residual[:, 1] = focal * (u - seen[:, 0]), focal * (v - seen[:, 1])
     residual[~front | ~np.isfinite(seen).all(axis=1)] = np.inf
     return residual, jacobian
 
