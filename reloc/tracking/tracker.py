@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import TracebackType
@@ -26,6 +26,7 @@ from reloc.tracking.recent import RecentFrame, RecentFrames
 TrackState = Literal["tracking", "relocalised", "lost"]
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize
+_PACE_S = 0.035  # of a search, at each frame that is lost: 20 frames wait for 0.7 s without a gap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -224,6 +225,9 @@ class Tracker:
             return None, None
         ready = sent.answer.done() if self._options.live else self._index >= sent.due
         if not ready:
+            if self._track is None and not self._options.live:
+                # What would be waited for in one go when it is due is waited for a little at each frame.
+                wait([sent.answer], timeout=_PACE_S)
             return None, None
         self._sent = None
         return sent.answer.result(), sent
