@@ -209,6 +209,10 @@ class VideoWriter:
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         if self.codec == _H264:
             context.options = {"crf": str(self.options.crf), "preset": self.options.preset}
+            if self.options.threads == 1:
+                # x264's macroblock tree reads memory that it has not set (seen with core 165, most often with
+                # small pictures): without it the same frames give the same bytes.
+                context.options |= {"x264-params": "mbtree=0"}
             if self._rate is None:
                 # With frames reordered, uneven times make an mp4 too short: its length is of decoding times.
                 context.options |= {"bf": "0"}

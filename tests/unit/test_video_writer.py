@@ -118,10 +118,15 @@ def test_quality_and_size(tmp_path: Path) -> None:
     _check_quality(tmp_path)
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_the_same_frames_give_the_same_bytes(tmp_path: Path, threads: int) -> None:
-    first = _write(tmp_path / "a.mp4", threads=threads).read_bytes()
-    assert _write(tmp_path / "b.mp4", threads=threads).read_bytes() == first
+def test_the_same_frames_give_the_same_bytes_whatever_memory_holds(tmp_path: Path) -> None:
+    """With x264's macroblock tree, a third to two thirds of these films differ."""
+    rng = np.random.default_rng(1)
+    films = set()
+    for _ in range(40):
+        # Freed memory with other content each time, for the encoder to find.
+        _ = [np.full(size, size % 256, np.uint8) for size in rng.integers(1_000, 400_000, 20)]
+        films.add(_write(tmp_path / "film.mp4").read_bytes())
+    assert len(films) == 1
 
 
 def test_rotation_and_tags(tmp_path: Path) -> None:
