@@ -35,6 +35,7 @@ from featuredb.simworld.scoring import pose_difference
 from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
 from reloc.localiser import Localiser
+from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
 from tools.anchor_simworld import anchored, featuredb
 from tools.growth_common import Verdict, conclude, say, table
@@ -82,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     database = anchored_map(args.out, args.size, args.seed, args.workers)
-    areas = Localiser.open(Database.open(database)).areas
+    finder = MapFinder(Localiser.open(Database.open(database)).areas)
     results: dict[str, Tracked] = {}
     figure, axes = plt.subplots(len(args.films), 1, figsize=(9, 2.4 * len(args.films)), squeeze=False)
     for name, ax in zip(args.films, axes[:, 0], strict=True):
@@ -90,10 +91,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         folder = write_film(args.out / f"film-{name}", options, args.workers, _progress(name))
         truth = read_film_truth(folder)
         camera = None if args.lens == "estimated" else truth.camera
-        tracked = track_video(folder / FILM_FILE, areas, camera=camera)
+        tracked = track_video(folder / FILM_FILE, finder, camera=camera)
         load, overlay_hz = os.getloadavg()[0], 0.0
         if args.overlay:
-            drawn = track_video(folder / FILM_FILE, areas, camera=camera, overlay=args.out / f"{name}.mp4")
+            drawn = track_video(folder / FILM_FILE, finder, camera=camera, overlay=args.out / f"{name}.mp4")
             overlay_hz = len(drawn.trajectory.points) / drawn.seconds.total
         metres, degrees = errors(tracked, truth)
         results[name] = judge_film(tracked, truth, metres, degrees, overlay_hz, load)

@@ -65,19 +65,22 @@ def run_track(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from reloc.localiser import Localiser
     from reloc.result import LocaliseRequest
+    from reloc.tracking.map_ground import MapFinder, usable_areas
     from reloc.tracking.outputs import check_outputs, exit_code, write_outputs
     from reloc.tracking.track_video import TrackVideoOptions, track_video
 
     check_outputs(args.out)
     localiser = Localiser.open(open_database(args))
     maps = tuple(args.map) if args.map else None
+    options = TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end)
+    areas = usable_areas(localiser.areas_of(maps), options.track.localise.extractor.fingerprint)
     found = track_video(
         args.video,
-        localiser.areas_of(maps),
+        MapFinder(areas),
         camera=_camera(args.camera),
         request=LocaliseRequest(prior=_prior(args.prior)),
         overlay=args.overlay,
-        options=TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end),
+        options=options,
     )
     trajectory = replace(found.trajectory, database=args.db, version=localiser.snapshot)
     found = replace(found, trajectory=trajectory)

@@ -4,13 +4,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reloc.matching import visible_points
 from reloc.tracking.tracker import TrackedFrame
 from reloc.tracking.trajectory import TrajectoryPoint
 
 _LANDMARK_RGB, _OTHER_RGB = (60, 220, 60), (40, 160, 240)
 _STATE_RGB = {"tracking": (60, 220, 60), "relocalised": (250, 210, 40), "lost": (240, 40, 40)}
-_MAX_OTHER = 1500  # more dots hide the picture
 
 
 def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoint) -> NDArray[np.uint8]:
@@ -20,8 +18,8 @@ def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoi
     """
     picture = np.ascontiguousarray(rgb).copy()
     scale = max(picture.shape[:2]) / 1280
-    if frame.cam_from_local is not None and frame.area is not None and frame.camera is not None:
-        for x, y in _others(frame):
+    if frame.cam_from_local is not None and frame.ground is not None and frame.camera is not None:
+        for x, y in frame.ground.visible(frame.camera, frame.cam_from_local):
             cv2.circle(picture, (round(x), round(y)), max(1, round(scale)), _OTHER_RGB, -1, cv2.LINE_AA)
         for x, y in frame.pixels if frame.pixels is not None else ():
             cv2.circle(picture, (round(x), round(y)), round(4 * scale) + 1, _LANDMARK_RGB, 1, cv2.LINE_AA)
@@ -41,20 +39,6 @@ def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoi
             cv2.LINE_AA,
         )
     return picture
-
-
-def _others(frame: TrackedFrame) -> NDArray[np.float64]:
-    """Pixels (n, 2) of some points of the map that the pose says are in the picture."""
-    assert frame.area is not None
-    assert frame.camera is not None
-    assert frame.cam_from_local is not None
-    every = max(1, len(frame.area.points) // 20_000)
-    rows = visible_points(
-        frame.area, np.arange(0, len(frame.area.points), every), frame.camera, frame.cam_from_local
-    )
-    rows = rows[:: max(1, len(rows) // _MAX_OTHER)]
-    pixels = frame.camera.project(frame.cam_from_local.act(frame.area.points[rows]))
-    return pixels[np.isfinite(pixels).all(axis=1)]
 
 
 def _words(point: TrajectoryPoint) -> list[str]:

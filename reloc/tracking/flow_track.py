@@ -1,4 +1,4 @@
-"""A track: points of the map carried from frame to frame by optical flow, and the poses that they give."""
+"""A track: known points carried from frame to frame by optical flow, and the poses that they give."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.flow import follow
-from reloc.tracking.keyframe import Keyframe, Unmatched
+from reloc.tracking.ground import Keyframe, Unmatched
 from reloc.tracking.landmarks import Landmarks
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
@@ -19,10 +19,10 @@ from reloc.tracking.recent import RecentFrame
 
 
 class FlowTrack:
-    """Landmarks of an area with the last poses; used from one thread at a time.
+    """Landmarks on a ground with the last poses; used from one thread at a time.
 
     Attributes:
-        area: that the landmarks are of.
+        ground: that the landmarks are of.
         landmarks: as the last frame shows them.
         why: the last thing that went wrong, in words.
     """
@@ -33,7 +33,7 @@ class FlowTrack:
             frame: the keyframe's own, at which the track begins.
             camera: intrinsics of the frames.
         """
-        self.area = keyframe.area
+        self.ground = keyframe.ground
         self.why = ""
         self._camera, self._options = camera, options
         self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
@@ -132,7 +132,7 @@ def _landmarks_of(keyframe: Keyframe, index: int) -> Landmarks:
     rows = keyframe.rows[first]
     return Landmarks(
         rows=rows,
-        points=keyframe.area.points[rows],
+        points=keyframe.points[first],
         pixels=keyframe.pixels[first],
         born=np.full(len(first), index, dtype=np.int64),
     )

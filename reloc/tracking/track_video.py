@@ -14,11 +14,10 @@ from featuredb.geometry.camera import Camera
 from featuredb.video.film import VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
-from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.film_overlay import draw_frame
-from reloc.tracking.keyframe import usable_areas
+from reloc.tracking.ground import Finder
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
@@ -76,7 +75,7 @@ class TrackedVideo:
 
 def track_video(
     source: Source,
-    areas: Sequence[IndexedArea],
+    finder: Finder,
     *,
     camera: Camera | None = None,
     request: LocaliseRequest | None = None,
@@ -90,6 +89,7 @@ def track_video(
     a little later, too.
 
     Args:
+        finder: finds the first frame, on maps or on a scan.
         camera: intrinsics of the film's frames, upright, of any size; None: of the first frame that is found.
         request: what else is known of the first frame.
         overlay: an mp4 to be written.
@@ -99,10 +99,8 @@ def track_video(
         VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
             breaks off, or is stopped by Ctrl-C, what was tracked until then is the result.
         InvalidValueError: the camera is of another shape than the film.
-        IncompatibleExtractorError: all maps are of another extractor.
     """
     options = options or TrackVideoOptions()
-    areas = usable_areas(areas, options.track.localise.extractor.fingerprint)
     points: list[TrajectoryPoint] = []
     trouble: list[str] = []
     clock = time.perf_counter
@@ -117,7 +115,7 @@ def track_video(
             video = stack.enter_context(open_video(source, settings))
             info = video.info
             lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
-            tracker = stack.enter_context(Tracker(areas, lens, options.track, request))
+            tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
             writer = None
             if overlay is not None:
                 writer = stack.enter_context(

@@ -1,4 +1,4 @@
-"""The pose of every frame of a video: flow between frames, keyframes against the map in the background."""
+"""The pose of every frame of a video: flow between frames, keyframes against the ground in the background."""
 
 import sys
 from collections.abc import Sequence
@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.area import Area
-from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, carried
-from reloc.tracking.keyframe import Keyframe, Unmatched, find_frame, match_keyframe
+from reloc.tracking.ground import Finder, Ground, Keyframe, Unmatched
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
 from reloc.tracking.recent import RecentFrame, RecentFrames
@@ -36,11 +34,11 @@ class TrackedFrame:
     Attributes:
         index, time_s: of the frame.
         state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
-        cam_from_local: pose in the area's frame, None where the track is lost.
+        cam_from_local: pose in the ground's frame, None where the track is lost.
         covariance: (6, 6), see `FittedPose`; None with the pose.
-        camera: intrinsics in use; None with the pose. area: in whose frame the pose is.
+        camera: intrinsics in use; None with the pose. ground: in whose frame the pose is.
         inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them; rows: (k,) of the
-            area's points.
+            ground's points.
         detail: why there is no pose.
     """
 
@@ -50,7 +48,7 @@ class TrackedFrame:
     cam_from_local: Rigid3 | None = None
     covariance: FloatArray | None = None
     camera: Camera | None = None
-    area: Area | None = None
+    ground: Ground | None = None
     inliers: int = 0
     pixels: FloatArray | None = None
     points: FloatArray | None = None
@@ -76,22 +74,23 @@ class Tracker:
 
     def __init__(
         self,
-        areas: Sequence[IndexedArea],
+        finder: Finder,
         camera: Camera | None = None,
         options: TrackOptions | None = None,
         request: LocaliseRequest | None = None,
     ) -> None:
         """
         Args:
+            finder: finds the first frame, and the track again where it was lost.
             camera: intrinsics of the frames; None: those of the first frame that is localised.
             request: what else is known of the first frame.
         """
-        self._areas, self._options = tuple(areas), options or TrackOptions()
+        self._finder, self._options = finder, options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
         self._camera = camera
         self._found = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
-        self._area: Area | None = None
+        self._ground: Ground | None = None
         self._track: FlowTrack | None = None
         self._frames = RecentFrames(
             self._options.live_frames
@@ -102,7 +101,7 @@ class Tracker:
         self._sent: _Sent | None = None
         self._behind = _FAR  # frames through which the thread carries a track that was found, live
         self._next_keyframe = 0
-        self._unconfirmed = 0  # keyframes in a row of which the map knew nothing
+        self._unconfirmed = 0  # keyframes in a row of which the ground knew nothing
         self._index = -1
         self._why = "nothing was localised yet"
 
@@ -120,9 +119,9 @@ class Tracker:
         return self._camera
 
     @property
-    def area(self) -> Area | None:
-        """The area in whose frame the poses are; None until something was localised."""
-        return self._area
+    def ground(self) -> Ground | None:
+        """The ground in whose frame the poses are; None until something was localised."""
+        return self._ground
 
     def track(self, gray: NDArray[np.uint8], time_s: float) -> TrackedFrame:
         """The pose of the next frame (h, w) uint8, taken at `time_s`, later than the last one."""
@@ -160,14 +159,14 @@ class Tracker:
         """Whether the last frame has a pose."""
         return self._track is not None
 
-    def use_areas(self, areas: Sequence[IndexedArea]) -> None:
-        """Track by these areas from the next frame on.
+    def use(self, finder: Finder) -> None:
+        """Track by this finder's ground from the next frame on.
 
-        A track in an area that is still among them goes on; another is lost, and looked for anew, since its
-        map may have been moved or taken back.
+        A track on ground that it still has goes on; another is lost, and looked for anew, since its map may
+        have been moved or taken back.
         """
-        self._areas = tuple(areas)
-        if self._track is not None and any(area.area is self._track.area for area in self._areas):
+        self._finder = finder
+        if self._track is not None and finder.has(self._track.ground):
             return
         if self._track is not None:
             self._lost("LOST: the maps have changed")
@@ -208,7 +207,7 @@ class Tracker:
             cam_from_local=fitted.cam_from_local,
             covariance=fitted.covariance,
             camera=self._camera,
-            area=track.area,
+            ground=track.ground,
             inliers=len(track.landmarks),
             pixels=track.landmarks.pixels,
             points=track.landmarks.points,
@@ -244,13 +243,13 @@ class Tracker:
         if not since:
             return None
         if track is not None:
-            if isinstance(found, FlowTrack) or found.area is not track.area:
+            if isinstance(found, FlowTrack) or found.ground is not track.ground:
                 return None
             return track.refresh(found, since[0], now)
         if isinstance(found, FlowTrack):
             return self._caught_up(found, since)
         self._camera = self._camera or found.camera
-        self._area, self._found = found.area, True
+        self._ground, self._found = found.ground, True
         begun = FlowTrack(found, since[0], self._camera, self._options)
         fitted = begun.settle()
         if fitted is None:
@@ -303,11 +302,11 @@ class Tracker:
         if self._sent is not None:
             return
         self._behind = _FAR
-        answer = self._pool.submit(find_frame, gray.copy(), self._request_now(), self._areas, self._options)
+        answer = self._pool.submit(self._finder.find, gray.copy(), self._request_now(), self._options)
         self._hand_over(self._index, answer, due=self._index + self._options.lost_answer_after)
 
     def _send_keyframe(self, gray: NDArray[np.uint8], fitted: FittedPose, track: FlowTrack) -> None:
-        """Have this frame matched against the map, if it is time for a keyframe and the thread is free."""
+        """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
         options = self._options
         if self._sent is not None:
             return
@@ -317,7 +316,7 @@ class Tracker:
             return
         assert self._camera is not None
         answer = self._pool.submit(
-            match_keyframe, gray.copy(), self._camera, fitted.cam_from_local, track.area, options
+            track.ground.match, gray.copy(), self._camera, fitted.cam_from_local, options
         )
         self._hand_over(self._index, answer, due=self._index + options.answer_after)
         self._next_keyframe = self._index + options.keyframe_every

@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import groupby
 
-import numpy as np
-
 from featuredb.geo.geopose import GeoPose, geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.answer import on_earth
 from reloc.tracking.tracker import TrackedFrame, TrackState
 
 
@@ -25,7 +22,7 @@ class EarthPose:
         geopose: the same as an OGC GeoPose.
         covariance: (6, 6), true east-north-up at the camera: rotation (rad) before displacement (m), of the
             frame's own measurement and of the map's placement.
-        map_id: whose points most landmarks are.
+        map_id: of the map, or the scan, whose points most landmarks are.
     """
 
     epsg: int
@@ -90,18 +87,18 @@ def point_of(frame: TrackedFrame) -> TrajectoryPoint:
 
 
 def _earth_pose(frame: TrackedFrame) -> EarthPose | None:
-    if frame.cam_from_local is None or frame.area is None or frame.rows is None or frame.covariance is None:
+    ground, pose = frame.ground, frame.cam_from_local
+    if pose is None or ground is None or frame.rows is None or frame.covariance is None:
         return None
-    area, pose = frame.area, frame.cam_from_local
-    main = area.maps[int(np.argmax(np.bincount(area.point_map[frame.rows], minlength=len(area.maps))))]
+    stands = ground.standing(frame.rows, pose.center, frame.covariance)
     return EarthPose(
-        epsg=main.epsg,
-        utm=area.frame.utm_from_enu(pose.center, main.epsg),
-        height_datum=main.height_datum,
+        epsg=stands.epsg,
+        utm=ground.frame.utm_from_enu(pose.center, stands.epsg),
+        height_datum=stands.height_datum,
         cam_from_utm_xyzw=quaternion_from_matrix(
-            pose.rotation @ area.frame.grid_from_enu(pose.center, main.epsg).T
+            pose.rotation @ ground.frame.grid_from_enu(pose.center, stands.epsg).T
         ),
-        geopose=geopose_from_camera(pose, area.frame),
-        covariance=on_earth(area, main, pose.center, frame.covariance),
-        map_id=main.map_id,
+        geopose=geopose_from_camera(pose, ground.frame),
+        covariance=stands.covariance,
+        map_id=stands.map_id,
     )

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import reloc.tracking.track_video as track_video_module
-import reloc.tracking.tracker as tracker_module
 import reloc.tracking.trajectory_files as trajectory_files_module
 from featuredb.cli.main import main
 from featuredb.errors import InvalidValueError, VideoError
@@ -24,7 +23,8 @@ from featuredb.video.writer import VideoWriter
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 from reloc.result import LocaliseRequest
-from reloc.tracking.keyframe import Unmatched
+from reloc.tracking.ground import Keyframe, Unmatched
+from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
@@ -64,7 +64,7 @@ def film() -> list[np.ndarray]:
 def tracked(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray], options: TrackOptions = _OPTIONS
 ) -> list[TrackedFrame]:
-    with Tracker(areas, CAMERA, options) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, options) as tracker:
         return [tracker.track(gray, i / 30.0) for i, gray in enumerate(film)]
 
 
@@ -139,7 +139,7 @@ def test_a_track_that_the_map_does_not_confirm_is_lost(
 ) -> None:
     """Its landmarks agree with each other still; three keyframes without the map are enough."""
     nothing = Unmatched(reason="TOO_FEW_MATCHES", detail="nothing")
-    monkeypatch.setattr(tracker_module, "match_keyframe", lambda *_: nothing)
+    monkeypatch.setattr(MapGround, "match", lambda *_: nothing)
     track = tracked(areas, film[:20])
     # Keyframes at frames 6, 10 and 14 are answered at 10, 14 and 18.
     assert [frame.state for frame in track[7:18]] == ["tracking"] * 11
@@ -152,7 +152,7 @@ def test_frames_between_a_localised_one_and_its_answer_have_poses_in_the_end(
 ) -> None:
     area_from_hills = areas[0].area.frame.enu_from(FRAME)
     late: dict[int, TrackedFrame] = {}
-    with Tracker(areas, CAMERA, _OPTIONS) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
         for i, gray in enumerate(film[:12]):
             tracker.track(gray, i / 30.0)
             late |= {frame.index: frame for frame in tracker.late}
@@ -168,14 +168,14 @@ def test_a_film_that_ends_before_the_answer_has_its_poses(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
     for count in (1, 4):
-        with Tracker(areas, CAMERA, _OPTIONS) as tracker:
+        with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
             now = [tracker.track(gray, i / 30.0).state for i, gray in enumerate(film[:count])]
             late = tracker.finish()
             assert not tracker.finish()
         assert now == ["lost"] * count
         assert [frame.state for frame in late] == ["relocalised", *["tracking"] * (count - 1)]
         assert [frame.index for frame in late] == list(range(count))
-    with Tracker(areas, CAMERA, _OPTIONS) as tracker:
+    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
         for i, gray in enumerate(film[:9]):
             tracker.track(gray, i / 30.0)
         assert not tracker.finish()
@@ -193,14 +193,16 @@ def test_where_the_film_begins_says_nothing_after_a_loss(
         sigma_vertical_m=100.0,
     )
     asked: list[GeoPrior | None] = []
-    real = tracker_module.find_frame
+    real = MapFinder.find
 
-    def noted(gray: np.ndarray, request: LocaliseRequest, *rest: object) -> object:
+    def noted(
+        self: MapFinder, gray: np.ndarray, request: LocaliseRequest, options: TrackOptions
+    ) -> Keyframe | Unmatched:
         asked.append(request.prior)
-        return real(gray, request, *rest)  # type: ignore[arg-type]
+        return real(self, gray, request, options)
 
-    monkeypatch.setattr(tracker_module, "find_frame", noted)
-    with Tracker(areas, CAMERA, _OPTIONS, LocaliseRequest(prior=prior)) as tracker:
+    monkeypatch.setattr(MapFinder, "find", noted)
+    with Tracker(MapFinder(areas), CAMERA, _OPTIONS, LocaliseRequest(prior=prior)) as tracker:
         for i, gray in enumerate(film[:32]):
             tracker.track(gray, i / 30.0)
     assert asked[0] is prior
@@ -257,7 +259,7 @@ def test_a_film_that_breaks_off_keeps_what_was_tracked(
                 yield frame
 
     monkeypatch.setattr(track_video_module, "open_video", lambda *args: Breaking(real(*args)))
-    found = track_video_module.track_video(folder / "film.mp4", areas, camera=CAMERA)
+    found = track_video_module.track_video(folder / "film.mp4", MapFinder(areas), camera=CAMERA)
     assert len(found.trajectory.points) == 12
     assert "reading failed" in found.complaints[0]
 

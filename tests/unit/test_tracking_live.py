@@ -9,6 +9,7 @@ import pytest
 
 import reloc.tracking.tracker as tracker_module
 from reloc.candidates import IndexedArea
+from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.recent import RecentFrame, RecentFrames
 from reloc.tracking.tracker import TrackedFrame, Tracker
@@ -25,8 +26,8 @@ class SlowThread:
         self.now = 0
         self.asked: list[tuple[int, str]] = []
         self.delays: dict[str, Callable[..., int]] = {
-            "find_frame": lambda *_: 9,
-            "match_keyframe": lambda *_: 5,
+            "find": lambda *_: 9,
+            "match": lambda *_: 5,
             "carried": lambda track, frames: len(frames) // 3,
         }
 
@@ -83,11 +84,11 @@ def check_poses(found: list[TrackedFrame], first: int = 0) -> None:
 def test_no_frame_waits_and_a_track_that_was_found_is_carried_to_the_frame_at_hand(
     thread: SlowThread,
 ) -> None:
-    with Tracker((field_area(),), CAMERA, _LIVE) as tracker:
+    with Tracker(MapFinder([field_area()]), CAMERA, _LIVE) as tracker:
         found = followed(tracker, thread, range(60))
         # Found after nine frames; those take three more, and the last three are followed at once.
         assert runs(found) == [("lost", 12), ("relocalised", 1), ("tracking", 47)]
-        assert [what for _, what in thread.asked[:3]] == ["find_frame", "carried", "match_keyframe"]
+        assert [what for _, what in thread.asked[:3]] == ["find", "carried", "match"]
         assert thread.asked[1][0] == 9
         assert not tracker.finish()
     check_poses(found)
@@ -97,7 +98,7 @@ def test_a_thread_that_is_slower_than_the_frames_is_caught_up_with_by_passing_so
     thread: SlowThread,
 ) -> None:
     thread.delays["carried"] = lambda track, frames: 2 * len(frames)
-    with Tracker((field_area(),), CAMERA, _LIVE) as tracker:
+    with Tracker(MapFinder([field_area()]), CAMERA, _LIVE) as tracker:
         found = followed(tracker, thread, range(45))
     assert [what for _, what in thread.asked].count("carried") == 1
     assert runs(found)[1:] == [("relocalised", 1), ("tracking", len(found) - 1 - runs(found)[0][1])]
@@ -108,26 +109,27 @@ def test_maps_that_change_end_a_track_in_them_and_leave_others_alone(thread: Slo
     old = field_area()
     other = IndexedArea(area=old.area, index=old.index)  # the same area, taken over: not another map
     moved = _rebuilt(old)
-    with Tracker((old,), CAMERA, _LIVE) as tracker:
+    with Tracker(MapFinder([old]), CAMERA, _LIVE) as tracker:
         followed(tracker, thread, range(20))
-        tracker.use_areas([other])
+        tracker.use(MapFinder([other]))
         assert {f.state for f in followed(tracker, thread, range(20, 30))} == {"tracking"}
-        tracker.use_areas([moved])
+        tracker.use(MapFinder([moved]))
         again = followed(tracker, thread, range(30, 60))
         assert again[0].detail == "LOST: the maps have changed"
         assert runs(again) == [("lost", 12), ("relocalised", 1), ("tracking", 17)]
-        assert all(f.area is moved.area for f in again if f.area is not None)
+        grounds = [f.ground for f in again if f.ground is not None]
+        assert all(isinstance(g, MapGround) and g.area is moved.area for g in grounds)
         check_poses(again, 30)
-        tracker.use_areas([])
+        tracker.use(MapFinder([]))
         gone = followed(tracker, thread, range(60, 90))
         assert {f.state for f in gone} == {"lost"}
 
 
 def test_what_was_found_in_maps_that_have_gone_is_not_used(thread: SlowThread) -> None:
     old = field_area()
-    with Tracker((old,), CAMERA, _LIVE) as tracker:
+    with Tracker(MapFinder([old]), CAMERA, _LIVE) as tracker:
         followed(tracker, thread, range(5))
-        tracker.use_areas([])
+        tracker.use(MapFinder([]))
         assert {f.state for f in followed(tracker, thread, range(5, 30))} == {"lost"}
 
 

@@ -14,13 +14,12 @@ from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValu
 from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.video.film import fitted_size
-from reloc.candidates import IndexedArea
 from reloc.result import LocaliseRequest
 from reloc.service.handler import StageClock, geo_prior
 from reloc.service.live.latest import Arrival
 from reloc.service.live.options import LiveOptions
 from reloc.service.source import ServedArea
-from reloc.tracking.keyframe import usable_areas
+from reloc.tracking.map_ground import MapFinder, usable_areas
 from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory import point_of
@@ -67,7 +66,7 @@ class FrameAnswerer:
             areas = usable_areas(self._adopted.localiser.areas, localise.extractor.fingerprint)
         except IncompatibleExtractorError as error:
             raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
-        self._areas: list[IndexedArea] = areas
+        self._finder = MapFinder(areas)
         self._request = LocaliseRequest(prior=prior)
         self._tracker: Tracker | None = None
         self._size: tuple[int, int] | None = None
@@ -190,7 +189,7 @@ class FrameAnswerer:
                     raise RequestError(
                         ErrorCode.BAD_REQUEST, f"camera: {error} (the frame has {width}x{height})"
                     ) from error
-            self._tracker = Tracker(self._areas, camera, self._tracker_options, self._request)
+            self._tracker = Tracker(self._finder, camera, self._tracker_options, self._request)
             self._size = (width, height)
         return self._tracker
 
@@ -205,7 +204,7 @@ class FrameAnswerer:
         self._adopted = area
         wanted = self._tracker_options.localise.extractor.fingerprint
         areas = [a for a in area.localiser.areas if a.area.extractor_fingerprint == wanted]
-        self._tracker.use_areas(areas)
+        self._tracker.use(MapFinder(areas))
 
 
 def _smaller(gray: NDArray[np.uint8], max_side_px: int) -> NDArray[np.uint8]:

@@ -1,0 +1,102 @@
+"""What a track stands on: points of maps, or of a scan, in one local frame; how a frame is found there."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from reloc.result import LocaliseRequest
+from reloc.tracking.options import TrackOptions
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Standing:
+    """What a pose stands on, and how surely.
+
+    Attributes:
+        epsg, height_datum: of UTM coordinates of the pose. map_id: of the map, or the scan.
+        covariance: (6, 6) of the pose, true east-north-up at the camera: rotation (rad) before displacement
+            (m), with what the ground's own place is uncertain.
+    """
+
+    epsg: int
+    height_datum: str
+    map_id: str
+    covariance: FloatArray
+
+
+class Ground(Protocol):
+    """Known points, and how a frame whose pose is known to some pixels is compared with them.
+
+    `match` is called from the tracker's thread, one call at a time.
+    """
+
+    @property
+    def frame(self) -> LocalFrame:
+        """Local frame of points and poses."""
+        ...
+
+    def match(
+        self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
+    ) -> "Keyframe | Unmatched":
+        """What is seen of the ground in a frame (h, w) that `pose` is about right for."""
+        ...
+
+    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+        """What a pose stands on whose landmarks are these.
+
+        Args:
+            rows: (k,) of the landmarks. center: (3,) of the camera.
+            measured: (6, 6) covariance by the landmarks' pixels alone, local axes: rotation before centre.
+        """
+        ...
+
+    def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
+        """Pixels (n, 2) of some points that the camera should see, to be drawn."""
+        ...
+
+
+class Finder(Protocol):
+    """Finds frames whose pose is not known."""
+
+    def find(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
+    ) -> "Keyframe | Unmatched":
+        """The pose of a frame (h, w) with what it is seen by; called from the tracker's thread."""
+        ...
+
+    def has(self, ground: Ground) -> bool:
+        """Whether a track on this ground may go on."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Keyframe:
+    """What the ground says of a frame.
+
+    Attributes:
+        cam_from_local: pose in the ground's frame. ground: that it is of.
+        camera: intrinsics; the given ones, or estimated along.
+        pixels: (k, 2) of its inliers. points: (k, 3) that they see, metres in the ground's frame.
+        rows: (k,) numbers of the points, by which they are told apart.
+    """
+
+    cam_from_local: Rigid3
+    ground: Ground
+    camera: Camera
+    pixels: FloatArray
+    points: FloatArray
+    rows: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unmatched:
+    """Why the ground says nothing of a frame: a code and a sentence."""
+
+    reason: str
+    detail: str

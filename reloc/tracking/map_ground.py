@@ -1,0 +1,140 @@
+"""Feature maps under a track: a frame against them where its pose says points are, or, without, anywhere."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IncompatibleExtractorError
+from featuredb.features.extractor import extract
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import Area
+from reloc.answer import on_earth
+from reloc.candidates import IndexedArea
+from reloc.localise import localise_features
+from reloc.matching import guided_matches, visible_points
+from reloc.pose import PoseHypothesis, refine_pose
+from reloc.result import LocaliseRequest
+from reloc.search import pairs
+from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
+from reloc.tracking.options import TrackOptions
+
+_MOST_SHOWN = 1500  # more dots hide the picture
+_MOST_LOOKED_AT = 20_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapGround:
+    """The maps of an area."""
+
+    area: Area
+
+    @property
+    def frame(self) -> LocalFrame:
+        """The area's."""
+        return self.area.frame
+
+    def match(
+        self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
+    ) -> Keyframe | Unmatched:
+        """Matches of a frame (h, w) whose pose is known to some pixels, and the pose that they give."""
+        settings, area = options.localise, self.area
+        features = extract(gray, settings.extractor)
+        matches = guided_matches(
+            features, area, np.arange(len(area.points), dtype=np.int32), camera, pose, settings.matching
+        )
+        if len(matches) < options.min_matches:
+            return Unmatched(
+                reason="TOO_FEW_MATCHES",
+                detail=f"{len(matches)} map points where the track has them, {options.min_matches} needed",
+            )
+        pixels, points = pairs(features, area, matches)
+        start = PoseHypothesis(
+            cam_from_local=pose,
+            camera=camera,
+            camera_source="request",
+            inliers=np.ones(len(pixels), dtype=np.bool_),
+            prior_focal_px=camera.focal_px,
+        )
+        refined = refine_pose(pixels, points, start, settings.pose)
+        if refined.count < options.min_matches:
+            return Unmatched(
+                reason="TOO_FEW_INLIERS",
+                detail=f"{refined.count} map points agree, {options.min_matches} needed",
+            )
+        rows = matches.point[refined.inliers].astype(np.int64)
+        return Keyframe(
+            cam_from_local=refined.cam_from_local,
+            ground=self,
+            camera=camera,
+            pixels=pixels[refined.inliers],
+            points=area.points[rows],
+            rows=rows,
+        )
+
+    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+        """By the map whose points most landmarks are."""
+        area = self.area
+        main = area.maps[int(np.argmax(np.bincount(area.point_map[rows], minlength=len(area.maps))))]
+        return Standing(
+            epsg=main.epsg,
+            height_datum=main.height_datum,
+            map_id=main.map_id,
+            covariance=on_earth(area, main, center, measured),
+        )
+
+    def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
+        """Of points that the pose says are in the picture, seen from a side that the map knows."""
+        every = max(1, len(self.area.points) // _MOST_LOOKED_AT)
+        rows = visible_points(self.area, np.arange(0, len(self.area.points), every), camera, pose)
+        rows = rows[:: max(1, len(rows) // _MOST_SHOWN)]
+        pixels = camera.project(pose.act(self.area.points[rows]))
+        return pixels[np.isfinite(pixels).all(axis=1)]
+
+
+class MapFinder:
+    """Finds frames as queries are found, on the maps of some areas."""
+
+    def __init__(self, areas: Sequence[IndexedArea]) -> None:
+        self._areas = tuple(areas)
+
+    def find(
+        self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
+    ) -> Keyframe | Unmatched:
+        """A frame (h, w) whose pose is not known, localised as a query would be."""
+        features = extract(gray, options.localise.extractor)
+        outcome = localise_features(features, request, self._areas, options.localise)
+        if outcome.best is None:
+            return Unmatched(reason=str(outcome.result.reason), detail=outcome.result.detail)
+        best = outcome.best
+        pixels, points = pairs(features, best.area, best.matches)
+        return Keyframe(
+            cam_from_local=best.pose.cam_from_local,
+            ground=MapGround(area=best.area),
+            camera=best.pose.camera,
+            pixels=pixels[best.rows],
+            points=points[best.rows],
+            rows=best.matches.point[best.rows].astype(np.int64),
+        )
+
+    def has(self, ground: Ground) -> bool:
+        """Whether these very maps are among its own: one that was moved or taken back is another."""
+        return isinstance(ground, MapGround) and any(a.area is ground.area for a in self._areas)
+
+
+def usable_areas(areas: Sequence[IndexedArea], fingerprint: str) -> list[IndexedArea]:
+    """Those whose descriptors can be compared with the film's.
+
+    Raises:
+        IncompatibleExtractorError: there are areas, and none of them is.
+    """
+    usable = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
+    if areas and not usable:
+        raise IncompatibleExtractorError(
+            f"the maps have descriptors of {areas[0].area.extractor_fingerprint}, a film's are {fingerprint}"
+        )
+    return usable
