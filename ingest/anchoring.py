@@ -307,7 +307,7 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     if request.pose_file is not None:
         rough = read_pose(request.pose_file, request.image)
         image = image_named(feature_map, rough.image)
-        starts[image.image_id] = prior_from_rough_pose(rough, feature_map)
+        starts[image.image_id] = prior_from_rough_pose(rough, feature_map.frame, feature_map.epsg)
         notes.append(f"{image.name} starts from the pose in {request.pose_file}")
     if request.picks_file is not None:
         for picks in read_picks(request.picks_file, request.image):

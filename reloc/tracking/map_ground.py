@@ -102,6 +102,11 @@ class MapFinder:
     def __init__(self, areas: Sequence[IndexedArea]) -> None:
         self._areas = tuple(areas)
 
+    @property
+    def grounds(self) -> list[MapGround]:
+        """A ground for each area."""
+        return [MapGround(area=a.area) for a in self._areas]
+
     def find(
         self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
     ) -> Keyframe | Unmatched:

@@ -77,7 +77,7 @@ def fit_pose(
         cam_from_local=pose,
         inlier=inlier,
         residual_px=residual,
-        covariance=_of_camera(pose, covariance),
+        covariance=of_camera(pose, covariance),
     )
 
 
@@ -115,7 +115,7 @@ def _linearised(
     return residual, jacobian
 
 
-def _of_camera(pose: Rigid3, covariance: FloatArray) -> FloatArray:
+def of_camera(pose: Rigid3, covariance: FloatArray) -> FloatArray:
     """From the left perturbation of cam_from_local to a rotation about local axes and a moved centre.
 
     cam_from_local' = exp(xi) cam_from_local: the camera turns by -R^T omega about the local axes, and its

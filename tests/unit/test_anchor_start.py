@@ -122,7 +122,9 @@ def test_a_rough_pose_looks_where_it_says() -> None:
     utm = np.array([EASTING + 40.0, NORTHING - 20.0, HEIGHT + 90.0])
     target = np.array([EASTING + 80.0, NORTHING + 50.0, HEIGHT])
     yaw, pitch = look_at_angles(utm, target)
-    prior = prior_from_rough_pose(RoughPose(image="x", utm=utm, yaw_deg=yaw, pitch_deg=pitch), feature_map)
+    prior = prior_from_rough_pose(
+        RoughPose(image="x", utm=utm, yaw_deg=yaw, pitch_deg=pitch), feature_map.frame, feature_map.epsg
+    )
     seen = prior.cam_from_local.act(feature_map.frame.enu_from_utm(target, EPSG))
     assert seen[2] > 0
     # UTM's scale and the Earth's curvature leave centimetres in a hundred metres.

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from featuredb.errors import RegistrationError
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
@@ -147,7 +148,8 @@ class RoughPose:
 
     Attributes:
         image: the photo's name.
-        utm: (3,) easting, northing, height of the camera, in the map's zone and the scan's datum.
+        utm: (3,) easting, northing, height of the camera, in the zone of the map (or, without one, of the
+            scan) and the scan's datum.
         yaw_deg: clockwise from grid north: where the optical axis points in plan; of a camera that looks
             straight down, where the top of the photo points.
         pitch_deg: of the optical axis above the horizon; -90 looks straight down.
@@ -169,10 +171,10 @@ class RoughPose:
         object.__setattr__(self, "utm", frozen_array("RoughPose.utm", self.utm, (3,)))
 
 
-def prior_from_rough_pose(rough: RoughPose, feature_map: FeatureMap) -> FramePrior:
-    """The rough pose in the map's local frame."""
-    center = feature_map.frame.enu_from_utm(rough.utm, feature_map.epsg)
-    grid_from_local = feature_map.frame.grid_from_enu(center, feature_map.epsg)
+def prior_from_rough_pose(rough: RoughPose, frame: LocalFrame, epsg: int) -> FramePrior:
+    """The rough pose, given in a UTM zone, in a local frame."""
+    center = frame.enu_from_utm(rough.utm, epsg)
+    grid_from_local = frame.grid_from_enu(center, epsg)
     rotation = cam_from_grid(rough.yaw_deg, rough.pitch_deg, rough.roll_deg) @ grid_from_local
     return FramePrior(
         cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),

@@ -47,10 +47,10 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
     loose = loosened(prior, options.prior_slack)
     for start in _starts(views, prior, clock):
         with clock.stage("compare sources"):
-            begun = _by_agreement(views, start)
+            begun = by_agreement(views, start)
         if start.kind == "dense" and begun.confirmation.log_nfa < options.promising_log_nfa:
             continue
-        judged.append(_polished(views, loose, begun.found, clock))
+        judged.append(polished(views, loose, begun.found, clock))
         confirmation = judged[-1].confirmation
         # Decisive features stand alone where the pictures have too little to compare.
         silent = confirmation.pieces < options.verdict.min_confirmation_pieces
@@ -74,7 +74,7 @@ def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: S
             near = searched_again(views, prior, start)
         if near is None:
             break
-        again = _polished(views, loosened(prior, options.prior_slack), near, clock)
+        again = polished(views, loosened(prior, options.prior_slack), near, clock)
         best, start = max(best, again, key=lambda j: j.confirmation.log_nfa), again.found
     return best
 
@@ -122,7 +122,7 @@ def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
     return telling or sources
 
 
-def _by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
+def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     """The pose with the source that agrees best with the photo there, whichever it was found by."""
     own = Judged(found=found, confirmation=confirmed(views, found))
     if found.log_nfa >= views.options.decisive_log_nfa:
@@ -135,7 +135,7 @@ def _by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     return max(heard, key=lambda j: j.confirmation.log_nfa)
 
 
-def _polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
+def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock: StageClock) -> Judged:
     """Fitted by guided features where colours are rendered, else by pieces; and shown to the pictures."""
     by_features = found.source == "rgb" and found.kind != "dense"
     with clock.stage("fit"):

@@ -120,7 +120,14 @@ def dense_side_px(views: FrameViews, spacing_px: float) -> int:
 
 def confirmed(views: FrameViews, found: FrameHypothesis) -> Confirmation:
     """What the pictures say of a pose."""
-    return confirm_pose(views.gray, found.pose.camera, found.pose.cam_from_local, views.cloud, found.source)
+    return confirm_pose(
+        views.gray,
+        found.pose.camera,
+        found.pose.cam_from_local,
+        views.cloud,
+        found.source,
+        views.options.confirm,
+    )
 
 
 def intensity_refined(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:

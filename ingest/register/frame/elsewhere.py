@@ -59,7 +59,9 @@ def agreement_elsewhere(
             there = candidate.cam_from_local
             if other.cam_from_local.angle_to_deg(pose) < 90.0 and _same_view(views, there, pose):
                 continue
-            agreement = confirm_pose(views.gray, views.camera, there, views.cloud, source)
+            agreement = confirm_pose(
+                views.gray, views.camera, there, views.cloud, source, views.options.confirm
+            )
             most = max(most, agreement.log_nfa)
     return Elsewhere(places=count, log_nfa=most)
 

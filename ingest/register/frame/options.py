@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
+from ingest.register.frame.confirmation import ConfirmOptions
 from ingest.register.frame.consistency import ConsistencyOptions
 from ingest.register.frame.dense_fit import DenseFitOptions
 from ingest.register.frame.pool import PoolOptions
@@ -49,6 +50,7 @@ class FrameOptions:
             normalised errors that tools/frame_evaluation.py prints.
         threads: for renders and features; 0 takes as many as the process may use, up to four.
         seed: of RANSAC.
+        confirm: how the pictures are asked.
     """
 
     sources: tuple[RenderSource, ...] = ()
@@ -80,6 +82,7 @@ class FrameOptions:
     pool: PoolOptions = field(default_factory=PoolOptions)
     consistency: ConsistencyOptions = field(default_factory=ConsistencyOptions)
     dense_fit: DenseFitOptions = field(default_factory=DenseFitOptions)
+    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
     verdict: VerdictOptions = field(default_factory=VerdictOptions)
 
     def __post_init__(self) -> None:

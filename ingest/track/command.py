@@ -19,8 +19,8 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "track",
         help="the pose of every frame of a video",
-        description="Follow a video by the active maps. Each frame has a pose with its uncertainty, or is "
-        "said to be lost. See docs/video.md.",
+        description="Follow a video by the active maps, by a LiDAR scan, or by both. Each frame has a pose "
+        "with its uncertainty, or is said to be lost. See docs/video.md.",
     )
     add_database_argument(parser)
     parser.add_argument("video", metavar="VIDEO", help="film, folder of pictures, or an address (rtsp://...)")
@@ -45,6 +45,22 @@ def register(subparsers: Any) -> None:
         "--prior", metavar="LAT,LON,SIGMA_M", help="where the film begins, WGS84 degrees and metres"
     )
     parser.add_argument("--map", action="append", metavar="ID", help="track by this map; may be repeated")
+    parser.add_argument(
+        "--by",
+        choices=("map", "scan", "both"),
+        default="map",
+        help="what the film is followed by: the maps, a scan alone, or the scan where the maps know nothing; "
+        "default: map",
+    )
+    parser.add_argument(
+        "--scan", action="append", metavar="ID", help="with --by scan or both; default: all scans there"
+    )
+    parser.add_argument(
+        "--pose",
+        type=Path,
+        metavar="FILE",
+        help="coarse pose of the first frame, JSON as for `featuredb anchor --pose`; a scan alone needs it",
+    )
     parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
     parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
     parser.add_argument(
@@ -58,31 +74,36 @@ def run_track(args: argparse.Namespace) -> int:
     """Track and write; 0, 1 where no frame was localised, 2 where a file could not be written.
 
     Raises:
-        InvalidValueError, VideoError, StoreError, ServiceError
+        InvalidValueError, VideoError, StoreError, ServiceError, RegistrationError, ScanNotFoundError
     """
     from dataclasses import replace
 
     from featuredb.cli.common import open_database
-    from reloc.localiser import Localiser
+    from ingest.track.finders import FilmGround, finder_for
     from reloc.result import LocaliseRequest
-    from reloc.tracking.map_ground import MapFinder, usable_areas
     from reloc.tracking.outputs import check_outputs, exit_code, write_outputs
     from reloc.tracking.track_video import TrackVideoOptions, track_video
 
     check_outputs(args.out)
-    localiser = Localiser.open(open_database(args))
-    maps = tuple(args.map) if args.map else None
     options = TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end)
-    areas = usable_areas(localiser.areas_of(maps), options.track.localise.extractor.fingerprint)
+    camera = _camera(args.camera)
+    database = open_database(args)
+    asked = FilmGround(
+        by=args.by,
+        maps=tuple(args.map) if args.map else None,
+        scans=tuple(args.scan) if args.scan else None,
+        pose_file=args.pose,
+    )
+    finder, version = finder_for(database, asked, camera, options.track)
     found = track_video(
         args.video,
-        MapFinder(areas),
-        camera=_camera(args.camera),
+        finder,
+        camera=camera,
         request=LocaliseRequest(prior=_prior(args.prior)),
         overlay=args.overlay,
         options=options,
     )
-    trajectory = replace(found.trajectory, database=args.db, version=localiser.snapshot)
+    trajectory = replace(found.trajectory, database=args.db, version=version)
     found = replace(found, trajectory=trajectory)
     outputs = write_outputs(args.out, trajectory)
     summary = _summary(found, [*outputs.written, *([str(args.overlay)] if args.overlay else [])])

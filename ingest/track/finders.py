@@ -1,0 +1,135 @@
+"""What a film is followed by, from a database: its maps, its scans, or both."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError, ScanNotFoundError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.lidar.load import PlanBox, load_cloud
+from featuredb.store import Database
+from featuredb.store.scans import ScanSummary, list_scans
+from ingest.register.anchor.start import RoughPose, prior_from_rough_pose
+from ingest.register.anchor.start_files import read_pose
+from ingest.track.map_over_scan import MapOverScanFinder
+from ingest.track.scan_ground import ScanFinder
+from reloc.localiser import Localiser
+from reloc.tracking.ground import Finder
+from reloc.tracking.map_ground import MapFinder, usable_areas
+from reloc.tracking.options import TrackOptions
+
+FilmBy = Literal["map", "scan", "both"]
+_REACH_M = 600.0  # around where the film begins: people fly in sight, and see further
+_MAP_MARGIN_M = 300.0  # around the cameras of a map
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmGround:
+    """What a person asks a film to be followed by.
+
+    Attributes:
+        by: what. maps, scans: ids; None: all there are.
+        pose_file: coarse pose of the first frame (JSON), see `read_pose`.
+    """
+
+    by: FilmBy = "map"
+    maps: tuple[str, ...] | None = None
+    scans: tuple[str, ...] | None = None
+    pose_file: Path | None = None
+
+
+def finder_for(
+    database: Database, asked: FilmGround, camera: Camera | None, options: TrackOptions
+) -> tuple[Finder, int]:
+    """What finds the film's frames, and the version of the database that it was made of.
+
+    Args:
+        camera: intrinsics of the film's frames, if they are known.
+
+    Raises:
+        InvalidValueError: what was asked for contradicts itself, or lacks a pose or a camera.
+        RegistrationError: the file of the pose is none.
+        ScanNotFoundError, MapNotFoundError, ScanError, StoreError
+        IncompatibleExtractorError: all maps are of another extractor.
+    """
+    if asked.by == "map":
+        if asked.scans or asked.pose_file:
+            raise InvalidValueError("--scan and --pose are for --by scan and --by both; add one of these")
+        maps, version = _maps(database, asked, options)
+        return maps, version
+    rough = None if asked.pose_file is None else read_pose(asked.pose_file, "the first frame")
+    if asked.by == "scan":
+        if rough is None or camera is None:
+            raise InvalidValueError(
+                "a scan alone tells neither the lens nor where to look: give --camera and --pose, or let a "
+                "map find the film by --by both"
+            )
+        return _on_scan(database, asked, rough), database.snapshot().version
+    maps, version = _maps(database, asked, options)
+    if len(maps.grounds) != 1:
+        raise InvalidValueError(
+            f"--by both follows the maps of one place, found {len(maps.grounds)}; name one by --map"
+        )
+    area = maps.grounds[0].area
+    scan = _over(area.frame, area.image_center, _scan(database, asked.scans), database, rough)
+    return MapOverScanFinder(maps, scan), version
+
+
+def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> tuple[MapFinder, int]:
+    localiser = Localiser.open(database)
+    areas = usable_areas(localiser.areas_of(asked.maps), options.localise.extractor.fingerprint)
+    return MapFinder(areas), localiser.snapshot
+
+
+def _scan(database: Database, ids: tuple[str, ...] | None) -> list[ScanSummary]:
+    """The scans meant, by ids or their first letters."""
+    scans = list_scans(database)
+    if ids is not None:
+        missing = [i for i in ids if not any(s.scan_id.startswith(i) for s in scans)]
+        if missing:
+            raise ScanNotFoundError(
+                f"no scan {', '.join(missing)}; `featuredb lidar list` lists what there is"
+            )
+        scans = [s for s in scans if any(s.scan_id.startswith(i) for i in ids)]
+    if not scans:
+        raise ScanNotFoundError(f"{database.url} has no scans; add one by `featuredb lidar add`")
+    return scans
+
+
+def _on_scan(database: Database, asked: FilmGround, rough: RoughPose) -> ScanFinder:
+    scans = _scan(database, asked.scans)
+    epsg = scans[0].epsg
+    east, north, _ = rough.utm.tolist()
+    frame = LocalFrame.from_utm(east, north, min(s.box.min_height for s in scans), epsg)
+    return _finder(database, scans, frame, (-_REACH_M, -_REACH_M, _REACH_M, _REACH_M), rough)
+
+
+def _over(
+    frame: LocalFrame,
+    centers: FloatArray,
+    scans: list[ScanSummary],
+    database: Database,
+    rough: RoughPose | None,
+) -> ScanFinder:
+    """The scans around the cameras (n, 3) of a map."""
+    low, high = np.min(centers, axis=0) - _MAP_MARGIN_M, np.max(centers, axis=0) + _MAP_MARGIN_M
+    box = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    return _finder(database, scans, frame, box, rough)
+
+
+def _finder(
+    database: Database, scans: list[ScanSummary], frame: LocalFrame, box: PlanBox, rough: RoughPose | None
+) -> ScanFinder:
+    ids = [s.scan_id for s in scans]
+    cloud = load_cloud(database, frame, box, scan_ids=ids)
+    if not len(cloud):
+        raise InvalidValueError(
+            f"scan {', '.join(ids)} has no points around where the film is looked for; is the pose's zone "
+            f"that of the scan, EPSG:{scans[0].epsg}? `featuredb lidar list` tells where scans lie"
+        )
+    first = None if rough is None else prior_from_rough_pose(rough, frame, scans[0].epsg)
+    return ScanFinder(cloud, ids[0], scans[0].epsg, first)
