@@ -35,6 +35,7 @@ class MapOverScan:
         """By the maps, or where they know nothing, by the scan; both reasons where that knows nothing."""
         by_map = self.maps.match(gray, camera, pose, options)
         if isinstance(by_map, Keyframe):
+            self.scan.last = by_map.cam_from_local  # where it is looked for on the scan, were it lost
             return replace(by_map, ground=self)
         by_scan = self.scan.match(gray, camera, pose, options)
         if isinstance(by_scan, Keyframe):

@@ -86,7 +86,8 @@ class ScanGround:
     """A scan's surface; used from the tracker's thread, except `standing` and `visible`.
 
     Attributes:
-        last: pose of the last keyframe that was registered, None before the first.
+        last: pose of the last keyframe, on the scan or on maps over it; None before the first. A lost camera
+            is looked for from there.
     """
 
     def __init__(self, cloud: PointCloud, scan_id: str, epsg: int, options: ScanTrackOptions) -> None:

@@ -157,6 +157,11 @@ def test_the_scan_goes_on_where_the_map_ends(database: Path, film: list[np.ndarr
     assert [f.state for f in found[6:]] == ["relocalised", *["tracking"] * 13]
     by_map = [f for f in found if f.rows is not None and (f.rows >= 0).any()]
     assert by_map, "the map has found the film"
+    # A loss would be looked for on the scan from the last keyframe, and not from where the film began.
+    last = finder._scan.ground.last
+    assert last is not None
+    centers = [frame.enu_from(FRAME).act(pose_at(i).center) for i in range(20)]
+    assert np.linalg.norm(centers - last.center, axis=1).argmin() >= 6
 
     class Forgets:
         """A map that knows nothing of keyframes."""
@@ -235,7 +240,7 @@ def test_what_contradicts_itself_is_told(
 
 
 def test_fixture_is_what_it_says(film: list[np.ndarray], cloud: PointCloud) -> None:
-    """Frames have features, and the scan ends east of the film."""
+    """Frames have features, and the scan reaches further east than the film."""
     assert len(extract(film[0], _OPTIONS.localise.extractor)) > 200
     assert cloud.xyz[:, 0].max() > pose_at(_FRAMES).center[0]
     assert isinstance(ScanFinder(cloud, "hills", EPSG, None).ground, ScanGround)
