@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.view_cones import ViewCones, in_view
 from featuredb.index.area import Area
 from featuredb.index.nearest import nearest
 from reloc.candidates import Cluster
@@ -133,20 +134,9 @@ def visible_points(
     A point counts as seen from a known side when the ray to the new camera lies within the cone of the
     map's own views, widened by `beyond_views_deg`.
     """
-    pixels = camera.project(cam_from_local.act(area.points[points]))
-    with np.errstate(invalid="ignore"):
-        inside = (
-            (pixels[:, 0] >= 0)
-            & (pixels[:, 1] >= 0)
-            & (pixels[:, 0] < camera.width)
-            & (pixels[:, 1] < camera.height)
-        )
-    toward = cam_from_local.center - area.points[points]
-    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-9)
-    cosine = np.einsum("ij,ij->i", toward, area.view_direction[points])
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0))
-    cone = np.arccos(np.clip(area.view_spread_cos[points], -1.0, 1.0)) + np.radians(beyond_views_deg)
-    return np.asarray(points[inside & (angle <= cone)], dtype=np.int64)
+    cones = ViewCones(direction=area.view_direction[points], spread_cos=area.view_spread_cos[points])
+    seen = in_view(area.points[points], cones, camera, cam_from_local, beyond_views_deg)
+    return np.asarray(points[seen], dtype=np.int64)
 
 
 def _one_to_one(

@@ -18,6 +18,7 @@ from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.view_cones import view_cones
 from featuredb.maps.feature_map import FeatureMap
 
 
@@ -172,14 +173,8 @@ def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> _Part:
     centers = np.array([area_from_map.act(i.cam_from_local.center) for i in feature_map.images]).reshape(
         -1, 3
     )
-    toward = centers[see_image] - points[see_point]
-    distance = np.linalg.norm(toward, axis=1)
-    unit = toward / np.maximum(distance, 1e-9)[:, None]
-    direction = _sum_by(see_point, unit, len(rows))
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-9)
-    cosine = np.einsum("ij,ij->i", direction[see_point], unit)
-    spread = np.ones(len(rows))
-    np.minimum.at(spread, see_point, cosine)
+    cones = view_cones(points, centers, see_point, see_image)
+    distance = np.linalg.norm(centers[see_image] - points[see_point], axis=1)
     near, far = np.full(len(rows), np.inf), np.zeros(len(rows))
     np.minimum.at(near, see_point, distance)
     np.maximum.at(far, see_point, distance)
@@ -196,8 +191,8 @@ def _lay_out(feature_map: FeatureMap, frame: LocalFrame) -> _Part:
         points=points,
         point_row=rows,
         point_covariance=_full_covariance(feature_map.points.covariance[rows], area_from_map.rotation),
-        view_direction=direction,
-        view_spread_cos=spread,
+        view_direction=cones.direction,
+        view_spread_cos=cones.spread_cos,
         view_distance=np.stack([near, far], axis=1),
         descriptors=_mean_descriptors(observations.descriptors[keep][order], see_point, len(rows)),
         see_image=see_image.astype(np.int32),

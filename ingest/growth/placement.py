@@ -31,9 +31,8 @@ from ingest.growth.similarity_fit import (
     tolerances_px,
 )
 from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
+from ingest.growth.visibility import VisibilityOptions, visible_parts, witnessed_parts
 from ingest.photo import Photo
-from reloc.acceptance import agreement
-from reloc.matching import visible_points
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,11 +53,9 @@ class PlacementOptions:
         rival_views: placements count as different if they move the model's photos by more than this share
             of the viewing distance.
         max_against_gps: share of the photos with a position.
-        min_visible: least share of the parts of a photo where existing points should be seen that shows
-            some: as for a query (reloc.acceptance).
-        min_visible_points: a photo that should see fewer existing points says nothing about visibility.
-        max_blind: share of photos below `min_visible`. Single ones are left out (`MapsPlacement.blind`): in a
-            simulated community a re-upload 10.8 m off showed 0.13 of its parts, right photos 0.22 and more.
+        visibility: what a photo must show.
+        max_blind: share of photos that show less of the existing points. Single ones are left out
+            (`MapsPlacement.blind`).
         parents: when an existing map is one of them.
     """
 
@@ -71,8 +68,7 @@ class PlacementOptions:
     max_rival: float = 0.5
     rival_views: float = 0.05
     max_against_gps: float = 0.5
-    min_visible: float = 0.2
-    min_visible_points: int = 30
+    visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     max_blind: float = 0.34
     parents: ParentOptions = field(default_factory=ParentOptions)
 
@@ -134,7 +130,12 @@ def place_by_maps(
     edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, anchors.take(np.flatnonzero(used))
-    shows = visible_parts(model, sim, held, areas, frame, options)
+    shows = visible_parts(model, sim, held, areas, frame, options.visibility)
+    witnessed = witnessed_parts(model, sim, held, areas, frame, options.visibility)
+    blind = sorted(
+        {k for k in agree if shows[k] < options.visibility.min_visible}
+        | (set(np.flatnonzero(witnessed < options.visibility.min_witnessed).tolist()) - (own.keys() - agree))
+    )
     asked = _ask(model, fit, agree, own, held, shows, edges, photos, frame, on_earth, ranked, options)
     refusal = gates.first_refusal(asked)
     placement = MapsPlacement(
@@ -146,7 +147,7 @@ def place_by_maps(
         covariance=fit.covariance + on_earth,
         agreeing=tuple(int(model.rows[k]) for k in sorted(agree)),
         disagreeing=tuple(int(model.rows[k]) for k in sorted(set(own) - agree)),
-        blind=tuple(int(model.rows[k]) for k in sorted(agree) if shows[k] < options.min_visible),
+        blind=tuple(int(model.rows[k]) for k in blind),
         edges=edges,
         residual_rms_m=_rms(_center_offsets(model, fit.local_from_sfm, own, agree)),
         gates=asked,
@@ -228,7 +229,7 @@ def _ask(
         gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
-        gates.visibility(shows[np.isfinite(shows)], options.min_visible, options.max_blind),
+        gates.visibility(shows[np.isfinite(shows)], options.visibility.min_visible, options.max_blind),
     )
 
 
@@ -281,37 +282,6 @@ def _against_positions(
         offsets.append((center - place)[:2])
         spreads.append(jacobian @ covariance @ jacobian.T + np.eye(2) * gps.sigma_horizontal_m**2)
     return np.array(offsets).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)
-
-
-def visible_parts(
-    model: Model,
-    sim: Sim3,
-    held: Anchors,
-    areas: Sequence[Area],
-    frame: LocalFrame,
-    options: PlacementOptions,
-) -> FloatArray:
-    """(k,) for each photo: share of the image's parts that should show existing points where it does so.
-
-    NaN for photos that should show hardly any.
-
-    The other direction of localisation: what the existing maps say the placed photo must show. Photos that
-    no map localised are asked as well.
-    """
-    found = np.full(len(model.rows), np.nan)
-    for k in range(len(model.rows)):
-        camera = model.cameras[int(model.camera_of[k])]
-        pose = sim.act_on_pose(model.cam_from_sfm[k])
-        pixels = []
-        for area in areas:
-            in_area = pose @ frame.enu_from(area.frame)
-            rows = visible_points(area, np.arange(len(area.points), dtype=np.int64), camera, in_area)
-            pixels.append(camera.project(in_area.act(area.points[rows])))
-        expected = np.concatenate(pixels) if pixels else np.zeros((0, 2))
-        if len(expected) >= options.min_visible_points:
-            seen = held.pixels[held.photo_of == k]
-            found[k] = agreement(seen, expected, camera.width, camera.height)
-    return found
 
 
 def _typical_excess_m(model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]) -> float:
