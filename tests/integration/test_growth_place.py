@@ -31,6 +31,7 @@ from tests.support.growth_box import (
 )
 from tests.support.new_photos import FINGERPRINT, NewPhotos, identity, take_photos
 from tests.support.scenes import (
+    CAMERA,
     indexed,
     looking_at,
     ring,
@@ -245,6 +246,27 @@ def test_a_single_blind_photo_is_left_out(
     assert isinstance(whole, GrownMap), whole
     assert whole.placement.blind == ()
     assert 1 in whole.model.rows
+
+
+def test_a_photo_that_shows_little_of_what_its_neighbours_see_is_left_out(
+    new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
+) -> None:
+    """No map localises it, and it hangs on the others by a corner of what it should show of their points."""
+    others = {r: photo for r, photo in localised.items() if r != 4}
+    of_it = new.model.photo_of == 4
+    pixels = new.keypoints()[4][new.model.keypoint_of[of_it]]
+    seen = ~of_it
+    seen[of_it] = (pixels < 0.4 * np.array([CAMERA.width, CAMERA.height])).all(axis=1)
+    views = np.bincount(new.model.point_of[seen], minlength=len(new.model.xyz))
+    bare = with_observations(new.model, seen & (views[new.model.point_of] >= 2))
+    lone = grow_component(bare, new.photos, new.features_of, others, [area], identity())
+    assert isinstance(lone, GrownMap), lone
+    assert lone.placement.blind == (4,)
+    assert lone.left_out[4][0] == "NOT_VISIBLE"
+    grown = grow_component(new.model, new.photos, new.features_of, others, [area], identity())
+    assert isinstance(grown, GrownMap), grown
+    assert grown.placement.blind == ()
+    assert 4 in grown.model.rows
 
 
 def test_two_maps_that_differ_say_so(new: NewPhotos) -> None:
