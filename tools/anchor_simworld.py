@@ -77,7 +77,7 @@ def _tell(name: str, database: Database, truth: Truth, queries: Sequence[Path]) 
     )
     if not queries:
         return
-    errors = _ask(database, truth, queries)
+    errors = [e for e in ask(database, truth, queries).values() if e is not None]
     if errors:
         position = np.array([e.position_m for e in errors])
         angle = np.array([e.angle_deg for e in errors])
@@ -99,18 +99,20 @@ def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, Fl
     return np.array(metres), np.array(degrees)
 
 
-def _ask(database: Database, truth: Truth, queries: Sequence[Path]) -> list[PoseError]:
-    errors = []
+def ask(database: Database, truth: Truth, photos: Sequence[Path]) -> dict[Path, PoseError | None]:
+    """What a server answers to photos of the world, against the truth; None where it does not."""
+    errors: dict[Path, PoseError | None] = {}
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
         Client(server.endpoints[0]) as client,
     ):
-        for path in queries:
+        for path in photos:
             reply = client.localise(path, timeout_s=60.0)
+            errors[path] = None
             if reply.utm is not None:
                 utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-                name = f"queries/{path.name}"
-                errors.append(pose_error(truth, name, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw))
+                name = f"{path.parent.name}/{path.name}"
+                errors[path] = pose_error(truth, name, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
     return errors
 
 

@@ -54,6 +54,10 @@ class TrackOptions:
         keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
+        keyframe_every_s, answer_after_s, lost_answer_after_s: of the film, where that is sooner: pictures
+            that come one in a second are each looked for, and not one in twenty.
+        catch_up: frames by which a track that was found comes nearer to the frame at hand with each new one.
+            With all at once one frame waited for 0.18 s.
         live: answers are taken as soon as they are there, and no frame waits for one. live_frames: that are
             kept meanwhile; 60 are two seconds, and 55 MB at 1280x720. live_steps: frames by which a track
             that was found is carried to the one at hand while a client waits; more are left to the thread.
@@ -75,6 +79,10 @@ class TrackOptions:
     few_landmarks: float = 0.5
     answer_after: int = 12
     lost_answer_after: int = 20
+    keyframe_every_s: float = 1.0
+    answer_after_s: float = 0.6
+    lost_answer_after_s: float = 1.0
+    catch_up: int = 5
     live: bool = False
     live_frames: int = 60
     live_steps: int = 3

@@ -58,11 +58,22 @@ class TrackedFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sent:
-    """What the thread has in hand: the number of its frame, and the frame at which it is waited for."""
+    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for."""
 
     index: int
     due: int
+    due_s: float
     answer: "Future[Answer]"
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class _Catching:
+    """A track from a localised frame on its way to the frame at hand: where it is, and its pose there."""
+
+    track: FlowTrack
+    at: RecentFrame
+    fitted: FittedPose
+    state: TrackState = "relocalised"
 
 
 class Tracker:
@@ -92,15 +103,12 @@ class Tracker:
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._ground: Ground | None = None
         self._track: FlowTrack | None = None
-        self._frames = RecentFrames(
-            self._options.live_frames
-            if self._options.live
-            else 1 + max(self._options.answer_after, self._options.lost_answer_after)
-        )
+        self._frames = RecentFrames(_frames_kept(self._options))
         self._late: list[TrackedFrame] = []
         self._sent: _Sent | None = None
+        self._catching: _Catching | None = None
         self._behind = _FAR  # frames through which the thread carries a track that was found, live
-        self._next_keyframe = 0
+        self._next_keyframe, self._next_keyframe_s = 0, float("inf")
         self._unconfirmed = 0  # keyframes in a row of which the ground knew nothing
         self._index = -1
         self._why = "nothing was localised yet"
@@ -128,15 +136,17 @@ class Tracker:
         self._index += 1
         before = self._frames.last
         now = RecentFrame(index=self._index, time_s=time_s, gray=gray)
-        self._frames.add(now, None if self._sent is None else self._sent.index)
+        self._frames.add(now, self._needed_from())
         self._late = []
         fitted = None
+        state: TrackState = "tracking"
         if before is not None and self._track is not None:
             fitted = self._track.follow(before, now)
             if fitted is None:
                 self._lost(f"LOST: {self._track.why}")
-        answered, sent = self._answer()
-        state: TrackState = "tracking"
+        elif self._catching is not None:
+            fitted, state = self._caught_up_by(self._options.catch_up), "relocalised"
+        answered, sent = self._answer(now)
         if isinstance(answered, Unmatched):
             self._unconfirmed += 1
             if fitted is None or self._unconfirmed >= self._options.max_unconfirmed:
@@ -149,9 +159,10 @@ class Tracker:
                 fitted = found
                 self._unconfirmed = 0
         if fitted is None or self._track is None:
-            self._search(gray)
+            if self._catching is None:
+                self._search(now)
             return TrackedFrame(index=self._index, time_s=time_s, state="lost", detail=self._why)
-        self._send_keyframe(gray, fitted, self._track)
+        self._send_keyframe(now, fitted, self._track)
         return self._known(now, state, fitted, self._track)
 
     @property
@@ -166,9 +177,10 @@ class Tracker:
         have been moved or taken back.
         """
         self._finder = finder
-        if self._track is not None and finder.has(self._track.ground):
+        track = self._catching.track if self._catching is not None else self._track
+        if track is not None and finder.has(track.ground):
             return
-        if self._track is not None:
+        if track is not None:
             self._lost("LOST: the maps have changed")
         self._sent = None
 
@@ -183,18 +195,19 @@ class Tracker:
     def finish(self) -> Sequence[TrackedFrame]:
         """After the last frame: poses of those before it that a frame still being looked for has found."""
         sent, self._sent = self._sent, None
-        if sent is None or self._options.live or self.tracking:
-            return ()
-        answered = sent.answer.result()
-        if isinstance(answered, Unmatched):
+        if self._options.live or self.tracking:
             return ()
         self._late = []
-        last = self._frames.last
-        assert last is not None
-        found, track = self._taken(answered, sent.index, last, None), self._track
-        if found is not None and track is not None:
+        last, fitted = self._frames.last, None
+        if sent is not None and last is not None:
+            answered = sent.answer.result()
+            if not isinstance(answered, Unmatched):
+                fitted = self._taken(answered, sent.index, last, None)
+        if self._catching is not None:
+            fitted = self._caught_up_by(_FAR)
+        if fitted is not None and self._track is not None and last is not None:
             state: TrackState = "tracking" if self._late else "relocalised"
-            self._late.append(self._known(last, state, found, track))
+            self._late.append(self._known(last, state, fitted, self._track))
         return tuple(self._late)
 
     def _known(
@@ -215,14 +228,21 @@ class Tracker:
         )
 
     def _lost(self, why: str) -> None:
-        self._track, self._why = None, why
+        self._track, self._catching, self._why = None, None, why
 
-    def _answer(self) -> "tuple[Answer | None, _Sent | None]":
+    def _needed_from(self) -> int | None:
+        """Number of the first frame that is still needed."""
+        if self._catching is not None:
+            return self._catching.at.index
+        return None if self._sent is None else self._sent.index
+
+    def _answer(self, now: RecentFrame) -> "tuple[Answer | None, _Sent | None]":
         """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
         sent = self._sent
         if sent is None:
             return None, None
-        ready = sent.answer.done() if self._options.live else self._index >= sent.due
+        due = now.index >= sent.due or now.time_s >= sent.due_s
+        ready = sent.answer.done() if self._options.live else due
         if not ready:
             if self._track is None and not self._options.live:
                 # What would be waited for in one go when it is due is waited for a little at each frame.
@@ -255,24 +275,29 @@ class Tracker:
         if fitted is None:
             self._why = f"LOST: {begun.why}"
             return None
-        return self._caught_up(begun, since) if self._options.live else self._begun(begun, since, fitted)
+        if self._options.live:
+            return self._caught_up(begun, since)
+        self._catching = _Catching(track=begun, at=since[0], fitted=fitted)
+        return self._caught_up_by(self._options.catch_up)
 
-    def _begun(self, track: FlowTrack, since: Sequence[RecentFrame], fitted: FittedPose) -> FittedPose | None:
-        """The track from a localised frame, the first of `since`, to the one at hand, frame by frame.
+    def _caught_up_by(self, most: int) -> FittedPose | None:
+        """Carry the track that was found through `most` more frames; the pose if that is all there are.
 
         Where it breaks, the frames before have their poses all the same.
         """
-        state: TrackState = "relocalised"
-        for before, after in pairwise(since):
-            self._late.append(self._known(before, state, fitted, track))
-            state = "tracking"
-            followed = track.follow(before, after)
+        catching = self._catching
+        assert catching is not None
+        for before, after in pairwise(self._frames.since(catching.at.index)[: most + 1]):
+            self._late.append(self._known(before, catching.state, catching.fitted, catching.track))
+            followed = catching.track.follow(before, after)
             if followed is None:
-                self._lost(f"LOST: {track.why}")
+                self._lost(f"LOST: {catching.track.why}")
                 return None
-            fitted = followed
-        self._track = track
-        return fitted
+            catching.at, catching.fitted, catching.state = after, followed, "tracking"
+        if catching.at is not self._frames.last:
+            return None
+        self._track, self._catching = catching.track, None
+        return catching.fitted
 
     def _caught_up(self, track: FlowTrack, since: Sequence[RecentFrame]) -> FittedPose | None:
         """Live: the track from the first of `since` to the frame at hand, soon or in the background.
@@ -283,7 +308,7 @@ class Tracker:
         steps, most = len(since) - 1, self._options.live_steps
         if most < steps < self._behind:
             self._behind = steps
-            self._hand_over(since[-1].index, self._pool.submit(carried, track, since), due=self._index + 1)
+            self._hand_over(since[-1].index, self._pool.submit(carried, track, since))
             return None
         self._behind = _FAR
         rows = np.linspace(0, steps, min(steps, most) + 1).round().astype(np.int64)
@@ -297,35 +322,49 @@ class Tracker:
         self._track = track
         return fitted
 
-    def _search(self, gray: NDArray[np.uint8]) -> None:
+    def _search(self, now: RecentFrame) -> None:
         """Have this frame localised, if the thread is free."""
         if self._sent is not None:
             return
-        self._behind = _FAR
-        answer = self._pool.submit(self._finder.find, gray.copy(), self._request_now(), self._options)
-        self._hand_over(self._index, answer, due=self._index + self._options.lost_answer_after)
+        self._behind, options = _FAR, self._options
+        answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_now(), options)
+        due = (now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s)
+        self._hand_over(now.index, answer, due)
 
-    def _send_keyframe(self, gray: NDArray[np.uint8], fitted: FittedPose, track: FlowTrack) -> None:
+    def _send_keyframe(self, now: RecentFrame, fitted: FittedPose, track: FlowTrack) -> None:
         """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
         options = self._options
         if self._sent is not None:
             return
         few = len(track.landmarks) < options.few_landmarks * options.landmarks
         early = options.keyframe_every - min(options.keyframe_soonest, options.keyframe_every)
-        if self._index < self._next_keyframe - (early if few else 0):
+        in_frames = now.index >= self._next_keyframe - (early if few else 0)
+        if not in_frames and now.time_s < self._next_keyframe_s:
             return
         assert self._camera is not None
         answer = self._pool.submit(
-            track.ground.match, gray.copy(), self._camera, fitted.cam_from_local, options
+            track.ground.match, now.gray.copy(), self._camera, fitted.cam_from_local, options
         )
-        self._hand_over(self._index, answer, due=self._index + options.answer_after)
-        self._next_keyframe = self._index + options.keyframe_every
+        due = (now.index + options.answer_after, now.time_s + options.answer_after_s)
+        self._hand_over(now.index, answer, due)
+        self._next_keyframe = now.index + options.keyframe_every
+        self._next_keyframe_s = now.time_s + options.keyframe_every_s
 
-    def _hand_over(self, index: int, answer: "Future[Any]", due: int) -> None:
-        self._sent = _Sent(index=index, due=due, answer=answer)
+    def _hand_over(
+        self, index: int, answer: "Future[Any]", due: tuple[int, float] = (_FAR, float("inf"))
+    ) -> None:
+        self._sent = _Sent(index=index, due=due[0], due_s=due[1], answer=answer)
 
     def _request_now(self) -> LocaliseRequest:
         if not self._found:
             return self._request
         # What was known of the first frame is not known of one after a loss.
         return replace(self._request, camera=self._camera, prior=None)
+
+
+def _frames_kept(options: TrackOptions) -> int:
+    """Frames since the one that the thread has, and those that come while a track catches up with them."""
+    if options.live:
+        return options.live_frames
+    meanwhile = -(-options.lost_answer_after // (options.catch_up - 1))
+    return 2 + max(options.answer_after, options.lost_answer_after + meanwhile)

@@ -32,7 +32,7 @@ from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import WEST_M, anchored_database
 from tests.support.planar_map import field_texture, view
 
-_OPTIONS = TrackOptions(keyframe_every=4, answer_after=4, lost_answer_after=6, min_matches=20)
+_OPTIONS = TrackOptions(keyframe_every=4, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
 _FRAMES, _CUT = 44, range(20, 24)
 
 
@@ -179,6 +179,61 @@ def test_a_film_that_ends_before_the_answer_has_its_poses(
         for i, gray in enumerate(film[:9]):
             tracker.track(gray, i / 30.0)
         assert not tracker.finish()
+
+
+def test_a_found_track_catches_up_a_few_frames_at_a_time(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray]
+) -> None:
+    """No frame waits for all of them, and the poses are those of one that does."""
+    slowly = replace(_OPTIONS, catch_up=3)
+    at_once: dict[int, TrackedFrame] = {}
+    late: dict[int, TrackedFrame] = {}
+    with (
+        Tracker(MapFinder(areas), CAMERA, slowly) as slow,
+        Tracker(MapFinder(areas), CAMERA, _OPTIONS) as fast,
+    ):
+        for i, gray in enumerate(film[:12]):
+            now, then = slow.track(gray, i / 30.0), fast.track(gray, i / 30.0)
+            assert len(slow.late) <= 3
+            assert now.state == ("lost" if i < 8 else "relocalised" if i == 8 else "tracking")
+            at_once |= {frame.index: frame for frame in (*fast.late, then) if frame.cam_from_local}
+            late |= {frame.index: frame for frame in (*slow.late, now) if frame.cam_from_local}
+    assert sorted(late) == sorted(at_once) == list(range(12))
+    for i in range(8):
+        found, wanted = late[i].cam_from_local, at_once[i].cam_from_local
+        assert found is not None
+        assert wanted is not None
+        np.testing.assert_array_equal(found.matrix(), wanted.matrix())
+    # The film ends, or the maps are taken back, while it catches up.
+    with Tracker(MapFinder(areas), CAMERA, slowly) as slow:
+        for i, gray in enumerate(film[:8]):
+            slow.track(gray, i / 30.0)
+        assert [frame.index for frame in slow.finish()] == [6, 7]
+    with Tracker(MapFinder(areas), CAMERA, slowly) as slow:
+        for i, gray in enumerate(film[:8]):
+            slow.track(gray, i / 30.0)
+        slow.use(MapFinder(()))
+        assert slow.track(film[8], 8 / 30.0).detail == "LOST: the maps have changed"
+        assert not slow.late
+
+
+def test_pictures_that_come_slowly_are_each_looked_for(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray]
+) -> None:
+    """Flow does not bridge them; each is found before the next but one comes."""
+    rows = list(range(0, 20, 5))
+    found: dict[int, TrackedFrame] = {}
+    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+        for i, row in enumerate(rows):
+            now = tracker.track(film[row], 2.0 * i)
+            found |= {frame.index: frame for frame in (*tracker.late, now) if frame.cam_from_local}
+        found |= {frame.index: frame for frame in tracker.finish()}
+    assert sorted(found) == list(range(len(rows)))
+    area_from_hills = areas[0].area.frame.enu_from(FRAME)
+    for i, frame in found.items():
+        assert frame.cam_from_local is not None
+        off = frame.cam_from_local.center - area_from_hills.act(pose_at(rows[i]).center)
+        assert np.linalg.norm(off) < 0.3
 
 
 def test_where_the_film_begins_says_nothing_after_a_loss(

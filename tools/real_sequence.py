@@ -1,0 +1,115 @@
+"""Real photos played as a film: every frame's pose against a reconstruction of all photos.
+
+    python -m tools.real_sequence --photos FOLDER [--seconds 1] [--work DIR]
+
+1. `featuredb ingest photos` makes a map of every second photo, and in another database one of all of them.
+2. All photos in the order of their names are the frames of a film, `--seconds` apart, which is tracked by the
+   first map as `featuredb track` does: no lens, no positions. Consecutive photos overlap little, so that most
+   frames are looked for anew.
+3. Each frame's pose is compared with that of the reconstruction of all photos, laid on the first map by the
+   cameras of both: a similarity, so that what GPS says of either does not count.
+
+Exit code 0 if every frame is within 1 m or said to be lost, and one at least is not lost.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.simworld.scoring import pose_difference
+from featuredb.store import Database
+from featuredb.video.folder import natural_key
+from ingest.register.gps import similarity_closed_form
+from reloc.localiser import Localiser
+from reloc.tracking.map_ground import MapFinder
+from reloc.tracking.track_video import track_video
+from tools.growth_common import table
+from tools.real_photos import ingest, reference
+
+_NEAR_M = 1.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    names = sorted(
+        (p.name for p in args.photos.iterdir() if p.suffix.lower() in (".jpg", ".jpeg", ".png")),
+        key=natural_key,
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        for name, left_out in (("part", names[1::2]), ("whole", [])):
+            if not (work / name).exists():
+                ingest(work / name, args.photos, left_out, work / "cache")
+        part, whole = reference(work / "part"), reference(work / "whole")
+        moved, off_m = laid_on(whole, part)
+        frames = film_of(args.photos, names, args.seconds, work / "frames")
+        tracked = track_video(str(frames), MapFinder(Localiser.open(Database.open(work / "part")).areas))
+    mapped = {image.name for image in part.images}
+    rows, metres = [], []
+    for name, point in zip(names, tracked.trajectory.points, strict=True):
+        kind = "in the map" if name in mapped else "new"
+        if point.pose is None:
+            rows.append((name, kind, "lost", "", "", point.detail[:60]))
+            continue
+        if name not in moved:
+            rows.append((name, kind, point.state, "", "", "not in the reconstruction"))
+            continue
+        off = pose_difference(
+            part.frame, moved[name], point.pose.epsg, point.pose.utm, point.pose.cam_from_utm_xyzw
+        )
+        metres.append(off.position_m)
+        rows.append((name, kind, point.state, f"{off.position_m:.3f}", f"{off.angle_deg:.3f}", ""))
+    sys.stdout.write(table(rows, ("frame", "photo", "state", "m", "degrees", "why")) + "\n")
+    unknown = sum(row[5] == "not in the reconstruction" for row in rows)
+    lost = sum(row[2] == "lost" for row in rows)
+    middle, largest = (np.median(metres), max(metres)) if metres else (np.nan, np.nan)
+    sys.stdout.write(
+        f"{args.photos}: {len(rows)} frames, {lost} lost, {len(metres)} compared: median {middle:.3f} m, "
+        f"largest {largest:.3f} m; {unknown} with a pose that the reconstruction has not; both "
+        f"reconstructions differ by {off_m:.3f} m at the median camera\n"
+    )
+    return 0 if metres and max(metres) <= _NEAR_M and unknown == 0 else 1
+
+
+def laid_on(whole: FeatureMap, part: FeatureMap) -> tuple[dict[str, Rigid3], float]:
+    """Poses of the whole's images in the part's frame, by name, and the median distance of common cameras."""
+    there = {image.name: image.cam_from_local for image in part.images}
+    both = [image for image in whole.images if image.name in there]
+    here = np.array([image.cam_from_local.center for image in both])
+    wanted = np.array([there[image.name].center for image in both])
+    sim = similarity_closed_form(here, wanted)
+    assert sim is not None
+    off = np.linalg.norm(sim.act(here) - wanted, axis=1)
+    return {image.name: sim.act_on_pose(image.cam_from_local) for image in whole.images}, float(
+        np.median(off)
+    )
+
+
+def film_of(photos: Path, names: Sequence[str], seconds: float, folder: Path) -> Path:
+    """A folder of links to the photos, with their times."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        link = folder / name
+        if not link.is_symlink():
+            link.symlink_to((photos / name).resolve())
+    lines = [f"{seconds * i:.3f}" for i in range(len(names))]
+    (folder / "times.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return folder
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, required=True)
+    parser.add_argument("--seconds", type=float, default=1.0, help="from photo to photo (1)")
+    parser.add_argument("--work", type=Path, default=None, help="keep databases and cache there")
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
