@@ -35,7 +35,9 @@ class MapOverScan:
         """By the maps, or where they know nothing, by the scan; both reasons where that knows nothing."""
         by_map = self.maps.match(gray, camera, pose, options)
         if isinstance(by_map, Keyframe):
-            self.scan.last = by_map.cam_from_local  # where it is looked for on the scan, were it lost
+            self.scan.seen_elsewhere(
+                by_map.cam_from_local
+            )  # where it is looked for on the scan, were it lost
             return replace(by_map, ground=self)
         by_scan = self.scan.match(gray, camera, pose, options)
         if isinstance(by_scan, Keyframe):
@@ -80,7 +82,7 @@ class MapOverScanFinder:
         """By the maps, or where they do not know the frame, by the scan."""
         by_map = self._maps.find(gray, request, options)
         if isinstance(by_map, Keyframe):
-            self._scan.ground.last = by_map.cam_from_local
+            self._scan.ground.seen_elsewhere(by_map.cam_from_local)
             return replace(by_map, ground=self._ground)
         by_scan = self._scan.find(gray, request, options)
         if isinstance(by_scan, Keyframe):

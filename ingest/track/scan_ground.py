@@ -26,6 +26,7 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import DepthFilterOptions, surface_at
+from ingest.track.keyframe_average import KeyframeAverage
 from reloc.result import LocaliseRequest
 from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
 from reloc.tracking.options import TrackOptions
@@ -65,6 +66,7 @@ class ScanTrackOptions:
         lost_sigma_m, lost_sigma_heading_deg, lost_sigma_tilt_deg: how far a lost camera may be from where it
             was last seen: a second of a drone's flight. From so near a frame of another town is refused
             in 7 s; from three times as far the dense search had not ended after four minutes.
+        fade, max_chi2: see `KeyframeAverage`.
         first, near: how a frame is registered from a prior, and from the track.
         depth: which depths are believed.
     """
@@ -77,6 +79,8 @@ class ScanTrackOptions:
     lost_sigma_m: float = 5.0
     lost_sigma_heading_deg: float = 8.0
     lost_sigma_tilt_deg: float = 3.0
+    fade: float = 0.75
+    max_chi2: float = 20.1
     first: FrameOptions = field(default_factory=_first_options)
     near: FrameOptions = field(default_factory=_near_options)
     depth: DepthFilterOptions = field(default_factory=DepthFilterOptions)
@@ -98,6 +102,7 @@ class ScanGround:
         self._cloud, self._scan_id, self._epsg, self._options = cloud, scan_id, epsg, options
         self._source: RenderSource = available_sources(cloud)[0]
         self._covariances: list[FloatArray] = []  # by number of the keyframe, local axes
+        self._average = KeyframeAverage(options.fade, options.max_chi2)
         self._shown: deque[FloatArray] = deque(maxlen=_SHOWN_KEYFRAMES)
         self.last: Rigid3 | None = None
 
@@ -121,11 +126,10 @@ class ScanGround:
         found = fit_near(gray, camera, prior, self._cloud, self._source, own.near)
         if isinstance(found, NoNearFit):
             return Unmatched(reason=found.reason, detail=found.message)
-        return self.registered(
-            gray, camera, found.pose.cam_from_local, found.covariance, found.source, options
-        )
+        averaged = self._average.add(pose, found.pose.cam_from_local, found.covariance)
+        return self._landmarks(gray, camera, averaged, found.covariance, found.source, options)
 
-    def registered(
+    def found(
         self,
         gray: NDArray[np.uint8],
         camera: Camera,
@@ -134,11 +138,29 @@ class ScanGround:
         source: RenderSource,
         options: TrackOptions,
     ) -> Keyframe | Unmatched:
-        """Landmarks of a frame (h, w) that was registered: its corners, on the scan's surface.
+        """Landmarks of a frame (h, w) that was registered without a track.
 
         Args:
             covariance: (6, 6) of the left perturbation of the pose. source: by which it was registered.
         """
+        self._average.begin(pose, covariance)
+        return self._landmarks(gray, camera, pose, covariance, source, options)
+
+    def seen_elsewhere(self, pose: Rigid3) -> None:
+        """The camera's pose by something else than the scan."""
+        self.last = pose
+        self._average.end()
+
+    def _landmarks(
+        self,
+        gray: NDArray[np.uint8],
+        camera: Camera,
+        pose: Rigid3,
+        covariance: FloatArray,
+        source: RenderSource,
+        options: TrackOptions,
+    ) -> Keyframe | Unmatched:
+        """The frame's corners, on the scan's surface."""
         self._source = source
         pixels = _corners(gray, self._options)
         rendering = render(self._cloud, camera, pose, RenderOptions(attributes=False, threads=1))
@@ -218,7 +240,7 @@ class ScanFinder:
         found = register_frame(gray, request.camera, prior, self._cloud, self._options.first)
         if found.cam_from_local is None or found.covariance is None or found.source is None:
             return Unmatched(reason=str(found.reason), detail=found.message)
-        return self.ground.registered(
+        return self.ground.found(
             gray, request.camera, found.cam_from_local, found.covariance, found.source, options
         )
 

@@ -32,7 +32,7 @@ from tests.support.planar_map import field_texture, view
 pytest.importorskip("laspy")
 pytest.importorskip("numba")
 
-_OPTIONS = TrackOptions(keyframe_every=6, answer_after=4, lost_answer_after=6, min_matches=20)
+_OPTIONS = TrackOptions(keyframe_every=6, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
 _FRAMES, _CUT = 40, range(20, 24)
 _EAST_M = -24.0  # where the survey of the map and the scan overlap
 
