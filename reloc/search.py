@@ -219,13 +219,23 @@ def camera_hypotheses(
         return [(request.camera, "request")]
     if request.camera_key:
         camera = area.camera_for_key(request.camera_key)
-        if camera is not None and (camera.width, camera.height) == (features.width, features.height):
+        if camera is not None and (camera.width, camera.height) != (features.width, features.height):
+            camera = _resampled(camera, features.width, features.height)  # frames of films are made smaller
+        if camera is not None:
             return [(camera, "map")]
     longer = max(features.width, features.height)
     if request.exif_focal_px:
         return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]
     # 1.2 times the longer side (a 45-degree lens) only starts the estimate.
     return [(Camera.from_focal(features.width, features.height, 1.2 * longer), "estimated")]
+
+
+def _resampled(camera: Camera, width: int, height: int) -> Camera | None:
+    """The lens for another size of its pictures; None where that is of another shape."""
+    try:
+        return camera.scaled_to(width, height)
+    except InvalidValueError:
+        return None
 
 
 def _best_pose(

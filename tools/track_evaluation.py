@@ -97,8 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     results: dict[str, Tracked] = {}
     figure, axes = plt.subplots(len(args.films), 1, figsize=(9, 2.4 * len(args.films)), squeeze=False)
     for name, ax in zip(args.films, axes[:, 0], strict=True):
-        options = film_options(name, args.size, args.seed, args.frames)
-        folder = write_film(args.out / f"film-{name}", options, args.workers, _progress(name))
+        options = film_options(name, args.size, args.seed, args.frames, args.readout_ms)
+        rolling = f"-{args.readout_ms:g}ms" if args.readout_ms else ""
+        folder = write_film(args.out / f"film-{name}{rolling}", options, args.workers, _progress(name))
         truth = read_film_truth(folder)
         camera = None if args.lens == "estimated" else truth.camera
         finder = finder_on(args.on, database, truth, args.seed)
@@ -165,12 +166,18 @@ def coarse_start(pose: Rigid3, seed: int) -> FramePrior:
     )
 
 
-def film_options(name: str, size: str, seed: int, frames: int) -> FilmOptions:
+def film_options(name: str, size: str, seed: int, frames: int, readout_ms: float = 0.0) -> FilmOptions:
     world = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
     extent = (32.0, 26.0) if size == "short" else PathOptions().half_extent_m
     path = PathOptions(seed=seed, style="jerky" if name == "jerky" else "smooth", half_extent_m=extent)
     cut = tuple(round(share * frames) for share in _CUT) if name == "cut" else None
-    return FilmOptions(world=world, path=path, frames=frames, cut=None if cut is None else (cut[0], cut[1]))
+    return FilmOptions(
+        world=world,
+        path=path,
+        frames=frames,
+        cut=None if cut is None else (cut[0], cut[1]),
+        readout_s=1e-3 * readout_ms,
+    )
 
 
 def errors(tracked: TrackedVideo, truth: FilmTruth) -> tuple[FloatArray, FloatArray]:
@@ -296,6 +303,9 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--films", nargs="+", choices=_FILMS, default=list(_FILMS))
     parser.add_argument("--lens", choices=("known", "estimated"), default="known")
     parser.add_argument("--on", choices=("map", "scan", "both"), default="map", help="what is tracked by")
+    parser.add_argument(
+        "--readout-ms", type=float, default=0.0, help="rolling shutter, from the first row to the last (0)"
+    )
     parser.add_argument("--overlay", action="store_true", help="track once more and draw it")
     parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)

@@ -14,6 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ _FORMAT = 1  # raised when the same options give other files
 _OTHER_SEED = 1000
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
 _GLITTER_HZ = 5.0  # how often the water looks new
+_BANDS = 12  # of rows, where they are not exposed at once
 _CHUNK = 4  # frames that travel to a process at a time
 
 
@@ -56,6 +58,8 @@ class FilmOptions:
         frames, rate_hz: of the film. width, height: pixels.
         shutter_s: how long a frame is exposed; what moves meanwhile is blurred. samples: pictures of that
             time that are averaged; each looks through other parts of the pixels.
+        readout_s: rolling shutter, from the first row of a frame to the last; a frame's time and true pose
+            are those of its middle row. 0: all rows at once.
         ev_range: stops between the darkest and the brightest exposure, which follow each other slowly, and
             leap once where the flight is jerky.
         cut: frames (first, last + 1) that show another town, or None.
@@ -72,6 +76,7 @@ class FilmOptions:
     height: int = 720
     shutter_s: float = 1 / 100
     samples: int = 4
+    readout_s: float = 0.0
     ev_range: float = 0.7
     cut: tuple[int, int] | None = None
     gps_sigma_m: float = 1.5
@@ -79,7 +84,13 @@ class FilmOptions:
     sensor: SensorOptions = field(default_factory=SensorOptions)
 
     def __post_init__(self) -> None:
-        if not (self.frames > 0 and self.rate_hz > 0 and self.samples > 0 and self.shutter_s >= 0):
+        if not (
+            self.frames > 0
+            and self.rate_hz > 0
+            and self.samples > 0
+            and self.shutter_s >= 0
+            and 0 <= self.readout_s <= 1 / self.rate_hz
+        ):
             raise InvalidValueError(f"FilmOptions: value out of range in {self}")
         if self.cut is not None and not 0 <= self.cut[0] < self.cut[1] <= self.frames:
             raise InvalidValueError(
@@ -105,6 +116,8 @@ class FilmOptions:
         """Digest of what the files depend on."""
         options = asdict(self)
         options["world"].pop("workers")
+        if options["readout_s"] == 0:
+            options.pop("readout_s")  # films that were written before there was one
         return hashlib.sha256(json.dumps([_FORMAT, options], sort_keys=True).encode()).hexdigest()
 
 
@@ -200,9 +213,12 @@ def film_frame(options: FilmOptions, frame: int) -> Image8:
     for k in range(n):
         moment_s = time_s + options.shutter_s * ((k + 0.5) / n - 0.5)
         camera = _shifted(options.camera, k, n)
-        rendered = render(faces, scene.ellipsoids, camera, path.pose(moment_s), look=look, supersample=1)
-        assert rendered.rgb is not None
-        light += rendered.rgb
+        for top, bottom, later_s in _bands(options):
+            part = _rows(camera, top, bottom)
+            pose = path.pose(moment_s + later_s)
+            rendered = render(faces, scene.ellipsoids, part, pose, look=look, supersample=1)
+            assert rendered.rgb is not None
+            light[top:bottom] += rendered.rgb
     light *= 2.0 ** _exposure_ev(options, time_s) / n
     sensor = replace(options.sensor, exposure_sigma_ev=0.0, white_balance_sigma=0.0)
     return expose(np.clip(light, 0, 255).astype(np.uint8), rng, sensor)
@@ -213,6 +229,23 @@ def _shifted(camera: Camera, k: int, n: int) -> Camera:
     shift = np.array([(k + 0.5) / n, ((k * 0.618034) + 0.5 / n) % 1.0]) - 0.5
     f, cx, cy, *rest = camera.params
     return replace(camera, params=(f, cx - float(shift[0]), cy - float(shift[1]), *rest))
+
+
+def _bands(options: FilmOptions) -> list[tuple[int, int, float]]:
+    """Rows (first, last + 1) that are exposed together, and how much later than the frame's middle."""
+    if options.readout_s == 0:
+        return [(0, options.height, 0.0)]
+    edges = np.linspace(0, options.height, _BANDS + 1).round().astype(int).tolist()
+    return [
+        (top, bottom, options.readout_s * (0.5 * (top + bottom) / options.height - 0.5))
+        for top, bottom in pairwise(edges)
+    ]
+
+
+def _rows(camera: Camera, top: int, bottom: int) -> Camera:
+    """The camera of some rows of the picture."""
+    f, cx, cy, *rest = camera.params
+    return replace(camera, height=bottom - top, params=(f, cx, cy - top, *rest))
 
 
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:

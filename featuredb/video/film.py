@@ -85,6 +85,8 @@ class VideoInfo:
         creation_time: when the recording was started by the camera's clock, or None. Said to be UTC, but
             many action cameras write their local time.
         make, model: of the camera, where a tag says so.
+        camera_key: by which maps know the lens (featuredb.features.exif), "" where the camera is not named.
+        focal_px: by EXIF of a folder's pictures, for the full size; None: not said.
         encoder: program or chip that made the stream, where a tag says so.
         tags: all text tags of the container and the stream by lower-case name, the stream's first.
         live: whether the source cannot be read twice or sought in: URLs, devices, pipes.
@@ -105,6 +107,8 @@ class VideoInfo:
     creation_time: datetime | None = None
     make: str | None = None
     model: str | None = None
+    camera_key: str = ""
+    focal_px: float | None = None
     encoder: str | None = None
     tags: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
     live: bool = False

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, VideoError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, probe
+from featuredb.features.exif import ExifInfo, read_exif
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})
@@ -77,6 +78,7 @@ class FolderVideo(Video):
         self._closed = False
         length_s = timed[-1][0] - timed[0][0]
         rate = (len(timed) - 1) / length_s if length_s > 0 else options.fps
+        exif = self._exif()
         super().__init__(
             VideoInfo(
                 name=folder.name or str(folder),
@@ -87,6 +89,10 @@ class FolderVideo(Video):
                 frame_rate_hz=rate,
                 duration_s=len(timed) / rate if rate else None,
                 frame_count=len(timed),
+                make=exif.make or None,
+                model=exif.model or None,
+                camera_key=exif.camera_key,
+                focal_px=exif.focal_px,
                 codec="pictures",
                 container="folder",
             )
@@ -144,6 +150,12 @@ class FolderVideo(Video):
         except ImageError as error:
             raise self._broken(name, error) from error
         return header.width, header.height
+
+    def _exif(self) -> ExifInfo:
+        """What the first picture says of its camera, if one in the middle and the last say the same."""
+        names = [self._timed[i][1] for i in sorted({0, len(self._timed) // 2, len(self._timed) - 1})]
+        said = [read_exif((self._folder / name).read_bytes()) for name in names]
+        return said[0] if len({exif.camera_key for exif in said}) == 1 else ExifInfo()
 
     def _broken(self, name: str, error: ImageError) -> VideoError:
         return VideoError(f"{self._folder.name}: the picture {name} cannot be read: {error}")

@@ -11,7 +11,7 @@ import cv2
 
 from featuredb.errors import VideoError
 from featuredb.geometry.camera import Camera
-from featuredb.video.film import VideoOptions
+from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from reloc.result import LocaliseRequest
@@ -115,6 +115,7 @@ def track_video(
             video = stack.enter_context(open_video(source, settings))
             info = video.info
             lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
+            request = _with_film(request or LocaliseRequest(), info)
             tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
             writer = None
             if overlay is not None:
@@ -178,6 +179,14 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
         points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
     if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].pose is not None:
         points[-1] = replace(points[-1], state="tracking")
+
+
+def _with_film(request: LocaliseRequest, info: VideoInfo) -> LocaliseRequest:
+    """What is known of the frames, with what the film says of its camera where nothing else was said."""
+    if request.camera_key is not None or request.exif_focal_px is not None:
+        return request
+    focal_px = None if info.focal_px is None else info.focal_px * info.frame_width / info.width
+    return replace(request, camera_key=info.camera_key or None, exif_focal_px=focal_px)
 
 
 def _resized(camera: Camera, width: int, height: int) -> Camera:

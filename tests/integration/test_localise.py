@@ -152,9 +152,13 @@ def test_the_camera_of_the_map_is_borrowed_by_its_key(
     assert result.pose is not None
     assert (result.pose.camera, result.pose.camera_source) == (CAMERA, "map")
     assert pose_errors(result, POSE)[0] < 0.05
-    # Of another size it is another picture; so is another key.
+    # Frames of a film are the same picture, made smaller.
     half = cv2.resize(photo, (320, 240), interpolation=cv2.INTER_AREA)
-    for image, key in ((half, "DJI"), (photo, "GoPro")):
+    smaller = localise(half, LocaliseRequest(camera_key="DJI", exif_focal_px=400.0), [area])
+    assert smaller.pose is not None
+    assert (smaller.pose.camera, smaller.pose.camera_source) == (CAMERA.scaled_to(320, 240), "map")
+    # Of another shape it is another picture; so is another key.
+    for image, key in ((photo[:360], "DJI"), (photo, "GoPro")):
         result = localise(image, LocaliseRequest(camera_key=key), [area])
         assert result.pose is None or result.pose.camera_source == "estimated"
 

@@ -87,6 +87,26 @@ def test_frames_show_the_town_from_where_the_truth_says(folder: Path) -> None:
     assert misfit(0.0) < 0.6 * min(misfit(0.3), misfit(-0.3))
 
 
+def test_a_rolling_shutter_shows_its_rows_one_after_the_other() -> None:
+    """The first rows are those of half a frame before, the middle ones those of the frame's own time."""
+    still = replace(_OPTIONS, frames=20, cut=None, ev_range=0.0, rate_hz=10.0)
+    between = replace(still, frames=40, rate_hz=20.0)
+    rolling = replace(still, readout_s=0.1)
+
+    def grey(options: FilmOptions, frame: int) -> np.ndarray:
+        picture = cv2.cvtColor(film_frame(options, frame), cv2.COLOR_RGB2GRAY)
+        return cv2.GaussianBlur(picture, (0, 0), 1.0).astype(float)
+
+    def apart(a: np.ndarray, b: np.ndarray, rows: slice) -> float:
+        return float(np.abs(a[rows] - b[rows]).mean())
+
+    rolled, now, before, after = grey(rolling, 8), grey(still, 8), grey(between, 15), grey(between, 17)
+    top, middle, bottom = slice(0, 8), slice(86, 94), slice(172, 180)
+    assert apart(rolled, before, top) < 0.8 * apart(rolled, now, top) < 0.8 * apart(rolled, after, top)
+    assert apart(rolled, now, middle) < 0.7 * min(apart(rolled, before, middle), apart(rolled, after, middle))
+    assert apart(rolled, after, bottom) < 0.7 * apart(rolled, now, bottom)
+
+
 def test_telemetry_lies_where_the_camera_was_a_moment_before(folder: Path) -> None:
     telemetry = read_telemetry(folder / TELEMETRY_FILE)
     truth = read_film_truth(folder)
@@ -124,6 +144,8 @@ def test_jerky_flights_turn_faster_and_both_keep_to_their_place() -> None:
 def test_impossible_films_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="cut"):
         FilmOptions(frames=10, cut=(5, 20))
+    with pytest.raises(InvalidValueError, match="value out of range"):
+        FilmOptions(frames=10, readout_s=0.1)
     with pytest.raises(InvalidValueError, match="heights_m"):
         PathOptions(heights_m=(5.0, 10.0))
     with pytest.raises(InvalidValueError, match="truth of a simulated film"):

@@ -5,11 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
 from featuredb.video.film import VideoOptions
 from featuredb.video.folder import natural_key
 from featuredb.video.frames import open_video
+from reloc.result import LocaliseRequest
+from reloc.tracking.track_video import _with_film
 from tests.support.films import HEIGHT, WIDTH, overwritten, picture, read, shown
 
 
@@ -133,3 +136,30 @@ def test_large_pictures_of_a_folder_are_made_smaller(tmp_path: Path) -> None:
     assert frame.rgb().shape == (60, 80, 3)
     with pytest.raises(VideoError, match="limit of a side is 100"):
         open_video(folder, VideoOptions(fps=1.0, max_full_side_px=100))
+
+
+def test_a_folder_says_whose_lens_its_pictures_have(tmp_path: Path) -> None:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+
+    def write(index: int, model: str) -> None:
+        exif = Image.Exif()
+        exif[ExifTags.Base.Make.value], exif[ExifTags.Base.Model.value] = "Maker", model
+        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm.value] = 36
+        Image.fromarray(picture(index)).save(folder / f"{index}.jpg", exif=exif)
+
+    for index in range(3):
+        write(index, "One")
+    with open_video(folder, VideoOptions(fps=1.0, max_side_px=80)) as video:
+        info = video.info
+    assert (info.make, info.model) == ("Maker", "One")
+    assert info.camera_key.startswith(f"maker|one|{WIDTH}x{HEIGHT}|f")
+    assert info.focal_px == pytest.approx(np.hypot(WIDTH, HEIGHT) * 36 / 43.2666, rel=0.01)
+    known = _with_film(LocaliseRequest(), info)  # of the frames, which are smaller
+    assert known.camera_key == info.camera_key
+    assert known.exif_focal_px == pytest.approx(info.focal_px * 80 / WIDTH)
+    assert _with_film(LocaliseRequest(exif_focal_px=7.0), info) == LocaliseRequest(exif_focal_px=7.0)
+    write(2, "Two")
+    with open_video(folder, VideoOptions(fps=1.0)) as video:
+        assert (video.info.camera_key, video.info.focal_px) == ("", None)
+        assert _with_film(LocaliseRequest(), video.info) == LocaliseRequest()
