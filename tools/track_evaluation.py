@@ -13,8 +13,8 @@
 Prints for each film the errors of position and orientation over all frames with a pose, the first and the
 last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film shows another
 town, and how long it took to be found again; frames per second, the longest time between two poses, and the
-machine's load, since a busy machine's speed is not the program's. Writes track.json and errors.png. Exit code
-0 if everything holds.
+machine's load, since a busy machine's speed is not the program's. Writes track.json, errors.png, and for each
+film the errors of its axes. Exit code 0 if everything holds.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
 from featuredb.simworld.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from featuredb.simworld.flight_path import PathOptions
@@ -46,6 +46,7 @@ from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
+from reloc.tracking.trajectory_plot import plot_png
 from tools.anchor_simworld import anchored, featuredb
 from tools.growth_common import Verdict, conclude, say, table
 
@@ -112,6 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         metres, degrees = errors(tracked, truth)
         results[name] = judge_film(tracked, truth, metres, degrees, overlay_hz, load)
         _draw(ax, name, truth, metres)
+        drawing = plot_png(tracked.trajectory, axis_errors(tracked, truth))
+        (args.out / f"axes-{name}.png").write_bytes(drawing)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
     figure.tight_layout()
     figure.savefig(args.out / "errors.png", dpi=110)
@@ -195,6 +198,20 @@ def errors(tracked: TrackedVideo, truth: FilmTruth) -> tuple[FloatArray, FloatAr
         )
         metres[point.index], degrees[point.index] = off.position_m, off.angle_deg
     return metres, degrees
+
+
+def axis_errors(tracked: TrackedVideo, truth: FilmTruth) -> FloatArray:
+    """(n, 6) of every frame, east-north-up: rotation (rad) before displacement (m); NaN without a pose."""
+    off = np.full((len(tracked.trajectory.points), 6), np.nan)
+    for row, point in enumerate(tracked.trajectory.points):
+        true = truth.cam_from_local[point.index]
+        if point.pose is None or true is None:
+            continue
+        center = truth.frame.enu_from_utm(point.pose.utm, point.pose.epsg)
+        grid = truth.frame.grid_from_enu(center, point.pose.epsg)
+        rotation = matrix_from_quaternion(point.pose.cam_from_utm_xyzw) @ grid
+        off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
+    return off
 
 
 def judge_film(

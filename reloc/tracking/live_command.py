@@ -38,7 +38,8 @@ def register(subparsers: Any) -> None:
         type=Path,
         default=[],
         metavar="FILE",
-        help="trajectory of the answered frames: .csv, .tum, .geojson, .kml, .json or .srt; may be repeated",
+        help="trajectory of the answered frames: .csv, .tum, .geojson, .kml, .json, .srt or .png; "
+        "may be repeated",
     )
     parser.add_argument(
         "--camera",

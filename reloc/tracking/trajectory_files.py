@@ -1,4 +1,4 @@
-"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, subtitles as DJI's drones write them.
+"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, DJI's subtitles, or a drawing.
 
 The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
 appears whole or not at all.
@@ -35,16 +35,17 @@ CSV_COLUMNS = (
 
 
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
-    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series) or `.srt`.
+    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`, `.png`.
 
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
-    text = _format(path)(trajectory)
+    made = _format(path)(trajectory)
+    content = made if isinstance(made, bytes) else made.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
-        temporary.write_text(text, encoding="utf-8", newline="")
+        temporary.write_bytes(content)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -217,17 +218,25 @@ def srt_text(trajectory: Trajectory) -> str:
     return "\n".join(blocks)
 
 
-_FORMATS: dict[str, Callable[[Trajectory], str]] = {
+def png(trajectory: Trajectory) -> bytes:
+    """From above, and the bounds of each axis over time."""
+    from reloc.tracking.trajectory_plot import plot_png  # matplotlib takes a second to load
+
+    return plot_png(trajectory)
+
+
+_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
     ".csv": csv_text,
     ".tum": tum_text,
     ".geojson": geojson_text,
     ".kml": kml_text,
     ".json": geopose_text,
     ".srt": srt_text,
+    ".png": png,
 }
 
 
-def _format(path: Path) -> Callable[[Trajectory], str]:
+def _format(path: Path) -> Callable[[Trajectory], str | bytes]:
     if path.suffix.lower() not in _FORMATS:
         raise InvalidValueError(
             f"{path.name}: expected a name that ends in {', '.join(_FORMATS)}, found {path.suffix!r}"
