@@ -31,7 +31,7 @@ from ingest.growth.similarity_fit import (
     tolerances_px,
 )
 from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
-from ingest.growth.visibility import VisibilityOptions, visible_parts, witnessed_parts
+from ingest.growth.visibility import ShownParts, VisibilityOptions, shown_parts
 from ingest.photo import Photo
 
 
@@ -130,13 +130,11 @@ def place_by_maps(
     edges = edges_of(model, fit, anchors, used, options.parents, options.fit)
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, anchors.take(np.flatnonzero(used))
-    shows = visible_parts(model, sim, held, areas, frame, options.visibility)
-    witnessed = witnessed_parts(model, sim, held, areas, frame, options.visibility)
-    blind = sorted(
-        {k for k in agree if shows[k] < options.visibility.min_visible}
-        | (set(np.flatnonzero(witnessed < options.visibility.min_witnessed).tolist()) - (own.keys() - agree))
+    shows = shown_parts(model, sim, held, areas, frame, options.visibility)
+    blind = _blind(shows, agree, own.keys() - agree, options.visibility)
+    asked = _ask(
+        model, fit, agree, own, held, shows.existing, edges, photos, frame, on_earth, ranked, options
     )
-    asked = _ask(model, fit, agree, own, held, shows, edges, photos, frame, on_earth, ranked, options)
     refusal = gates.first_refusal(asked)
     placement = MapsPlacement(
         reason=refusal.reason if refusal else None,
@@ -147,12 +145,18 @@ def place_by_maps(
         covariance=fit.covariance + on_earth,
         agreeing=tuple(int(model.rows[k]) for k in sorted(agree)),
         disagreeing=tuple(int(model.rows[k]) for k in sorted(set(own) - agree)),
-        blind=tuple(int(model.rows[k]) for k in blind),
+        blind=tuple(int(model.rows[k]) for k in sorted(blind)),
         edges=edges,
         residual_rms_m=_rms(_center_offsets(model, fit.local_from_sfm, own, agree)),
         gates=asked,
     )
     return Held(placement=placement, anchors=anchors, fit=fit, used=used)
+
+
+def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: VisibilityOptions) -> set[int]:
+    """Photos that show too little of what they should; those that disagree are left out as such."""
+    little = set(np.flatnonzero(shows.witnessed < options.min_witnessed).tolist()) - disagree
+    return little | {k for k in agree if shows.existing[k] < options.min_visible}
 
 
 def localised_rows(model: Model, own: Mapping[int, LocalisedPhoto]) -> list[int]:

@@ -115,7 +115,7 @@ class MapsPlacement:
         covariance: (7, 7) with the uncertainty of the existing maps on Earth, or None.
         agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
             that do not. Photos that no map localises are in neither.
-        blind: of the agreeing, those that show too little of what existing maps say they should.
+        blind: those that show too little of what existing maps, or the others' points, say they should.
         edges: one for each existing map that holds it, most shared points first.
         residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
         gates: every gate with its figure, in the order they were asked.

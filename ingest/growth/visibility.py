@@ -12,6 +12,7 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
@@ -45,55 +46,52 @@ class VisibilityOptions:
     min_witnesses: int = 3
 
 
-def visible_parts(
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShownParts:
+    """For each photo the share of the image's parts that should show points where it does so.
+
+    NaN for photos that should show hardly any. Photos that no map localised are asked as well.
+
+    Attributes:
+        existing: (k,) of the points of existing maps.
+        witnessed: (k,) of these and of the points of the model itself that several photos bear out.
+    """
+
+    existing: FloatArray
+    witnessed: FloatArray
+
+
+def shown_parts(
     model: Model,
     sim: Sim3,
     held: Anchors,
     areas: Sequence[Area],
     frame: LocalFrame,
     options: VisibilityOptions,
-) -> FloatArray:
-    """(k,) for each photo: share of the image's parts that should show existing points where it does so.
-
-    NaN for photos that should show hardly any. Photos that no map localised are asked as well.
+) -> ShownParts:
+    """What the photos of a placed model show of what they should.
 
     Args:
         sim: frame from the model's.
         held: pixels of the model's photos in which existing points are seen, where the placement has them.
     """
-    return np.array(
-        [
-            _share(model, k, held.pixels[held.photo_of == k], _existing(model, k, sim, areas, frame), options)
-            for k in range(len(model.rows))
-        ]
-    )
-
-
-def witnessed_parts(
-    model: Model,
-    sim: Sim3,
-    held: Anchors,
-    areas: Sequence[Area],
-    frame: LocalFrame,
-    options: VisibilityOptions,
-) -> FloatArray:
-    """(k,) as `visible_parts`, and asked for the points of the model itself that several photos bear out."""
     often = model.track_lengths() >= options.min_witnesses
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
-    shares = np.full(len(model.rows), np.nan)
+    existing, witnessed = np.full(len(model.rows), np.nan), np.full(len(model.rows), np.nan)
     for k, pose in enumerate(model.cam_from_sfm):
         camera = model.cameras[int(model.camera_of[k])]
+        expected, seen = _existing(model, k, sim, areas, frame), held.pixels[held.photo_of == k]
+        existing[k] = _share(camera, seen, expected, options)
         own = often & in_view(model.xyz, cones, camera, pose, EXPECTED_DEG)
-        expected = np.concatenate(
-            [_existing(model, k, sim, areas, frame), camera.project(pose.act(model.xyz[own]))]
-        )
         seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]
-        seen = np.concatenate(
-            [held.pixels[held.photo_of == k], camera.project(pose.act(model.xyz[seen_own]))]
+        witnessed[k] = _share(
+            camera,
+            np.concatenate([seen, camera.project(pose.act(model.xyz[seen_own]))]),
+            np.concatenate([expected, camera.project(pose.act(model.xyz[own]))]),
+            options,
         )
-        shares[k] = _share(model, k, seen, expected, options)
-    logger.debug("share of what should be seen: %s", np.round(shares, 2).tolist())
-    return shares
+    logger.debug("shares of what should be seen: %s", np.round(witnessed, 2).tolist())
+    return ShownParts(existing=existing, witnessed=witnessed)
 
 
 def _existing(model: Model, k: int, sim: Sim3, areas: Sequence[Area], frame: LocalFrame) -> FloatArray:
@@ -108,8 +106,7 @@ def _existing(model: Model, k: int, sim: Sim3, areas: Sequence[Area], frame: Loc
     return np.concatenate(pixels)
 
 
-def _share(model: Model, k: int, seen: FloatArray, expected: FloatArray, options: VisibilityOptions) -> float:
+def _share(camera: Camera, seen: FloatArray, expected: FloatArray, options: VisibilityOptions) -> float:
     if len(expected) < options.min_points:
         return float("nan")
-    camera = model.cameras[int(model.camera_of[k])]
     return agreement(seen, expected, camera.width, camera.height)
