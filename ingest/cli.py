@@ -118,7 +118,10 @@ def _add_making(parser: argparse.ArgumentParser) -> None:
         "height, with a camera that is known well",
     )
     group.add_argument(
-        "--max-features", type=int, default=None, help="per photo; default: 12000, fewer match faster"
+        "--max-features",
+        type=int,
+        default=None,
+        help="per photo; default: 12000, for films 5000; fewer match faster",
     )
     group.add_argument("--max-side", type=int, default=None, metavar="PX", help="default: 1600")
     group.add_argument(
