@@ -27,8 +27,8 @@ class PoseHypothesis:
         camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
         inliers: (m,) bool over the matches that it was estimated from.
         prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
-        lens_information: (4,) inverse variances of what was known of the lens beforehand (focal length,
-            principal point, radial) where it was estimated with the pose, else None.
+        lens_information: (n,) inverse variances of what was known of the lens beforehand, in the order of
+            `reloc.self_calibration.lens_of`, where it was estimated with the pose, else None.
     """
 
     cam_from_local: Rigid3

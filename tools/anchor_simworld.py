@@ -31,6 +31,7 @@ from featuredb.store import Database
 from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from reloc.wire import CameraRequest
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -99,19 +100,31 @@ def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, Fl
     return np.array(metres), np.array(degrees)
 
 
-def ask(database: Database, truth: Truth, photos: Sequence[Path]) -> dict[Path, PoseError | None]:
-    """What a server answers to photos of the world, against the truth; None where it does not."""
+def ask(
+    database: Database, truth: Truth, photos: Sequence[Path], *, lens_known: bool = False
+) -> dict[Path, PoseError | None]:
+    """What a server answers to photos of the world, against the truth; None where it does not.
+
+    Args:
+        lens_known: the true intrinsics go with each photo, as a calibrated camera's do.
+    """
     errors: dict[Path, PoseError | None] = {}
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
         Client(server.endpoints[0]) as client,
     ):
         for path in photos:
-            reply = client.localise(path, timeout_s=60.0)
+            name = f"{path.parent.name}/{path.name}"
+            lens = truth.images[name].camera if lens_known else None
+            camera = (
+                None
+                if lens is None
+                else CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+            )
+            reply = client.localise(path, camera=camera, timeout_s=60.0)
             errors[path] = None
             if reply.utm is not None:
                 utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-                name = f"{path.parent.name}/{path.name}"
                 errors[path] = pose_error(truth, name, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
     return errors
 

@@ -5,7 +5,7 @@
 1. The film `smooth` of `tools.track_evaluation` (kept in DIR/film-smooth), a drone's telemetry beside it.
 2. `featuredb lidar add` of the town's scan; `featuredb ingest video`; `featuredb anchor --auto` of its map.
 3. The map's cameras against the truth; then photos that another drone and other people took of the town, none
-   of which are in the database, are asked of a server.
+   of which are in the database, are asked of a server: with their true lens, and with what EXIF tells.
 
 Photos count that look at what the film saw: those whose view's middle lies within the ground that the map's
 points cover. Writes video_map.json; exit code 0 if everything holds.
@@ -24,11 +24,12 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from featuredb.simworld.scan_world import make_scan_world
+from featuredb.simworld.scoring import PoseError
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
 from ingest.workspace import default_root
 from tools.anchor_simworld import ask, featuredb
-from tools.growth_common import Verdict, conclude, say
+from tools.growth_common import Verdict, conclude
 from tools.track_evaluation import film_options
 
 _KEYFRAMES, _SECONDS = 60, 300.0
@@ -60,12 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     off = keyframe_errors(feature_map, read_film_truth(folder))
     truth = world.world.truth
     photos = [p for group in ("drone", "queries") for p in world.world.images(group)]
-    answers = ask(Database.open(database), truth, looking_at_map(photos, truth, feature_map))
-    metres = np.array([np.inf if e is None else e.position_m for e in answers.values()])
-    for photo, error in answers.items():
-        said = "no answer" if error is None else f"{error.position_m:.3f} m, {error.angle_deg:.3f} degrees"
-        say(f"{photo.parent.name}/{photo.name}: {said}")
-    near, wrong = int((metres <= _NEAR_M).sum()), int(((metres > _WRONG_M) & np.isfinite(metres)).sum())
+    asked = looking_at_map(photos, truth, feature_map)
     verdicts = [
         Verdict(
             name="keyframes",
@@ -83,15 +79,25 @@ def main(argv: Sequence[str] | None = None) -> int:
             text=f"{done - began:.0f} s, of which anchoring {done - ingested:.0f}; {_SECONDS:g} wanted",
             holds=done - began <= _SECONDS,
         ),
-        Verdict(
-            name="photos",
-            text=f"{near} of {len(metres)} within {_NEAR_M} m, {_SHARE:.0%} wanted",
-            holds=near >= _SHARE * len(metres) > 0,
-        ),
-        Verdict(name="wrong", text=f"{wrong} answers over {_WRONG_M:g} m off, none wanted", holds=wrong == 0),
     ]
-    figures = {photo.name: None if e is None else e.position_m for photo, e in answers.items()}
+    figures: dict[str, dict[str, float | None]] = {}
+    for name, lens_known in (("photos of a known lens", True), ("photos with EXIF alone", False)):
+        answers = ask(Database.open(database), truth, asked, lens_known=lens_known)
+        figures[name] = {photo.name: None if e is None else e.position_m for photo, e in answers.items()}
+        verdicts.append(judge_answers(name, list(answers.values())))
     return conclude(args.out, "video_map", verdicts, figures)
+
+
+def judge_answers(name: str, errors: Sequence[PoseError | None]) -> Verdict:
+    """Whether enough photos are near enough, and none is far off."""
+    metres = np.array([np.inf if e is None else e.position_m for e in errors])
+    near, wrong = int((metres <= _NEAR_M).sum()), int(((metres > _WRONG_M) & np.isfinite(metres)).sum())
+    return Verdict(
+        name=name,
+        text=f"{near} of {len(metres)} within {_NEAR_M} m, {_SHARE:.0%} wanted; "
+        f"median {np.median(metres):.3f} m; {wrong} over {_WRONG_M:g} m off, none wanted",
+        holds=near >= _SHARE * len(metres) > 0 and wrong == 0,
+    )
 
 
 def keyframe_errors(feature_map: FeatureMap, truth: FilmTruth) -> FloatArray:

@@ -20,10 +20,11 @@ from reloc.acceptance import AcceptanceOptions, agreement
 from reloc.candidates import IndexedArea
 from reloc.localise import Localised, localise_features
 from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
-from reloc.options import LocaliseOptions
+from reloc.options import LocaliseOptions, PoseOptions
 from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
 from reloc.result import LocaliseRequest
 from reloc.search import pairs
+from reloc.self_calibration import LensPriors
 
 _LOG = logging.getLogger(__name__)
 
@@ -51,7 +52,9 @@ class LocaliseEachOptions:
     """
 
     localise: LocaliseOptions = field(
-        default_factory=lambda: LocaliseOptions(acceptance=AcceptanceOptions(min_spread=0.0))
+        default_factory=lambda: LocaliseOptions(
+            pose=PoseOptions(lens=LensPriors(whole_lens=False)), acceptance=AcceptanceOptions(min_spread=0.0)
+        )
     )
     max_features: int = 4000
     retry_without_geotag: bool = True

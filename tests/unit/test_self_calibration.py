@@ -16,9 +16,11 @@ from reloc.pose import PoseHypothesis, pose_uncertainty, refine_pose
 from reloc.self_calibration import (
     Calibrated,
     LensPriors,
+    _with_lens,
     calibrate,
     covariance_from_information,
     joint_jacobians,
+    lens_of,
 )
 from tests.support.scenes import box_points, looking_at
 
@@ -63,13 +65,72 @@ def test_a_deep_scene_tells_pose_and_lens(guess: float) -> None:
     start = shifted(pose, np.array([2.0, -1.0, 1.5]), np.array([0.02, -0.03, 0.01]))
     found = run(pixels, points, start, guess, 0.7)
     assert np.linalg.norm(found.cam_from_local.center - pose.center) < 0.02
-    assert found.cam_from_local.angle_to_deg(pose) < 0.01
-    np.testing.assert_allclose(found.camera.params[0], 900.0, atol=0.5)
-    np.testing.assert_allclose(found.camera.params[1:3], TRUE.params[1:3], atol=0.2)
-    assert found.camera.params[3] == pytest.approx(0.03, abs=1e-3)
-    np.testing.assert_allclose(
-        found.lens_information, 1 / np.array([0.7 * guess, 10, 10, PRIORS.radial]) ** 2
+    assert found.cam_from_local.angle_to_deg(pose) < 0.03
+    assert found.camera.model == "OPENCV"
+    lens = lens_of(found.camera)
+    np.testing.assert_allclose(lens[0], 900.0, atol=0.5)
+    np.testing.assert_allclose(lens[1:3], TRUE.params[1:3], atol=0.6)
+    np.testing.assert_allclose(lens[3:], [0.03, 0.0, 0.0, 0.0, 0.0], atol=2e-3)
+    known = [
+        0.7 * guess,
+        10,
+        10,
+        PRIORS.radial,
+        PRIORS.aspect,
+        PRIORS.second_radial,
+        *[PRIORS.tangential] * 2,
+    ]
+    np.testing.assert_allclose(found.lens_information, 1 / np.array(known) ** 2)
+    simple = calibrate(
+        pixels,
+        points,
+        start,
+        Camera.from_focal(WIDTH, HEIGHT, guess),
+        guess,
+        0.7,
+        0.6,
+        replace(PRIORS, whole_lens=False),
     )
+    assert simple.camera.model == "SIMPLE_RADIAL"
+    np.testing.assert_allclose(simple.camera.params, TRUE.params, atol=0.5)
+    np.testing.assert_allclose(simple.lens_information, found.lens_information[:4])
+
+
+def test_a_lens_with_more_than_one_coefficient_is_told_whole() -> None:
+    """What one radial coefficient leaves over passes for another focal length, far beyond what is claimed."""
+    rng = np.random.default_rng(8)
+    lens = Camera(
+        model="OPENCV",
+        width=WIDTH,
+        height=HEIGHT,
+        params=(750.0, 751.0, 501.0, 399.0, -0.07, 0.05, 1e-3, -8e-4),
+    )
+    count = 3000
+    off_m: dict[bool, list[float]] = {True: [], False: []}
+    squared: dict[bool, list[float]] = {True: [], False: []}
+    for _ in range(10):
+        points = rng.uniform([-38, -30, 0], [38, 30, 0.3], (count, 3))
+        points[: count // 10, 2] = 6.0  # a few roofs, seen from above
+        pixels = _seen(lens, points, NADIR) + rng.normal(0, 0.3, (count, 2))
+        for whole in (True, False):
+            options = replace(PoseOptions(), lens=replace(PRIORS, whole_lens=whole))
+            start = PoseHypothesis(
+                cam_from_local=NADIR,
+                camera=Camera.from_focal(WIDTH, HEIGHT, 754.0),
+                camera_source="exif",
+                inliers=np.ones(count, dtype=bool),
+                prior_focal_px=754.0,
+            )
+            found = refine_pose(pixels, points, start, options)
+            rows = found.inliers
+            nothing = np.zeros((int(rows.sum()), 3, 3))
+            said = pose_uncertainty(pixels[rows], points[rows], nothing, found, options).covariance[3:, 3:]
+            off = found.cam_from_local.center - NADIR.center
+            off_m[whole].append(float(np.linalg.norm(off)))
+            squared[whole].append(float(off @ np.linalg.solve(said, off)))
+    assert np.mean(off_m[True]) < 0.5 * np.mean(off_m[False])
+    assert np.mean(squared[True]) < 5.0  # 3 in theory
+    assert np.mean(squared[False]) > 2.0 * np.mean(squared[True])
 
 
 def test_wrong_matches_hardly_move_it() -> None:
@@ -179,19 +240,26 @@ def test_degenerate_input_comes_back_finite(kind: str) -> None:
     assert 0 < found.camera.focal_px < 1e5
 
 
-def test_closed_derivatives_against_finite_differences() -> None:
-    camera = replace(TRUE, params=(900.0, 506.0, 395.0, -0.2))
+@pytest.mark.parametrize(
+    "camera",
+    [
+        replace(TRUE, params=(900.0, 506.0, 395.0, -0.2)),
+        replace(TRUE, model="OPENCV", params=(900.0, 905.0, 506.0, 395.0, -0.2, 0.06, 3e-3, -2e-3)),
+    ],
+)
+def test_closed_derivatives_against_finite_differences(camera: Camera) -> None:
     points = box_points(np.random.default_rng(6), 20)
     by_point, joint = joint_jacobians(camera, SLANTED, points)
     numeric_point, numeric_pose = pixel_jacobians(camera, SLANTED, points)
     np.testing.assert_allclose(by_point, numeric_point, rtol=1e-5, atol=1e-4)
     np.testing.assert_allclose(joint[:, :, :6], numeric_pose, rtol=1e-5, atol=1e-3)
-    for i, step in enumerate((0.01, 0.01, 0.01, 1e-5)):
-        ends = []
-        for sign in (1, -1):
-            params = list(camera.params)
-            params[i] += sign * step
-            ends.append(replace(camera, params=tuple(params)).project(SLANTED.act(points)))
+    lens = lens_of(camera)
+    assert joint.shape[2] == 6 + len(lens)
+    np.testing.assert_allclose(_with_lens(camera, lens).params, camera.params)
+    for i, step in enumerate((0.01, 0.01, 0.01, *[1e-5] * 5)[: len(lens)]):
+        away = np.zeros(len(lens))
+        away[i] = step
+        ends = [_with_lens(camera, lens + sign * away).project(SLANTED.act(points)) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(joint[:, :, 6 + i], expected, rtol=1e-5, atol=1e-5)
 

@@ -20,6 +20,7 @@ from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.acceptance import independent_inliers, log_nfa
 from reloc.options import PoseOptions
 from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+from reloc.self_calibration import LensPriors
 
 MatchKind = Literal["upright", "oriented", "dense"]
 
@@ -149,7 +150,8 @@ def pose_options(views: FrameViews) -> PoseOptions:
     side = max(views.camera.width, views.camera.height)
     by_scan = views.spacing_full_px / side
     tolerance = float(np.clip(by_scan, options.tolerance_rel, options.max_tolerance_rel))
-    return PoseOptions(tolerance_rel=tolerance, seed=options.seed)
+    # A frame on a scan has too few matches for more of a lens.
+    return PoseOptions(tolerance_rel=tolerance, lens=LensPriors(whole_lens=False), seed=options.seed)
 
 
 def joined_pools(pools: Sequence[Pool]) -> Pool:
