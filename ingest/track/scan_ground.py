@@ -39,19 +39,22 @@ _SHOWN_KEYFRAMES = 4
 
 # A film's frames are small and often near to what they show: at a pixel for each point of the scan most have
 # too few pieces to say anything. In frames of the simulated flight, half a metre between the points and
-# 50 m away, 57 to 67 % of the pieces agree at poses that were fitted to from 0.3 m off, and 8 % at most at
-# those fitted to from 8 m off; of a town with the same streets 26 to 28 % do.
-_CONFIRM = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.45)
+# 50 m away, 38 to 63 % of the pieces agree at poses that were fitted to from 0.3 m off
+# (`tools/scan_keyframes.py`), and 8 % at most at those fitted to from 8 m off; of a town with the same
+# streets 26 to 28 % do. A frame that a track leads to is asked for what lies between. One that is looked for over
+# metres has more chances to be at a wrong place: with 30 % one of that town was believed.
+_CONFIRM_FIRST = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.45)
+_CONFIRM_NEAR = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.33)
 
 
 def _first_options() -> FrameOptions:
-    return FrameOptions(confirm=_CONFIRM, threads=1)
+    return FrameOptions(confirm=_CONFIRM_FIRST, threads=1)
 
 
 def _near_options() -> FrameOptions:
     # From some pixels off the last round of the dense fit is enough, as often as it moves the pose.
     fit = DenseFitOptions(spacing_px=(3.75,), piece_px=(40,), near_px=(6,), more_rounds=4)
-    return FrameOptions(confirm=_CONFIRM, dense_fit=fit, threads=1)
+    return FrameOptions(confirm=_CONFIRM_NEAR, dense_fit=fit, threads=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
