@@ -154,7 +154,10 @@ class FolderVideo(Video):
     def _exif(self) -> ExifInfo:
         """What the first picture says of its camera, if one in the middle and the last say the same."""
         names = [self._timed[i][1] for i in sorted({0, len(self._timed) // 2, len(self._timed) - 1})]
-        said = [read_exif((self._folder / name).read_bytes()) for name in names]
+        try:
+            said = [read_exif((self._folder / name).read_bytes()) for name in names]
+        except OSError:
+            return ExifInfo()  # whoever comes to that picture says what is wrong with it
         return said[0] if len({exif.camera_key for exif in said}) == 1 else ExifInfo()
 
     def _broken(self, name: str, error: ImageError) -> VideoError:

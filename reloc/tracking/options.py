@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+from featuredb.errors import InvalidValueError
 from reloc.options import LocaliseOptions
 
 
@@ -56,8 +57,8 @@ class TrackOptions:
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
         keyframe_every_s, answer_after_s, lost_answer_after_s: of the film, where that is sooner: pictures
             that come one in a second are each looked for, and not one in twenty.
-        catch_up: frames by which a track that was found comes nearer to the frame at hand with each new one.
-            With all at once one frame waited for 0.18 s.
+        catch_up: frames by which a track that was found comes nearer to the frame at hand with each new one,
+            two or more. With all at once one frame waited for 0.18 s.
         live: answers are taken as soon as they are there, and no frame waits for one. live_frames: that are
             kept meanwhile; 60 are two seconds, and 55 MB at 1280x720. live_steps: frames by which a track
             that was found is carried to the one at hand while a client waits; more are left to the thread.
@@ -89,3 +90,10 @@ class TrackOptions:
     min_matches: int = 30
     max_unconfirmed: int = 3
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)
+
+    def __post_init__(self) -> None:
+        if self.catch_up < 2:
+            raise InvalidValueError(
+                f"TrackOptions.catch_up: expected 2 frames or more, found {self.catch_up}: a track that was "
+                "found would never come to the frame at hand"
+            )
