@@ -43,7 +43,7 @@ class MapGround:
     ) -> Keyframe | Unmatched:
         """Matches of a frame (h, w) whose pose is known to some pixels, and the pose that they give."""
         settings, area = options.localise, self.area
-        features = extract(gray, settings.extractor)
+        features = extract(gray, options.keyframes)
         matches = guided_matches(
             features, area, np.arange(len(area.points), dtype=np.int32), camera, pose, settings.matching
         )

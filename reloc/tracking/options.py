@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
+from featuredb.features.extractor import ExtractorOptions
 from reloc.options import LocaliseOptions
 
 
@@ -38,6 +39,10 @@ class FitOptions:
     reference_side_px: int = 1280
 
 
+def _keyframe_features() -> ExtractorOptions:
+    return ExtractorOptions(max_side_px=800, max_features=1500, oversample=1.0)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackOptions:
     """From frames to poses.
@@ -49,9 +54,8 @@ class TrackOptions:
             followed. least_kept: of those that should be in view of the next frame; a film that is cut to a
             look-alike keeps a few. On the simulated flights smooth frames keep 99 %, turns on the spot of 95
             degrees in 0.8 s 68 % and more; cuts to a town of the same plan kept 10 %, and back 43 %.
-        keyframe_every: frames from one that is matched against the map to the next. On the simulated flights
-            12 and 24 are alike (means of 0.044 and 0.047 m, 0.050 twice), and matching one takes a core as
-            long as following 24 frames.
+        keyframe_every: frames from one that is matched against the map to the next. On a simulated flight of
+            40 s every 18th, 20th and 24th gave means of 0.049, 0.051 and 0.064 m.
         keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.
         answer_after: frames after which the answer to a keyframe is waited for: so the same film gives
             the same poses, however busy the machine is. While the track is lost: `lost_answer_after`.
@@ -64,7 +68,9 @@ class TrackOptions:
             that was found is carried to the one at hand while a client waits; more are left to the thread.
         min_matches: of a keyframe with the map. max_unconfirmed: keyframes in a row without them; then the
             track is lost, however well its old landmarks agree with each other.
-        localise: how a lost track is found again; its extractor is that of keyframes, too.
+        keyframes: features of a keyframe, whose pose is known to some pixels. As many as a query's took twice
+            the time, for which the film waited (50 instead of 72 frames a second), and gave 0.045 m.
+        localise: how a lost track is found again.
     """
 
     flow: FlowOptions = field(default_factory=FlowOptions)
@@ -75,10 +81,10 @@ class TrackOptions:
     min_landmarks: int = 20
     least_share: float = 0.4
     least_kept: float = 0.5
-    keyframe_every: int = 24
+    keyframe_every: int = 20
     keyframe_soonest: int = 6
     few_landmarks: float = 0.5
-    answer_after: int = 12
+    answer_after: int = 10
     lost_answer_after: int = 20
     keyframe_every_s: float = 1.0
     answer_after_s: float = 0.6
@@ -89,6 +95,7 @@ class TrackOptions:
     live_steps: int = 3
     min_matches: int = 30
     max_unconfirmed: int = 3
+    keyframes: ExtractorOptions = field(default_factory=_keyframe_features)
     localise: LocaliseOptions = field(default_factory=LocaliseOptions)
 
     def __post_init__(self) -> None:
