@@ -269,7 +269,7 @@ class Tracker:
         if isinstance(found, FlowTrack):
             return self._caught_up(found, since)
         self._camera = self._camera or found.camera
-        self._ground, self._found = found.ground, True
+        self._ground, self._found, self._unconfirmed = found.ground, True, 0
         begun = FlowTrack(found, since[0], self._camera, self._options)
         fitted = begun.settle()
         if fitted is None:

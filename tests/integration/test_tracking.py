@@ -217,6 +217,18 @@ def test_a_found_track_catches_up_a_few_frames_at_a_time(
         assert not slow.late
 
 
+def test_searches_in_vain_do_not_count_against_the_track_that_is_found(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three keyframes in a row without the map are a loss, whatever was looked for before."""
+    monkeypatch.setattr(MapGround, "match", lambda *_: Unmatched(reason="TOO_FEW_MATCHES", detail="nothing"))
+    other = _render(field_texture(9), pose_at(0), 0)
+    track = tracked(areas, [other] * 18 + film[:16], replace(_OPTIONS, catch_up=3))
+    # Searches at 0, 6 and 12 are in vain; that of 18 is answered at 24, and caught up with at 26.
+    assert [frame.state for frame in track[:27]] == ["lost"] * 26 + ["relocalised"]
+    assert [frame.state for frame in track[27:]] == ["tracking"] * 7
+
+
 def test_pictures_that_come_slowly_are_each_looked_for(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
