@@ -131,6 +131,15 @@ def test_everything_comes_from_this_server(seen: Seen, url: str) -> None:
     assert any(r.endswith("three.module.min.js") for r in seen.requests)
 
 
+def test_a_view_is_pointed_at_right_before_its_first_frame(seen: Seen, url: str) -> None:
+    seen.open(url)
+    spot = "viewer.stage.project(viewer.place.maps[0].photos[0].center)"
+    at_once = seen.of_viewer(f"(viewer.view('space'), {spot})")
+    seen.frame()
+    assert at_once is not None
+    assert at_once == pytest.approx(seen.of_viewer(spot), abs=0.01)
+
+
 def test_points_are_drawn_and_a_map_can_be_hidden(seen: Seen, url: str) -> None:
     seen.open(url)
     seen.only("points")

@@ -146,6 +146,7 @@ export class Stage {
 
   /** Where a spot is seen: pixels of the canvas, or null behind the camera. @returns {?[number, number]} */
   project([x, y, z]) {
+    this.camera.updateMatrixWorld(); // else it is where the last frame drew it, or nowhere before the first
     const seen = new THREE.Vector3(x, y, z).project(this.camera);
     if (seen.z < -1 || seen.z > 1) return null;
     return [((seen.x + 1) / 2) * this.canvas.clientWidth, ((1 - seen.y) / 2) * this.canvas.clientHeight];
@@ -155,6 +156,7 @@ export class Stage {
   unprojectPlan(px, py) {
     const x = (px / this.canvas.clientWidth) * 2 - 1;
     const y = 1 - (py / this.canvas.clientHeight) * 2;
+    this.plan.updateMatrixWorld();
     const spot = new THREE.Vector3(x, y, 0).unproject(this.plan);
     return [spot.x, spot.y];
   }
