@@ -342,6 +342,8 @@ class Tracker:
         if not in_frames and now.time_s < self._next_keyframe_s:
             return
         assert self._camera is not None
+        if few:
+            options = replace(options, keyframes=options.fine_keyframes)
         answer = self._pool.submit(
             track.ground.match, now.gray.copy(), self._camera, fitted.cam_from_local, options
         )
