@@ -10,7 +10,10 @@ from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
-    from reloc.wire import LocaliseReply
+    from reloc.wire import CameraRequest, LocaliseReply
+
+    # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
+    Ask = Callable[[bytes, CameraRequest | None, bool], LocaliseReply]
 
 _NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
 _DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -101,6 +104,19 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
         help="intrinsics by COLMAP's model, e.g. PINHOLE,4000,3000,3200,3200,2000,1500",
     )
+    parser.add_argument(
+        "--camera-sigmas",
+        metavar="SIGMAS...",
+        help="one standard deviation of each of --camera's parameters, OPENCV's or SIMPLE_RADIAL's; without "
+        "it they are exact",
+    )
+    parser.add_argument(
+        "--shared-lens",
+        action="store_true",
+        help="photos of one camera, by EXIF and size, have one lens: it is estimated from all of them, three "
+        "or more, and each is then answered with it; a photo alone hardly tells its focal length from its "
+        "height. Not for zoom lenses without EXIF, nor for cropped pictures",
+    )
     parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
     parser.add_argument("--json", action="store_true", help="print one JSON reply per line")
     parser.add_argument(
@@ -153,23 +169,23 @@ def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
     from reloc.query_arguments import parse_camera, parse_prior
 
-    prior, camera = parse_prior(args.prior), parse_camera(args.camera)
+    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
     if args.contribute and not (args.owner and args.licence):
         raise InvalidValueError(
             "--contribute: expected --owner and --licence, too: whose photos they are, and under what terms"
         )
     with Client(args.connect, args.database, config_path=args.config) as client:
 
-        def ask(data: bytes) -> "LocaliseReply":
+        def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
             return client.localise(
                 data,
                 prior,
-                camera,
+                lens or camera,
                 timeout_s=args.timeout,
-                inliers=args.overlay is not None,
+                inliers=first or args.overlay is not None,
                 exif_prior=args.exif_prior,
                 maps=tuple(args.map) if args.map else None,
-                contribute=args.contribute,
+                contribute=args.contribute and not first,
                 owner=args.owner,
                 licence=args.licence,
                 client_id=args.client_id,
@@ -190,18 +206,19 @@ def _localise(args: argparse.Namespace) -> int:
     from reloc.service.handler import StageClock, answer_query
     from reloc.wire import LocaliseWireRequest, RequestOptions
 
-    request = LocaliseWireRequest(
-        prior=parse_prior(args.prior),
-        camera=parse_camera(args.camera),
-        options=RequestOptions(
-            inliers=args.overlay is not None,
-            exif_prior=args.exif_prior,
-            maps=tuple(args.map) if args.map else None,
-        ),
-    )
+    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
     localiser = Localiser.open(open_database(args))
 
-    def ask(data: bytes) -> "LocaliseReply":
+    def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
+        request = LocaliseWireRequest(
+            prior=prior,
+            camera=lens or camera,
+            options=RequestOptions(
+                inliers=first or args.overlay is not None,
+                exif_prior=args.exif_prior,
+                maps=tuple(args.map) if args.map else None,
+            ),
+        )
         return answer_query(
             data,
             request,
@@ -216,17 +233,18 @@ def _localise(args: argparse.Namespace) -> int:
 
 def _answer_all(
     args: argparse.Namespace,
-    ask: Callable[[bytes], "LocaliseReply"],
+    ask: "Ask",
     other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
 ) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
     from reloc.wording import describe
 
     codes = {0}
+    lenses = _shared_lenses(args, ask) if args.shared_lens else {}
     for path in map(Path, args.image):
         try:
             data = path.read_bytes()
-            reply = ask(data)
+            reply = ask(data, lenses.get(path), False)
             sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
             sys.stdout.flush()
             if reply.status != "localised":
@@ -249,6 +267,41 @@ def _answer_all(
             sys.stderr.write(f"featuredb: {path}: {error}\n")
             codes.add(2)
     return max(codes)
+
+
+def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRequest]":
+    """Ask for each image once, and find the lens that all photos of a camera agree on; says it on stderr."""
+    from featuredb.features.exif import read_exif
+    from reloc.query_arguments import as_arguments
+    from reloc.shared_lens import lenses_of_cameras
+
+    if args.camera is not None:
+        raise InvalidValueError(
+            "--shared-lens: expected no --camera, which is the lens of all photos already"
+        )
+    paths: list[Path] = []
+    keys: list[str] = []
+    replies: list[LocaliseReply] = []
+    for path in map(Path, args.image):
+        try:
+            data = path.read_bytes()
+            reply = ask(data, None, True)
+        except (OSError, FeatureDbError):
+            continue  # said when it is asked for again
+        if reply.camera is not None:
+            exif = read_exif(data)
+            paths.append(path)
+            keys.append(exif.camera_key or f"no EXIF, {reply.camera.width}x{reply.camera.height}")
+            replies.append(reply)
+    lenses = lenses_of_cameras(keys, replies)
+    for key in dict.fromkeys(keys):
+        lens = lenses.get(key)
+        if lens is None:
+            sys.stderr.write(f"{key}: no lens that three photos or more agree on\n")
+        else:
+            said = as_arguments(lens.as_request())
+            sys.stderr.write(f"{key}: lens of {lens.agree.sum()} of {len(lens.agree)} photos: {said}\n")
+    return {p: lenses[k].as_request() for p, k in zip(paths, keys, strict=True) if k in lenses}
 
 
 def _as_json_line(path: Path, reply: "LocaliseReply") -> str:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from featuredb.features.extractor import ExtractorOptions
 from reloc.acceptance import AcceptanceOptions
-from reloc.self_calibration import LensPriors
+from reloc.lens_prior import LensPriors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

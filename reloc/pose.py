@@ -12,6 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.jacobians import pixel_jacobians
+from reloc.lens_prior import LensPrior
 from reloc.options import PoseOptions
 from reloc.self_calibration import calibrate, covariance_from_information, joint_jacobians
 
@@ -27,8 +28,8 @@ class PoseHypothesis:
         camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
         inliers: (m,) bool over the matches that it was estimated from.
         prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
-        lens_information: (n,) inverse variances of what was known of the lens beforehand, in the order of
-            `reloc.self_calibration.lens_of`, where it was estimated with the pose, else None.
+        lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
+            exact, or nothing has been refined yet.
     """
 
     cam_from_local: Rigid3
@@ -36,7 +37,7 @@ class PoseHypothesis:
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
     prior_focal_px: float
-    lens_information: FloatArray | None = None
+    lens_prior: LensPrior | None = None
 
     @property
     def count(self) -> int:
@@ -44,7 +45,7 @@ class PoseHypothesis:
 
     @property
     def focal_is_free(self) -> bool:
-        """Whether the lens was estimated together with the pose."""
+        """Whether the focal length was looked for together with the pose."""
         return self.camera_source in ("exif", "estimated")
 
 
@@ -148,7 +149,7 @@ def refine_pose(
         near = residual < 2.0 * tolerance_px
         if near.sum() < 4:
             break
-        if pose.focal_is_free:
+        if pose.focal_is_free or pose.lens_prior is not None:
             pose = _refine_with_lens(pixels[near], points[near], pose, tolerance_px, options)
         else:
             pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
@@ -179,23 +180,13 @@ def _refine_known_lens(
 def _refine_with_lens(
     pixels: FloatArray, points: FloatArray, start: PoseHypothesis, tolerance_px: float, options: PoseOptions
 ) -> PoseHypothesis:
-    priors = options.lens
-    found = calibrate(
-        pixels,
-        points,
-        start.cam_from_local,
-        start.camera,
-        start.prior_focal_px,
-        priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel,
-        0.25 * tolerance_px,
-        priors,
-    )
-    return replace(
-        start,
-        cam_from_local=found.cam_from_local,
-        camera=found.camera,
-        lens_information=found.lens_information,
-    )
+    prior = start.lens_prior
+    if prior is None:
+        priors = options.lens
+        rel = priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel
+        prior = priors.around(start.camera, start.prior_focal_px, rel)
+    found = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
+    return replace(start, cam_from_local=found.cam_from_local, camera=found.camera, lens_prior=prior)
 
 
 def reprojection_errors(
@@ -237,7 +228,7 @@ def pose_uncertainty(
         pixels, points: (k, 2), (k, 3) of the inliers only.
         point_covariance: (k, 3, 3) in the area's frame.
     """
-    lens = pose.lens_information
+    lens = pose.lens_prior
     jacobians = pixel_jacobians if lens is None else joint_jacobians
     by_point, jacobian = jacobians(pose.camera, pose.cam_from_local, points)
     residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
@@ -249,7 +240,7 @@ def pose_uncertainty(
     # Residuals of zero are test data; the floor is a hundredth of a pixel.
     information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
     if lens is not None:
-        information[6:, 6:] += np.diag(lens)
+        information[6:, 6:] += np.diag(lens.information)
     return PoseUncertainty(
         covariance=covariance_from_information(information)[:6, :6],
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),

@@ -13,6 +13,7 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
+from reloc.lens_prior import LensPrior
 
 Reason = Literal[
     "NO_COVERAGE",
@@ -37,7 +38,9 @@ class LocaliseRequest:
     """What is known of a query besides its pixels.
 
     Attributes:
-        camera: intrinsics for the image's full size, trusted as they are; None: see the next two.
+        camera: intrinsics for the image's full size; None: see the next two.
+        camera_prior: how well its intrinsics are known, which are then estimated with the pose; None:
+            exactly.
         camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
             key lends its calibrated intrinsics.
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
@@ -48,6 +51,7 @@ class LocaliseRequest:
     """
 
     camera: Camera | None = None
+    camera_prior: LensPrior | None = None
     camera_key: str | None = None
     exif_focal_px: float | None = None
     prior: GeoPrior | None = None

@@ -164,6 +164,8 @@ def _poses(
     pose = _best_pose(
         features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
     )
+    if pose is not None:
+        pose = replace(pose, lens_prior=request.camera_prior)
     watch.split("pose")
     if pose is None or pose.count < 4:
         return []

@@ -4,59 +4,24 @@ A photo of a nearly flat scene hardly tells focal length from height, nor a curv
 The priors keep the estimate where lenses are, and the covariance says what the photo could not tell.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from reloc.jacobians import chain_to_pose
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LensPriors:
-    """Standard deviations of what is known of a lens before the photo is looked at.
-
-    Attributes:
-        exif_focal_rel: EXIF focal lengths of well-behaved cameras are within 1 to 3 %, by rounding of the
-            35 mm equivalent mostly; wide, because cropped pictures and video-like modes miss by tens of
-            percent, and one photo alone has to get away from that.
-        unknown_focal_rel: without EXIF: a factor of two either way.
-        radial: k1 of consumer lenses is within a few hundredths, phones' wide lenses up to 0.1.
-        center_rel: principal points of consumer cameras lie within 1 % of the longer side of the middle.
-        whole_lens: OPENCV's parameters are estimated, and not SIMPLE_RADIAL's alone. What a lens has beyond
-            one radial coefficient leaves a pattern that passes for another focal length, and the covariance
-            knows nothing of it: photos of a drone's lens had errors of 0.39 m at the median and 3.2 m at
-            most, their squared normalised errors a mean of 66 where 3 is right; with whole lenses 0.17 m,
-            0.6 m and 2.6 (`tools/video_map.py`).
-        second_radial, tangential, aspect: k2; p1 and p2; the second focal length over the first, less one.
-    """
-
-    exif_focal_rel: float = 0.15
-    unknown_focal_rel: float = 0.7
-    radial: float = 0.04
-    center_rel: float = 0.01
-    whole_lens: bool = True
-    second_radial: float = 0.04
-    tangential: float = 0.001
-    aspect: float = 0.001
+from reloc.lens_prior import LensPrior, lens_of, whole_lens, with_lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Calibrated:
-    """Pose and camera together.
-
-    Attributes:
-        lens_information: (4,) or (8,) inverse variances of what was known beforehand of the lens, in the
-            order of `lens_of`.
-    """
+    """Pose and camera together."""
 
     cam_from_local: Rigid3
     camera: Camera
-    lens_information: FloatArray
 
 
 def calibrate(
@@ -64,12 +29,10 @@ def calibrate(
     points: FloatArray,
     start_pose: Rigid3,
     start_camera: Camera,
-    prior_focal_px: float,
-    focal_sigma_rel: float,
+    prior: LensPrior,
     noise_px: float,
-    priors: LensPriors,
 ) -> Calibrated:
-    """Refine pose and lens: OPENCV's parameters, or SIMPLE_RADIAL's where the priors say so.
+    """Refine pose and lens: as many parameters as the prior has.
 
     Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
 
@@ -81,63 +44,16 @@ def calibrate(
     Raises:
         InvalidValueError: the camera is of another model.
     """
-    pose, count = start_pose, 8 if priors.whole_lens else 4
-    camera = _with_lens(start_camera, _whole(lens_of(start_camera))[:count])
-    longer = max(camera.width, camera.height)
-    prior_mean = np.array([prior_focal_px, camera.width / 2, camera.height / 2, 0.0, 0.0, 0.0, 0.0, 0.0])[
-        :count
-    ]
-    prior_sigma = np.array(
-        [
-            focal_sigma_rel * prior_focal_px,
-            priors.center_rel * longer,
-            priors.center_rel * longer,
-            priors.radial,
-            priors.aspect,
-            priors.second_radial,
-            priors.tangential,
-            priors.tangential,
-        ]
-    )[:count]
-    problem = _Problem(
+    camera = with_lens(start_camera, whole_lens(lens_of(start_camera))[: len(prior.mean)])
+    problem = LensProblem(
         pixels=pixels,
         points=points,
         noise_px=noise_px,
-        trust=(noise_px / _measured_noise_px(pixels, points, pose, camera, noise_px)) ** 2,
-        prior_mean=prior_mean,
-        prior_sigma=prior_sigma,
+        trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
+        prior=prior,
     )
-    pose, camera = _minimise(problem, pose, camera)
-    return Calibrated(cam_from_local=pose, camera=camera, lens_information=1.0 / prior_sigma**2)
-
-
-def lens_of(camera: Camera) -> FloatArray:
-    """Parameters of a lens, (4,) of SIMPLE_RADIAL or (8,) of OPENCV: f, cx, cy, k1, aspect, k2, p1, p2.
-
-    Raises:
-        InvalidValueError: the camera is of another model.
-    """
-    if camera.model == "SIMPLE_RADIAL":
-        return np.asarray(camera.params)
-    if camera.model == "OPENCV":
-        fx, fy, cx, cy, k1, k2, p1, p2 = camera.params
-        return np.array([fx, cx, cy, k1, fy / fx - 1.0, k2, p1, p2])
-    raise InvalidValueError(
-        f"calibrate: expected a SIMPLE_RADIAL or an OPENCV camera, found one that is {camera.model}"
-    )
-
-
-def _whole(lens: FloatArray) -> FloatArray:
-    """(8,) with what a SIMPLE_RADIAL lens has not."""
-    return np.concatenate([lens, np.zeros(8 - len(lens))])
-
-
-def _with_lens(camera: Camera, lens: FloatArray) -> Camera:
-    """A camera of the same pictures with these parameters, in the order of `lens_of`."""
-    if len(lens) == 4:
-        return replace(camera, model="SIMPLE_RADIAL", params=tuple(lens))
-    f, cx, cy, k1, aspect, k2, p1, p2 = lens
-    return replace(camera, model="OPENCV", params=(f, f * (1.0 + aspect), cx, cy, k1, k2, p1, p2))
+    pose, camera = _minimise(problem, start_pose, camera)
+    return Calibrated(cam_from_local=pose, camera=camera)
 
 
 def joint_jacobians(
@@ -148,7 +64,7 @@ def joint_jacobians(
     In closed form: pixel = (f, f (1 + aspect)) d(u, v) + c with (u, v) = (x, y) / z and Brown's distortion d.
     """
     lens = lens_of(camera)
-    focal, _, _, k1, aspect, k2, p1, p2 = _whole(lens)
+    focal, _, _, k1, aspect, k2, p1, p2 = whole_lens(lens)
     in_camera = cam_from_local.act(points)
     depth = in_camera[:, 2]
     uv = in_camera[:, :2] / depth[:, None]
@@ -186,7 +102,7 @@ def covariance_from_information(information: FloatArray) -> FloatArray:
     return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
 
 
-def _measured_noise_px(
+def measured_noise_px(
     pixels: FloatArray, points: FloatArray, pose: Rigid3, camera: Camera, noise_px: float
 ) -> float:
     """Deviation of one coordinate by the median residual; between a tenth and twice what is normal."""
@@ -198,7 +114,7 @@ def _measured_noise_px(
     return float(np.clip(np.median(error) / 1.1774, 0.1 * noise_px, 2.0 * noise_px))
 
 
-def _minimise(problem: "_Problem", pose: Rigid3, camera: Camera) -> tuple[Rigid3, Camera]:
+def _minimise(problem: "LensProblem", pose: Rigid3, camera: Camera) -> tuple[Rigid3, Camera]:
     """Levenberg-Marquardt. Cauchy weights make its steps too short, so longer ones are tried too."""
     damping = 1e-4
     cost = problem.cost(pose, camera)
@@ -223,7 +139,7 @@ def _minimise(problem: "_Problem", pose: Rigid3, camera: Camera) -> tuple[Rigid3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _System:
+class NormalEquations:
     """Normal equations of one Levenberg-Marquardt step: (6 + n, 6 + n) and (6 + n,)."""
 
     information: FloatArray
@@ -231,23 +147,25 @@ class _System:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Problem:
+class LensProblem:
     """Measurements and priors; parameters are pose (6), then the lens as in `lens_of`."""
 
     pixels: FloatArray
     points: FloatArray
     noise_px: float
     trust: float  # of a pixel: variance that noise_px stands for over the measured one
-    prior_mean: FloatArray
-    prior_sigma: FloatArray
+    prior: LensPrior
 
     def cost(self, pose: Rigid3, camera: Camera) -> float:
         """Half the Cauchy loss in units of the noise plus half the priors' chi-square."""
+        return self.cost_of_pixels(pose, camera) + prior_cost(self.prior, camera)
+
+    def cost_of_pixels(self, pose: Rigid3, camera: Camera) -> float:
+        """Half the Cauchy loss in units of the noise."""
         residual = camera.project(pose.act(self.points)) - self.pixels
         squared = np.sum(residual**2, axis=1) / self.noise_px**2
         squared = np.where(np.isfinite(squared), squared, 1e6)
-        prior = ((lens_of(camera) - self.prior_mean) / self.prior_sigma) ** 2
-        return 0.5 * float(self.trust * np.log1p(squared).sum() + prior.sum())
+        return 0.5 * float(self.trust * np.log1p(squared).sum())
 
     def best_length(self, pose: Rigid3, camera: Camera, step: FloatArray) -> tuple[float, float]:
         """The best of the lengths 1, 2 and 4 of a step, and the cost there."""
@@ -259,8 +177,15 @@ class _Problem:
             length, cost = longer, longer_cost
         return length, cost
 
-    def linearise(self, pose: Rigid3, camera: Camera) -> _System:
-        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2)."""
+    def linearise(self, pose: Rigid3, camera: Camera) -> NormalEquations:
+        """Normal equations of pixels and prior."""
+        system = self.linearise_pixels(pose, camera)
+        system.information[6:, 6:] += np.diag(self.prior.information)
+        system.gradient[6:] += (self.prior.mean - lens_of(camera)) * self.prior.information
+        return system
+
+    def linearise_pixels(self, pose: Rigid3, camera: Camera) -> NormalEquations:
+        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2), of the pixels alone."""
         in_camera = pose.act(self.points)
         # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
         front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
@@ -269,15 +194,27 @@ class _Problem:
         weight = self.trust / (self.noise_px**2 + np.sum(residual**2, axis=1))
         information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
         gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
-        information[6:, 6:] += np.diag(1.0 / self.prior_sigma**2)
-        gradient[6:] += (self.prior_mean - lens_of(camera)) / self.prior_sigma**2
-        return _System(information=information, gradient=gradient)
+        return NormalEquations(information=information, gradient=gradient)
+
+
+def prior_cost(prior: LensPrior, camera: Camera) -> float:
+    """Half the chi-square of a lens under what was known of it."""
+    return 0.5 * float(np.sum(((lens_of(camera) - prior.mean) / prior.sigma) ** 2))
 
 
 def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:
+    return pose_step(pose, delta[:6]), lens_step(camera, delta[6:])
+
+
+def pose_step(pose: Rigid3, delta: FloatArray) -> Rigid3:
+    """A pose moved by a rotation and a displacement (6,) of its centre about the local axes."""
     rotation = pose.rotation @ so3_exp(delta[:3]).T
-    center = pose.center + delta[3:6]
+    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + delta[3:]))
+
+
+def lens_step(camera: Camera, delta: FloatArray) -> Camera:
+    """A lens with other parameters, in the order of `lens_of`."""
     lens = lens_of(camera)
-    moved = lens + delta[6:]
+    moved = lens + delta
     moved[0] = np.clip(moved[0], 0.7 * lens[0], 1.4 * lens[0])  # one step's reach
-    return Rigid3(rotation=rotation, translation=-rotation @ center), _with_lens(camera, moved)
+    return with_lens(camera, moved)

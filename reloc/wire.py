@@ -59,6 +59,7 @@ RequestId = Annotated[str, Field(pattern=r"^[A-Za-z0-9._:-]{1,128}$")]
 Name = Annotated[str, Field(pattern=r"^[^\s\x00-\x1f\x7f-\x9f][^\x00-\x1f\x7f-\x9f]{0,199}$")]
 # Wide enough for any camera; a value outside is a unit mistake or nonsense.
 CameraParam = Annotated[float, Field(ge=-1e6, le=1e6)]
+CameraSigma = Annotated[float, Field(ge=0, le=1e6)]
 Side = Annotated[int, Field(ge=1, le=65_535)]
 Quaternion4 = Annotated[tuple[float, ...], Field(min_length=4, max_length=4)]
 Triple = Annotated[tuple[float, ...], Field(min_length=3, max_length=3)]
@@ -71,12 +72,17 @@ NotNegative = Annotated[float, Field(ge=0)]
 
 
 class CameraRequest(Request):
-    """Intrinsics of the photo by COLMAP's model names; those of another size of the picture are scaled."""
+    """Intrinsics of the photo by COLMAP's model names; those of another size of the picture are scaled.
+
+    `sigmas`: one standard deviation of each parameter, in their order, of an OPENCV or a SIMPLE_RADIAL lens;
+    it is then estimated with the pose, within these. Null: the parameters are exact.
+    """
 
     model: Annotated[str, Field(pattern=r"^[A-Z_]{1,32}$")]
     width: Side
     height: Side
     params: Annotated[tuple[CameraParam, ...], Field(min_length=3, max_length=12)]
+    sigmas: Annotated[tuple[CameraSigma, ...], Field(min_length=4, max_length=8)] | None = None
 
 
 class PriorRequest(Request):

@@ -46,6 +46,12 @@ class TrackOpenRequest(Request):
     camera: CameraRequest | None = None
     prior: PriorRequest | None = None
 
+    @model_validator(mode="after")
+    def _exact_lens(self) -> "TrackOpenRequest":
+        if self.camera is not None and self.camera.sigmas is not None:
+            raise ValueError("camera.sigmas: expected none, since a session holds its lens as it is given")
+        return self
+
 
 class TrackLimits(Answer):
     """Of one frame; those with longer sides than `tracked_side_px` are made smaller by the server."""

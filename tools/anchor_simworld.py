@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
+from featuredb.features.exif import read_exif
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scan_world import ScanWorld, make_scan_world
@@ -31,6 +32,7 @@ from featuredb.store import Database
 from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from reloc.shared_lens import lenses_of_cameras
 from reloc.wire import CameraRequest
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -101,23 +103,35 @@ def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, Fl
 
 
 def ask(
-    database: Database, truth: Truth, photos: Sequence[Path], *, lens_known: bool = False
+    database: Database,
+    truth: Truth,
+    photos: Sequence[Path],
+    *,
+    lens_known: bool = False,
+    lens_shared: bool = False,
 ) -> dict[Path, PoseError | None]:
     """What a server answers to photos of the world, against the truth; None where it does not.
 
     Args:
         lens_known: the true intrinsics go with each photo, as a calibrated camera's do.
+        lens_shared: the lens that the photos of its camera agree on goes with each.
     """
     errors: dict[Path, PoseError | None] = {}
     with (
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
         Client(server.endpoints[0]) as client,
     ):
+        shared = {}
+        if lens_shared:
+            keys = [read_exif(path.read_bytes()).camera_key for path in photos]
+            first = [client.localise(path, timeout_s=60.0, inliers=True) for path in photos]
+            found = {key: lens.as_request() for key, lens in lenses_of_cameras(keys, first).items()}
+            shared = {path: found[key] for path, key in zip(photos, keys, strict=True) if key in found}
         for path in photos:
             name = f"{path.parent.name}/{path.name}"
             lens = truth.images[name].camera if lens_known else None
             camera = (
-                None
+                shared.get(path)
                 if lens is None
                 else CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
             )

@@ -18,13 +18,13 @@ from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.acceptance import AcceptanceOptions, agreement
 from reloc.candidates import IndexedArea
+from reloc.lens_prior import LensPriors
 from reloc.localise import Localised, localise_features
 from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
 from reloc.options import LocaliseOptions, PoseOptions
 from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
 from reloc.result import LocaliseRequest
 from reloc.search import pairs
-from reloc.self_calibration import LensPriors
 
 _LOG = logging.getLogger(__name__)
 

@@ -20,6 +20,7 @@ from featuredb.features.exif import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
+from reloc.lens_prior import LensPrior, known_within
 from reloc.reply import reply_from_result
 from reloc.result import LocaliseRequest
 from reloc.service.source import LocaliserLike
@@ -121,8 +122,11 @@ def localise_request(
     prior = None if wire_request.prior is None else geo_prior(wire_request.prior)
     if prior is None and wire_request.options.exif_prior:
         prior = prior_from_exif(exif)
+    lens = wire_request.camera
+    camera = None if lens is None else _camera(lens, width, height)
     return LocaliseRequest(
-        camera=None if wire_request.camera is None else _camera(wire_request.camera, width, height),
+        camera=camera,
+        camera_prior=None if lens is None or camera is None else _camera_prior(lens, camera),
         camera_key=exif.camera_key or None,
         exif_focal_px=exif.focal_px,
         prior=prior,
@@ -150,6 +154,19 @@ def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
         raise RequestError(
             ErrorCode.BAD_REQUEST, f"camera: {error} (the image has {width}x{height})"
         ) from error
+
+
+def _camera_prior(request: CameraRequest, camera: Camera) -> LensPrior | None:
+    """How well the camera, scaled to the image, is known; None: exactly."""
+    if request.sigmas is None:
+        return None
+    lengths = {"OPENCV": 4, "SIMPLE_RADIAL": 3}.get(camera.model, 0)  # in pixels, which grow with the image
+    try:
+        sigmas = np.array(request.sigmas)
+        sigmas[:lengths] *= camera.width / request.width
+        return known_within(camera, sigmas)
+    except InvalidValueError as error:
+        raise RequestError(ErrorCode.BAD_REQUEST, f"camera.sigmas: {error}") from error
 
 
 def geo_prior(prior: PriorRequest) -> GeoPrior:

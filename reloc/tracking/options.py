@@ -55,11 +55,12 @@ class TrackOptions:
         landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
         columns, rows: of the grid over which they are spread.
         min_landmarks: that agree with a pose; fewer are a lost track. On the simulated flights the mean error
-            grew from 0.04 m with 150 and more to 0.4 m with 60 to 80 and 0.5 m with 40 to 60; the three frames
-            with 20 to 30 were off by 0.5 to 1.2 m, with bounds that said 1 m. least_share: of those that the flow
-            followed. least_kept: of those that should be in view of the next frame; a film that is cut to a
-            look-alike keeps a few. On the simulated flights smooth frames keep 99 %, turns on the spot of 95
-            degrees in 0.8 s 68 % and more; cuts to a town of the same plan kept 10 %, and back 43 %.
+            grew from 0.04 m with 150 and more to 0.4 m with 60 to 80 and 0.5 m with 40 to 60; the three
+            frames with 20 to 30 were off by 0.5 to 1.2 m, with bounds that said 1 m.
+        least_share: of those that the flow followed, that agree. least_kept: of those that should be in view
+            of the next frame; a film that is cut to a look-alike keeps a few. On the simulated flights smooth
+            frames keep 99 %, turns on the spot of 95 degrees in 0.8 s 68 % and more; cuts to a town of the
+            same plan kept 10 %, and back 43 %.
         keyframe_every: frames from one that is matched against the map to the next. On a simulated flight of
             40 s every 18th, 20th and 24th gave means of 0.049, 0.051 and 0.064 m.
         keyframe_soonest: so many frames, where landmarks run out: fewer than `few_landmarks` of those wanted.

@@ -134,6 +134,13 @@ def server(database):
     assert process.stop() == 0
 
 
+def center_error(reply: LocaliseReply, truth: Rigid3) -> float:
+    """Metres."""
+    frame = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
+    found = (reply.utm.easting, reply.utm.northing, reply.utm.height)
+    return float(np.linalg.norm(frame.utm_from_enu(truth.center, EPSG) - found))
+
+
 def assert_pose(reply: LocaliseReply, truth: Rigid3, east_m: float = 0.0) -> None:
     """Against the truth by UTM and rotation, independently of the GeoPose."""
     frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
@@ -167,6 +174,51 @@ def test_localise_command_gives_the_same_answer_without_a_server(server, databas
     assert run("localise", str(database), image, "--camera", CAMERA_TEXT, "--json") == 0
     here = json.loads(capsys.readouterr().out)
     assert {**over_the_wire, "timings_ms": 0, "request_id": 0} == {**here, "timings_ms": 0, "request_id": 0}
+
+
+def test_photos_of_one_camera_share_a_lens(server, database, tmp_path, capsys):
+    """Asked one by one the flat field hardly tells their lens; together their tilts do."""
+    texture = field_texture(1)
+    views = {
+        f"{i}.png": view(4 * i - 8, 6 - 3 * i, 40 + 3 * i, tilt, 70 * i)
+        for i, tilt in enumerate((8, 25, 35, 20, 30))
+    }
+    for name, pose in views.items():
+        (tmp_path / name).write_bytes(png(render(texture, pose)))
+    images = [str(tmp_path / name) for name in views]
+    off, claimed = {}, {}
+    exact = ("--camera", CAMERA_TEXT)
+    for words in (exact, (), ("--shared-lens",)):
+        assert run("localise", str(database), *images, "--json", *words) == 0
+        said = capsys.readouterr()
+        replies = [json.loads(line) for line in said.out.splitlines()]
+        for reply in replies:
+            reply.pop("image")
+        answers = [LocaliseReply.model_validate_json(json.dumps(reply)) for reply in replies]
+        off[words] = [center_error(a, truth) for a, truth in zip(answers, views.values(), strict=True)]
+        claimed[words] = [np.hypot(a.accuracy.horizontal_68_m, a.accuracy.vertical_68_m) for a in answers]
+        assert (np.array(off[words]) < 3 * np.array(claimed[words])).all()
+    assert np.mean(off["--shared-lens",]) < np.mean(off[()])
+    # An estimated lens is not taken for a known one.
+    assert 2 * np.max(claimed[exact]) < np.max(claimed["--shared-lens",]) < np.median(claimed[()])
+    assert "lens of 5 of 5 photos: --camera=OPENCV,640,480," in said.err
+    assert {r["camera"]["source"] for r in replies} == {"request"}
+    # What is printed is taken, and gives the same answer over the wire.
+    words = re.search(r"(--camera=\S+) (--camera-sigmas=\S+)", said.err).groups()
+    assert run("query", images[0], "--connect", server.endpoint, "--json", *words) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["position"] == pytest.approx(replies[0]["position"], abs=1e-5)
+    assert run("localise", str(database), *images[:2], "--json", "--shared-lens") == 0
+    assert "no lens that three photos or more agree on" in capsys.readouterr().err
+
+
+def test_a_shared_lens_and_a_given_one_exclude_each_other(database, photos, capsys):
+    image = str(photos / "a.png")
+    assert run("localise", str(database), image, "--shared-lens", "--camera", CAMERA_TEXT) == 2
+    assert "--shared-lens: expected no --camera" in capsys.readouterr().err
+    sigmas = "--camera-sigmas=1,1,1,1"
+    assert run("localise", str(database), image, "--camera", CAMERA_TEXT, sigmas) == 2
+    assert "OPENCV" in capsys.readouterr().err
 
 
 def test_people_read_utm_degrees_accuracy_and_what_to_try(server, photos, capsys):

@@ -56,7 +56,7 @@ def test_a_known_lens_with_sixty_percent_outliers(seed: int) -> None:
     assert (found.inliers & true).sum() > 0.95 * true.sum()
     assert (found.inliers & ~true).sum() <= 3
     assert found.camera == CAMERA
-    assert found.lens_information is None
+    assert found.lens_prior is None
 
 
 @pytest.mark.parametrize("seed", range(4))

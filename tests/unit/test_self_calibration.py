@@ -11,16 +11,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from reloc.jacobians import pixel_jacobians
+from reloc.lens_prior import LensPriors, lens_of, with_lens
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, pose_uncertainty, refine_pose
 from reloc.self_calibration import (
     Calibrated,
-    LensPriors,
-    _with_lens,
     calibrate,
     covariance_from_information,
     joint_jacobians,
-    lens_of,
 )
 from tests.support.scenes import box_points, looking_at
 
@@ -50,7 +48,7 @@ def run(
     pixels: FloatArray, points: FloatArray, start: Rigid3, focal_px: float, focal_sigma: float
 ) -> Calibrated:
     camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
-    return calibrate(pixels, points, start, camera, focal_px, focal_sigma, 0.6, PRIORS)
+    return calibrate(pixels, points, start, camera, PRIORS.around(camera, focal_px, focal_sigma), 0.6)
 
 
 def shifted(pose: Rigid3, metres: FloatArray, axis_angle: FloatArray) -> Rigid3:
@@ -80,20 +78,13 @@ def test_a_deep_scene_tells_pose_and_lens(guess: float) -> None:
         PRIORS.second_radial,
         *[PRIORS.tangential] * 2,
     ]
-    np.testing.assert_allclose(found.lens_information, 1 / np.array(known) ** 2)
-    simple = calibrate(
-        pixels,
-        points,
-        start,
-        Camera.from_focal(WIDTH, HEIGHT, guess),
-        guess,
-        0.7,
-        0.6,
-        replace(PRIORS, whole_lens=False),
-    )
+    camera = Camera.from_focal(WIDTH, HEIGHT, guess)
+    np.testing.assert_allclose(PRIORS.around(camera, guess, 0.7).sigma, known)
+    prior = replace(PRIORS, whole_lens=False).around(camera, guess, 0.7)
+    np.testing.assert_allclose(prior.sigma, known[:4])
+    simple = calibrate(pixels, points, start, camera, prior, 0.6)
     assert simple.camera.model == "SIMPLE_RADIAL"
     np.testing.assert_allclose(simple.camera.params, TRUE.params, atol=0.5)
-    np.testing.assert_allclose(simple.lens_information, found.lens_information[:4])
 
 
 def test_a_lens_with_more_than_one_coefficient_is_told_whole() -> None:
@@ -153,7 +144,7 @@ def test_a_flat_scene_keeps_the_prior_and_finds_the_valley_from_anywhere() -> No
     for height_m, focal_px in ((40.0, 600.0), (60.0, 900.0), (90.0, 1350.0)):
         start = Rigid3(rotation=NADIR.rotation, translation=[0.0, 0.0, height_m])
         camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
-        found = calibrate(pixels, points, start, camera, 1000.0, 0.15, 0.6, PRIORS)
+        found = calibrate(pixels, points, start, camera, PRIORS.around(camera, 1000.0, 0.15), 0.6)
         assert found.camera.focal_px == pytest.approx(1000.0, rel=0.02)
         ratio = found.cam_from_local.center[2] / found.camera.focal_px
         assert ratio == pytest.approx(60.0 / 900.0, rel=2e-3)
@@ -234,7 +225,7 @@ def test_degenerate_input_comes_back_finite(kind: str) -> None:
     elif kind == "line":
         points = points[0] + np.linspace(0, 1, len(points))[:, None] * [5.0, 2.0, 1.0]
         pixels = TRUE.project(pose.act(points))
-    found = calibrate(pixels, points, pose, camera, 900.0, 0.7, 0.6, PRIORS)
+    found = calibrate(pixels, points, pose, camera, PRIORS.around(camera, 900.0, 0.7), 0.6)
     assert np.isfinite(found.cam_from_local.matrix()).all()
     assert np.isfinite(found.camera.params).all()
     assert 0 < found.camera.focal_px < 1e5
@@ -255,11 +246,11 @@ def test_closed_derivatives_against_finite_differences(camera: Camera) -> None:
     np.testing.assert_allclose(joint[:, :, :6], numeric_pose, rtol=1e-5, atol=1e-3)
     lens = lens_of(camera)
     assert joint.shape[2] == 6 + len(lens)
-    np.testing.assert_allclose(_with_lens(camera, lens).params, camera.params)
+    np.testing.assert_allclose(with_lens(camera, lens).params, camera.params)
     for i, step in enumerate((0.01, 0.01, 0.01, *[1e-5] * 5)[: len(lens)]):
         away = np.zeros(len(lens))
         away[i] = step
-        ends = [_with_lens(camera, lens + sign * away).project(SLANTED.act(points)) for sign in (1, -1)]
+        ends = [with_lens(camera, lens + sign * away).project(SLANTED.act(points)) for sign in (1, -1)]
         expected = (ends[0] - ends[1]) / (2 * step)
         np.testing.assert_allclose(joint[:, :, 6 + i], expected, rtol=1e-5, atol=1e-5)
 
@@ -267,7 +258,7 @@ def test_closed_derivatives_against_finite_differences(camera: Camera) -> None:
 def test_other_models_are_refused() -> None:
     pinhole = Camera(model="PINHOLE", width=10, height=10, params=(9.0, 9.0, 5.0, 5.0))
     with pytest.raises(InvalidValueError, match="SIMPLE_RADIAL"):
-        calibrate(np.zeros((4, 2)), np.ones((4, 3)), NADIR, pinhole, 9.0, 0.1, 1.0, PRIORS)
+        calibrate(np.zeros((4, 2)), np.ones((4, 3)), NADIR, pinhole, PRIORS.around(TRUE, 9.0, 0.1), 1.0)
 
 
 def test_what_the_information_leaves_open_has_a_huge_variance() -> None:

@@ -18,9 +18,9 @@ from ingest.register.frame.star import fan_headings_deg, star_poses, turned_abou
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.acceptance import independent_inliers, log_nfa
+from reloc.lens_prior import LensPriors
 from reloc.options import PoseOptions
 from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
-from reloc.self_calibration import LensPriors
 
 MatchKind = Literal["upright", "oriented", "dense"]
 

@@ -64,11 +64,11 @@ def focal_sigma_rel(
     From the inliers with the residuals' own variance, so many of them counted as one, and what was known
     of the lens beforehand: over flat ground it stays at that.
     """
-    if pose.lens_information is None or len(points) < 6:
+    if pose.lens_prior is None or len(points) < 6:
         return 0.0
     _, jacobian = joint_jacobians(pose.camera, pose.cam_from_local, points)
     residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
     variance = correlated_inliers * max(float(np.mean(residual**2)), 1e-4)
     information = np.einsum("nij,nik->jk", jacobian, jacobian) / variance
-    information[6:, 6:] += np.diag(pose.lens_information)
+    information[6:, 6:] += np.diag(pose.lens_prior.information)
     return float(np.sqrt(covariance_from_information(information)[6, 6]) / pose.camera.focal_px)
