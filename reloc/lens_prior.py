@@ -120,7 +120,7 @@ def lens_of(camera: Camera) -> FloatArray:
         fx, fy, cx, cy, k1, k2, p1, p2 = camera.params
         return np.array([fx, cx, cy, k1, fy / fx - 1.0, k2, p1, p2])
     raise InvalidValueError(
-        f"calibrate: expected a SIMPLE_RADIAL or an OPENCV camera, found one that is {camera.model}"
+        f"expected the parameters of a SIMPLE_RADIAL or an OPENCV lens, found {camera.model}'s"
     )
 
 

@@ -90,6 +90,26 @@ def test_the_request_reaches_the_localiser_as_it_was_meant():
     assert reply.inlier_points.utm[1] == pytest.approx((EASTING + 5.5, NORTHING - 3.25, HEIGHT))
 
 
+def test_how_well_a_camera_is_known_is_of_the_photo_as_it_was_sent():
+    localiser = ScriptedLocaliser(1)
+    lens = (300.0, 303.0, 160.0, 120.0, 0.1, 0.01, 0.001, 0.002)
+    sigmas = (2.0, 2.0, 1.0, 0.5, 0.02, 0.03, 1e-4, 2e-4)
+    whole = CameraRequest(model="OPENCV", width=320, height=240, params=lens, sigmas=sigmas)
+    simple = CameraRequest(
+        model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 160.0, 120.0, 0.1), sigmas=(4, 2, 2, 0.1)
+    )
+    with running_server(localiser) as server, client_of(server) as client:
+        client.localise(photo(), camera=whole)
+        client.localise(photo(), camera=simple)
+    first, second = (request.camera_prior for request in localiser.requests)
+    assert first is not None
+    assert second is not None
+    # Half the size: lengths halve, coefficients do not; the second focal length is a ratio.
+    assert first.mean == pytest.approx([150.0, 80.0, 60.0, 0.1, 0.01, 0.01, 0.001, 0.002])
+    assert first.sigma == pytest.approx([1.0, 0.5, 0.25, 0.02, 0.001, 0.03, 1e-4, 2e-4])
+    assert second.sigma == pytest.approx([2.0, 1.0, 1.0, 0.1])
+
+
 def test_not_localised_is_an_answer_with_a_reason_and_no_pose():
     with (
         running_server(ScriptedLocaliser(1, lambda *_: not_localised(1))) as server,
@@ -196,6 +216,24 @@ def test_a_defect_of_the_localiser_costs_one_query_and_its_details_stay_in_the_l
             b'{"camera": {"model": "LENS", "width": 4, "height": 3, "params": [1, 2, 3]}}',
             "BAD_REQUEST",
             "LENS",
+        ),
+        (
+            b'{"camera": {"model": "PINHOLE", "width": 1600, "height": 1200, "params": [9, 9, 3, 3],'
+            b' "sigmas": [1, 1, 1, 1]}}',
+            "BAD_REQUEST",
+            "camera.sigmas: expected the parameters of a SIMPLE_RADIAL or an OPENCV lens, found PINHOLE",
+        ),
+        (
+            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [9, 3, 3, 0],'
+            b' "sigmas": [1, 1, 1, 1, 1]}}',
+            "BAD_REQUEST",
+            "camera.sigmas: known_within: expected 4 sigmas",
+        ),
+        (
+            b'{"camera": {"model": "SIMPLE_RADIAL", "width": 1600, "height": 1200, "params": [9, 3, 3, 0],'
+            b' "sigmas": [1, 1, -1, 1]}}',
+            "BAD_REQUEST",
+            "camera.sigmas",
         ),
         (b'{"contribute": true, "owner": "A", "licence": "CC0-1.0"}', "UNSUPPORTED", "--contributions on"),
         (b'{"contribute": true}', "BAD_REQUEST", "expected owner and licence"),

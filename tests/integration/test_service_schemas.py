@@ -165,6 +165,15 @@ GOOD_REQUESTS = [
             "params": [3000, 2000, 1500, -0.01],
         }
     },
+    {
+        "camera": {
+            "model": "SIMPLE_RADIAL",
+            "width": 4000,
+            "height": 3000,
+            "params": [3000, 2000, 1500, -0.01],
+            "sigmas": [3, 1.5, 1.5, 0],
+        }
+    },
     {"camera": None, "prior": None, "request_id": None, "contribute": False, "options": {}},
     {"contribute": True, "owner": "A. Person", "licence": "CC-BY-4.0", "client_id": "phone 7"},
     {"contribute": True, "owner": "Ä" * 200, "licence": "x", "client_id": None},
