@@ -273,7 +273,7 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     """Ask for each image once, and find the lens that all photos of a camera agree on; says it on stderr."""
     from featuredb.features.exif import read_exif
     from reloc.query_arguments import as_arguments
-    from reloc.shared_lens import lenses_of_cameras
+    from reloc.shared_lens import lenses_of_cameras, views_of
 
     if args.camera is not None:
         raise InvalidValueError(
@@ -286,14 +286,16 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
         try:
             data = path.read_bytes()
             reply = ask(data, None, True)
-        except (OSError, FeatureDbError):
+        except (OSError, FeatureDbError) as error:
+            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
+                break
             continue  # said when it is asked for again
         if reply.camera is not None:
             exif = read_exif(data)
             paths.append(path)
             keys.append(exif.camera_key or f"no EXIF, {reply.camera.width}x{reply.camera.height}")
             replies.append(reply)
-    lenses = lenses_of_cameras(keys, replies)
+    lenses, asked_with = lenses_of_cameras(keys, views_of(replies))
     for key in dict.fromkeys(keys):
         lens = lenses.get(key)
         if lens is None:
@@ -301,7 +303,7 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
         else:
             said = as_arguments(lens.as_request())
             sys.stderr.write(f"{key}: lens of {lens.agree.sum()} of {len(lens.agree)} photos: {said}\n")
-    return {p: lenses[k].as_request() for p, k in zip(paths, keys, strict=True) if k in lenses}
+    return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
 
 
 def _as_json_line(path: Path, reply: "LocaliseReply") -> str:

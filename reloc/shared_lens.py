@@ -107,18 +107,30 @@ def views_of(replies: Sequence[LocaliseReply]) -> list[LensView | None]:
     return views
 
 
-def lenses_of_cameras(keys: Sequence[str], replies: Sequence[LocaliseReply]) -> dict[str, SharedLens]:
-    """The lens of each camera whose photos agree on one.
+def lenses_of_cameras(
+    keys: Sequence[str], views: Sequence[LensView | None]
+) -> tuple[dict[str, SharedLens], list[CameraRequest | None]]:
+    """The lens of each camera whose photos agree on one, and what each photo (n) is to be asked with.
+
+    A photo that contradicts its camera's lens, or whose lens is known already, is asked with none.
 
     Args:
-        keys: of the photos' cameras. replies: to the photos, with inliers.
+        keys: (n) of the photos' cameras. views: (n) see `views_of`.
     """
-    views: dict[str, list[LensView]] = {}
-    for key, view in zip(keys, views_of(replies), strict=True):
+    rows: dict[str, list[int]] = {}
+    for row, (key, view) in enumerate(zip(keys, views, strict=True)):
         if view is not None:
-            views.setdefault(key, []).append(view)
-    found = {key: shared_lens(of_camera) for key, of_camera in views.items()}
-    return {key: lens for key, lens in found.items() if lens is not None}
+            rows.setdefault(key, []).append(row)
+    lenses: dict[str, SharedLens] = {}
+    asked_with: list[CameraRequest | None] = [None] * len(views)
+    for key, own in rows.items():
+        lens = shared_lens([view for view in (views[row] for row in own) if view is not None])
+        if lens is None:
+            continue
+        lenses[key] = lens
+        for row, agrees in zip(own, lens.agree, strict=True):
+            asked_with[row] = lens.as_request() if agrees else None
+    return lenses, asked_with
 
 
 def shared_lens(

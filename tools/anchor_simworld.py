@@ -32,7 +32,7 @@ from featuredb.store import Database
 from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from reloc.shared_lens import lenses_of_cameras
+from reloc.shared_lens import lenses_of_cameras, views_of
 from reloc.wire import CameraRequest
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -121,12 +121,11 @@ def ask(
         start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
         Client(server.endpoints[0]) as client,
     ):
-        shared = {}
+        shared: dict[Path, CameraRequest | None] = {}
         if lens_shared:
             keys = [read_exif(path.read_bytes()).camera_key for path in photos]
             first = [client.localise(path, timeout_s=60.0, inliers=True) for path in photos]
-            found = {key: lens.as_request() for key, lens in lenses_of_cameras(keys, first).items()}
-            shared = {path: found[key] for path, key in zip(photos, keys, strict=True) if key in found}
+            shared = dict(zip(photos, lenses_of_cameras(keys, views_of(first))[1], strict=True))
         for path in photos:
             name = f"{path.parent.name}/{path.name}"
             lens = truth.images[name].camera if lens_known else None

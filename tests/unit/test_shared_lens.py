@@ -8,7 +8,7 @@ from featuredb.geometry.camera import Camera
 from reloc.lens_prior import LensPriors, known_within, lens_of
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, refine_pose
-from reloc.shared_lens import LensView, shared_lens
+from reloc.shared_lens import LensView, lenses_of_cameras, shared_lens
 from tests.support.scenes import looking_at
 
 WIDTH, HEIGHT = 1000, 800
@@ -85,6 +85,17 @@ def test_a_photo_of_another_lens_is_left_out() -> None:
     assert found is not None
     np.testing.assert_array_equal(found.agree, [True, True, False, True, True, True, True])
     assert found.camera.params[0] == pytest.approx(900.0, abs=2.0)
+
+
+def test_a_photo_that_contradicts_its_cameras_lens_is_not_asked_with_it() -> None:
+    rng = np.random.default_rng(5)
+    other = Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=(990.0, 990.0, *TRUE.params[2:]))
+    (stranger,) = photos(rng, 1, other)
+    views = [*photos(rng, 3, TRUE), stranger, None, *photos(rng, 2, other)]
+    lenses, asked_with = lenses_of_cameras(["a", "a", "a", "a", "a", "b", "b"], views)
+    assert list(lenses) == ["a"]
+    assert [lens is not None for lens in asked_with] == [True] * 3 + [False] * 4
+    assert asked_with[0] == lenses["a"].as_request()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
