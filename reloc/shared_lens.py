@@ -1,7 +1,8 @@
 """One lens of many photos, estimated with all their poses: a photo alone hardly tells it from its height.
 
-Least squares over all photos; each one's pose is eliminated (Schur complement), since only the lens ties
-them. The map's points are held fixed.
+Least squares over all photos, by the residuals, weights and priors of `reloc.self_calibration`; each one's
+pose is eliminated (Schur complement), since only the lens ties them. The map's points are held fixed. COLMAP's
+bundle adjustment has no priors on lenses, which three photos from above may need.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,8 @@ from reloc.wire import CameraRequest, LocaliseReply
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SharedLensOptions:
-    """
+    """When photos have a lens in common.
+
     Attributes:
         least_photos: that agree on a lens.
         max_excess: by how much more a photo's pixels disagree with the common lens than with one of its own:

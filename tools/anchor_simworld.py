@@ -22,18 +22,12 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif import read_exif
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scan_world import ScanWorld, make_scan_world
-from featuredb.simworld.scoring import PoseError, pose_error
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
-from reloc.client import Client
-from reloc.service.options import ServeOptions
-from reloc.service.serve import start_server
-from reloc.shared_lens import lenses_of_cameras, views_of
-from reloc.wire import CameraRequest
+from tools.asked_photos import ask
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -80,7 +74,7 @@ def _tell(name: str, database: Database, truth: Truth, queries: Sequence[Path]) 
     )
     if not queries:
         return
-    errors = [e for e in ask(database, truth, queries).values() if e is not None]
+    errors = [answer.error for answer in ask(database, truth, queries).values() if answer is not None]
     if errors:
         position = np.array([e.position_m for e in errors])
         angle = np.array([e.angle_deg for e in errors])
@@ -100,46 +94,6 @@ def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, Fl
         metres.append(float(np.linalg.norm(pose.center - true.center)))
         degrees.append(pose.angle_to_deg(true))
     return np.array(metres), np.array(degrees)
-
-
-def ask(
-    database: Database,
-    truth: Truth,
-    photos: Sequence[Path],
-    *,
-    lens_known: bool = False,
-    lens_shared: bool = False,
-) -> dict[Path, PoseError | None]:
-    """What a server answers to photos of the world, against the truth; None where it does not.
-
-    Args:
-        lens_known: the true intrinsics go with each photo, as a calibrated camera's do.
-        lens_shared: the lens that the photos of its camera agree on goes with each.
-    """
-    errors: dict[Path, PoseError | None] = {}
-    with (
-        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
-        Client(server.endpoints[0]) as client,
-    ):
-        shared: dict[Path, CameraRequest | None] = {}
-        if lens_shared:
-            keys = [read_exif(path.read_bytes()).camera_key for path in photos]
-            first = [client.localise(path, timeout_s=60.0, inliers=True) for path in photos]
-            shared = dict(zip(photos, lenses_of_cameras(keys, views_of(first))[1], strict=True))
-        for path in photos:
-            name = f"{path.parent.name}/{path.name}"
-            lens = truth.images[name].camera if lens_known else None
-            camera = (
-                shared.get(path)
-                if lens is None
-                else CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
-            )
-            reply = client.localise(path, camera=camera, timeout_s=60.0)
-            errors[path] = None
-            if reply.utm is not None:
-                utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
-                errors[path] = pose_error(truth, name, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
-    return errors
 
 
 def featuredb(*words: str, may_refuse: bool = False) -> int:

@@ -24,11 +24,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from featuredb.simworld.scan_world import make_scan_world
-from featuredb.simworld.scoring import PoseError
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
 from ingest.workspace import default_root
-from tools.anchor_simworld import ask, featuredb
+from tools.anchor_simworld import featuredb
+from tools.asked_photos import Answered, ask
 from tools.growth_common import Verdict, conclude, say
 from tools.track_evaluation import film_options
 
@@ -83,11 +83,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     figures: dict[str, dict[str, float | None]] = {}
     served = Database.open(database)
     for name, answers in (
-        ("photos of a known lens", ask(served, truth, asked, lens_known=True)),
+        ("photos of a known lens", ask(served, truth, asked, lens="known")),
         ("photos with EXIF alone, one by one", ask(served, truth, asked)),
-        ("photos with EXIF alone, of shared lenses", ask(served, truth, asked, lens_shared=True)),
+        ("photos with EXIF alone, of shared lenses", ask(served, truth, asked, lens="shared")),
     ):
-        figures[name] = {photo.name: None if e is None else e.position_m for photo, e in answers.items()}
+        figures[name] = {p.name: None if a is None else a.error.position_m for p, a in answers.items()}
         verdict = judge_answers(name, list(answers.values()))
         if "one by one" in name:
             say(f"{name}: {verdict.text}")  # what a photo alone can tell of its lens is not the map's doing
@@ -96,14 +96,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     return conclude(args.out, "video_map", verdicts, figures)
 
 
-def judge_answers(name: str, errors: Sequence[PoseError | None]) -> Verdict:
+def judge_answers(name: str, answers: Sequence[Answered | None]) -> Verdict:
     """Whether enough photos are near enough, and none is far off."""
-    metres = np.array([np.inf if e is None else e.position_m for e in errors])
+    metres = np.array([np.inf if a is None else a.error.position_m for a in answers])
+    normalised = np.mean([a.normalised for a in answers if a is not None] or [np.nan])
     near, wrong = int((metres <= _NEAR_M).sum()), int(((metres > _WRONG_M) & np.isfinite(metres)).sum())
     return Verdict(
         name=name,
         text=f"{near} of {len(metres)} within {_NEAR_M} m, {_SHARE:.0%} wanted; "
-        f"median {np.median(metres):.3f} m; {wrong} over {_WRONG_M:g} m off, none wanted",
+        f"median {np.median(metres):.3f} m, largest {metres.max():.3f} m, mean squared normalised error "
+        f"{normalised:.1f}; {wrong} over {_WRONG_M:g} m off, none wanted",
         holds=near >= _SHARE * len(metres) > 0 and wrong == 0,
     )
 
