@@ -1,8 +1,8 @@
 """One lens of many photos, estimated with all their poses: a photo alone hardly tells it from its height.
 
 Least squares over all photos, by the residuals, weights and priors of `reloc.self_calibration`; each one's
-pose is eliminated (Schur complement), since only the lens ties them. The map's points are held fixed. COLMAP's
-bundle adjustment has no priors on lenses, which three photos from above may need.
+pose is eliminated (Schur complement), since only the lens ties them. The map's points are held fixed.
+COLMAP's bundle adjustment has no priors on lenses, which three photos from above may need.
 """
 
 from collections.abc import Sequence
