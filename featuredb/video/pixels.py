@@ -30,7 +30,7 @@ _FULL_FROM_LIMITED = np.clip(np.rint((np.arange(256) - 16) * (255.0 / 219.0)), 0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PixelReader:
-    """Makes arrays of the pictures of one film; to be used from one thread at a time.
+    """Makes arrays of the pictures of one film; greys and colours each from one thread at a time.
 
     Attributes:
         width, height: of the result before it is turned, pixels.
@@ -42,7 +42,8 @@ class PixelReader:
     clockwise_deg: int
     # Each keeps its scaler set up for one kind of work; a picture's own one would be set up for each picture.
     _gray: VideoReformatter = field(default_factory=VideoReformatter, repr=False)
-    _smaller: VideoReformatter = field(default_factory=VideoReformatter, repr=False)
+    _gray_yuv: VideoReformatter = field(default_factory=VideoReformatter, repr=False)
+    _rgb_yuv: VideoReformatter = field(default_factory=VideoReformatter, repr=False)
     _rgb: VideoReformatter = field(default_factory=VideoReformatter, repr=False)
 
     def gray(self, picture: av.VideoFrame) -> NDArray[np.uint8]:
@@ -54,7 +55,8 @@ class PixelReader:
         name = picture.format.name
         if name not in _LUMA_PLANE and picture.format.components[0].is_luma:
             # Libav's own grey of these would weigh the colours anew by BT.601, whatever the film's matrix.
-            picture, name = self._smaller_yuv(picture, "yuv420p", _matrix(picture)), "yuv420p"
+            matrix = _matrix(picture)
+            picture, name = self._smaller_yuv(self._gray_yuv, picture, "yuv420p", matrix), "yuv420p"
         if name in _LUMA_PLANE and picture.planes[0].line_size >= picture.width:
             gray = self._luma(picture)
             if name not in _FULL_RANGE and picture.color_range != ColorRange.JPEG:
@@ -72,15 +74,19 @@ class PixelReader:
         """
         matrix = _matrix(picture)
         if picture.format.name in _LUMA_PLANE:  # smaller first, which leaves less to convert: 3 times as fast
-            picture = self._smaller_yuv(picture, None, matrix)
+            picture = self._smaller_yuv(self._rgb_yuv, picture, None, matrix)
         rgb = self._converted(self._rgb, picture, "rgb24", matrix)
         return np.ascontiguousarray(turned(rgb, self.clockwise_deg))
 
     def _smaller_yuv(
-        self, picture: av.VideoFrame, pixel_format: str | None, matrix: Colorspace | None
+        self,
+        reformatter: VideoReformatter,
+        picture: av.VideoFrame,
+        pixel_format: str | None,
+        matrix: Colorspace | None,
     ) -> av.VideoFrame:
         """The picture in its final size, in its own colours: of `matrix`, if it names none."""
-        return self._smaller.reformat(
+        return reformatter.reformat(
             picture,
             self.width,
             self.height,

@@ -1,17 +1,17 @@
 """A film's frames up to its end, whatever ends it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from featuredb.errors import VideoError
-from featuredb.video.film import Video, VideoFrame
+from featuredb.video.film import VideoFrame
 
 
-def until_it_ends(video: Video, trouble: list[str]) -> Iterator[VideoFrame]:
+def until_it_ends(film: Iterable[VideoFrame], trouble: list[str]) -> Iterator[VideoFrame]:
     """The frames, up to where the film cannot be read any more or somebody presses Ctrl-C.
 
     What was tracked until then is not lost with it; without any frame the error is the caller's.
     """
-    frames, read = iter(video), 0
+    frames, read = iter(film), 0
     while True:
         try:
             frame = next(frames)

@@ -52,33 +52,40 @@ def fit_pose(
     still = np.repeat([1.0, 1.0 / depth], 3)
     for _ in range(options.iterations):
         residual, jacobian = _linearised(pose, points, seen, focal)
-        squared = np.einsum("ij,ij->i", residual, residual)
-        weight = np.where(np.isfinite(squared), 1.0 / (1.0 + squared / loss**2), 0.0)
-        weighted = jacobian * weight[:, None, None]
-        normal = np.einsum("nki,nkj->ij", weighted, jacobian)
-        gradient = np.einsum("nki,nk->i", weighted, np.nan_to_num(residual))
+        squared = (residual * residual).sum(axis=0)
+        known = np.isfinite(squared)
+        weight = np.where(known, 1.0 / (1.0 + squared / loss**2), 0.0)
+        weighted = jacobian * weight
+        normal = _product(weighted, jacobian)
         if not _is_determined(normal):
             return None
-        step = -np.linalg.solve(normal, gradient)
+        step = -np.linalg.solve(normal, _product(weighted, np.where(known, residual, 0.0)[None])[:, 0])
         pose = Rigid3.exp(step) @ pose
         if np.abs(step * still).max() < _STILL:
             break
     residual, jacobian = _linearised(pose, points, seen, focal)
-    distance = np.sqrt(np.einsum("ij,ij->i", residual, residual))
+    distance = np.hypot(*residual)
     inlier = np.asarray(distance < options.tolerance_px * scale)
     if inlier.sum() < 4:
         return None
-    variance = np.einsum("ij,ij->", residual[inlier], residual[inlier]) / max(2 * inlier.sum() - 6, 1)
-    normal = np.einsum("nki,nkj->ij", jacobian[inlier], jacobian[inlier])
+    variance = float((distance[inlier] ** 2).sum()) / max(2 * int(inlier.sum()) - 6, 1)
+    agreeing = jacobian[:, :, inlier]
+    normal = _product(agreeing, agreeing)
     if not _is_determined(normal):
         return None
-    covariance = np.linalg.inv(normal) * max(float(variance), 1e-4)
+    covariance = np.asarray(np.linalg.inv(normal) * max(variance, 1e-4), dtype=np.float64)
     return FittedPose(
         cam_from_local=pose,
         inlier=inlier,
-        residual_px=residual,
+        residual_px=np.ascontiguousarray(residual.T),
         covariance=of_camera(pose, covariance),
     )
+
+
+def _product(first: FloatArray, second: FloatArray) -> FloatArray:
+    """(a, b) sums over pixels and axes of (a, 2, n) times (b, 2, n)."""
+    sums: FloatArray = first.reshape(len(first), -1) @ second.reshape(len(second), -1).T
+    return sums
 
 
 def _is_determined(normal: FloatArray) -> bool:
@@ -95,7 +102,7 @@ def _is_determined(normal: FloatArray) -> bool:
 def _linearised(
     pose: Rigid3, points: FloatArray, seen: FloatArray, focal: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (n, 2) in pixels and derivatives (n, 2, 6) by the pose's left perturbation.
+    """Residuals (2, n) in pixels and derivatives (6, 2, n) by the pose's left perturbation.
 
     Points behind the camera have residuals of infinity and no derivatives.
     """
@@ -103,15 +110,14 @@ def _linearised(
     front = z > 1e-6
     inverse = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
     u, v = x * inverse, y * inverse
-    jacobian = np.zeros((len(z), 2, 6))
-    jacobian[:, 0, 0], jacobian[:, 0, 1], jacobian[:, 0, 2] = -u * v, 1.0 + u * u, -v
-    jacobian[:, 0, 3], jacobian[:, 0, 5] = inverse, -u * inverse
-    jacobian[:, 1, 0], jacobian[:, 1, 1], jacobian[:, 1, 2] = -(1.0 + v * v), u * v, u
-    jacobian[:, 1, 4], jacobian[:, 1, 5] = inverse, -v * inverse
-    jacobian *= (focal * front)[:, None, None]
-    residual = np.empty((len(z), 2))
-    residual[:, 0], residual[:, 1] = focal * (u - seen[:, 0]), focal * (v - seen[:, 1])
-    residual[~front | ~np.isfinite(seen).all(axis=1)] = np.inf
+    residual = focal * (np.stack([u, v]) - seen.T)
+    residual[:, ~front | ~np.isfinite(seen).all(axis=1)] = np.inf
+    near, across = focal * inverse, focal * front
+    jacobian = np.zeros((6, 2, len(z)))
+    jacobian[0, 0], jacobian[1, 0], jacobian[2, 0] = across * (-u * v), across * (1.0 + u * u), -across * v
+    jacobian[3, 0], jacobian[5, 0] = near, -near * u
+    jacobian[0, 1], jacobian[1, 1], jacobian[2, 1] = -across * (1.0 + v * v), across * (u * v), across * u
+    jacobian[4, 1], jacobian[5, 1] = near, -near * v
     return residual, jacobian
 
 

@@ -11,6 +11,7 @@ import cv2
 
 from featuredb.errors import VideoError
 from featuredb.geometry.camera import Camera
+from featuredb.video.ahead import ReadAhead
 from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
@@ -23,6 +24,8 @@ from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
 
 _LOG = logging.getLogger(__name__)
+# Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
+_READ_ON = 4
 OnFrame = Callable[[TrackedFrame, TrajectoryPoint], None]
 
 
@@ -45,13 +48,15 @@ class TrackVideoOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackSeconds:
-    """Where the time went, seconds: of the whole run, and in decoding, tracking and drawing.
+    """Where the time went, seconds: the whole run is waiting, tracking and drawing.
 
     Attributes:
+        waiting: for the next frame. decoding: also of frames that were decoded beside the tracking.
         longest_gap: between the poses of two frames.
     """
 
     total: float
+    waiting: float
     decoding: float
     tracking: float
     drawing: float
@@ -105,7 +110,7 @@ def track_video(
     trouble: list[str] = []
     clock = time.perf_counter
     began = last = clock()
-    decoding = drawing = gap = 0.0
+    waiting = drawing = gap = 0.0
     settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
     threads = cv2.getNumThreads()
     # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
@@ -129,9 +134,10 @@ def track_video(
                     )
                 )
             first_s: float | None = None
+            ahead = stack.enter_context(ReadAhead(video))
             mark = clock()
-            for frame in until_it_ends(video, trouble):
-                decoding += clock() - mark
+            for frame in until_it_ends(ahead, trouble):
+                waiting += clock() - mark
                 tracked = tracker.track(frame.gray, frame.time_s)
                 point = point_of(tracked)
                 points.append(point)
@@ -145,6 +151,8 @@ def track_video(
                     picture = draw_frame(frame.rgb(), tracked, point)
                     writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
                     drawing += clock() - now
+                if not tracker.busy:
+                    ahead.read_on(_READ_ON)
                 mark = clock()
             if not points:
                 raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
@@ -159,8 +167,9 @@ def track_video(
         camera=lens,
         seconds=TrackSeconds(
             total=total,
-            decoding=decoding,
-            tracking=total - decoding - drawing,
+            waiting=waiting,
+            decoding=ahead.seconds,
+            tracking=total - waiting - drawing,
             drawing=drawing,
             longest_gap=gap,
         ),

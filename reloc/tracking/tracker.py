@@ -24,7 +24,9 @@ from reloc.tracking.recent import RecentFrame, RecentFrames
 TrackState = Literal["tracking", "relocalised", "lost"]
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize
-_PACE_S = 0.035  # of a search, at each frame that is lost: 20 frames wait for 0.7 s without a gap
+# What would be waited for in one go when it is due is waited for a little at each frame: for a search, and a
+# keyframe of many features, from the first; for another keyframe at the last ones, which it seldom needs.
+_PACE_S, _LAST_PACE_S, _LAST_FRAMES = 0.05, 0.02, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,11 +60,16 @@ class TrackedFrame:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Sent:
-    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for."""
+    """What the thread has in hand: its frame, and the frame or the film's time at which it is waited for.
+
+    Attributes:
+        slow: whether it takes longer than the frames until then.
+    """
 
     index: int
     due: int
     due_s: float
+    slow: bool
     answer: "Future[Answer]"
 
 
@@ -170,6 +177,11 @@ class Tracker:
         """Whether the last frame has a pose."""
         return self._track is not None
 
+    @property
+    def busy(self) -> bool:
+        """Whether the thread of the keyframes has one in hand."""
+        return self._sent is not None and not self._sent.answer.done()
+
     def use(self, finder: Finder) -> None:
         """Track by this finder's ground from the next frame on.
 
@@ -244,9 +256,8 @@ class Tracker:
         due = now.index >= sent.due or now.time_s >= sent.due_s
         ready = sent.answer.done() if self._options.live else due
         if not ready:
-            if self._track is None and not self._options.live:
-                # What would be waited for in one go when it is due is waited for a little at each frame.
-                wait([sent.answer], timeout=_PACE_S)
+            if not self._options.live and (sent.slow or now.index >= sent.due - _LAST_FRAMES):
+                wait([sent.answer], timeout=_PACE_S if sent.slow else _LAST_PACE_S)
             return None, None
         self._sent = None
         return sent.answer.result(), sent
@@ -329,7 +340,7 @@ class Tracker:
         self._behind, options = _FAR, self._options
         answer = self._pool.submit(self._finder.find, now.gray.copy(), self._request_now(), options)
         due = (now.index + options.lost_answer_after, now.time_s + options.lost_answer_after_s)
-        self._hand_over(now.index, answer, due)
+        self._hand_over(now.index, answer, due, slow=True)
 
     def _send_keyframe(self, now: RecentFrame, fitted: FittedPose, track: FlowTrack) -> None:
         """Have this frame matched against the ground, if it is time for a keyframe and the thread is free."""
@@ -348,14 +359,19 @@ class Tracker:
             track.ground.match, now.gray.copy(), self._camera, fitted.cam_from_local, options
         )
         due = (now.index + options.answer_after, now.time_s + options.answer_after_s)
-        self._hand_over(now.index, answer, due)
+        self._hand_over(now.index, answer, due, slow=few)
         self._next_keyframe = now.index + options.keyframe_every
         self._next_keyframe_s = now.time_s + options.keyframe_every_s
 
     def _hand_over(
-        self, index: int, answer: "Future[Any]", due: tuple[int, float] = (_FAR, float("inf"))
+        self,
+        index: int,
+        answer: "Future[Any]",
+        due: tuple[int, float] = (_FAR, float("inf")),
+        *,
+        slow: bool = False,
     ) -> None:
-        self._sent = _Sent(index=index, due=due[0], due_s=due[1], answer=answer)
+        self._sent = _Sent(index=index, due=due[0], due_s=due[1], slow=slow, answer=answer)
 
     def _request_now(self) -> LocaliseRequest:
         if not self._found:

@@ -1,0 +1,100 @@
+"""Frames that are read ahead: the same, in the same order, with their errors where they belong."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from featuredb.errors import InvalidValueError, VideoError
+from featuredb.video.ahead import ReadAhead
+from featuredb.video.film import Video, VideoFrame, VideoReport
+from featuredb.video.frames import open_video
+from tests.support.films import film, read
+
+
+class _Film(Video):
+    """Frames of a real film, which breaks after some, and tells how many were read."""
+
+    def __init__(self, path: Path, breaks_after: int = 1000, live: bool = False) -> None:
+        with open_video(path) as video:
+            super().__init__(replace(video.info, live=live))
+            self._known = list(video)
+        self._breaks_after, self.read = breaks_after, 0
+
+    @property
+    def report(self) -> VideoReport:
+        return VideoReport(delivered=self.read)
+
+    def close(self) -> None:
+        self._known = []
+
+    def _frames(self) -> Iterator[VideoFrame]:
+        for frame in self._known:
+            if self.read == self._breaks_after:
+                raise VideoError("the film is broken here")
+            self.read += 1
+            yield frame
+
+
+@pytest.mark.parametrize("pattern", [(0,), (1,), (4,), (0, 7, 0, 0, 2), (100,)])
+def test_frames_are_those_of_the_film_however_far_it_is_read_ahead(
+    tmp_path: Path, pattern: tuple[int, ...]
+) -> None:
+    path = film(tmp_path, "mp4", 50)
+    expected = read(path)
+    with open_video(path) as video, ReadAhead(video) as ahead:
+        found = []
+        for frame in ahead:
+            found.append(frame)
+            ahead.read_on(pattern[len(found) % len(pattern)])
+            # Colours are made here while greys are made there.
+            np.testing.assert_array_equal(frame.rgb(), expected[len(found) - 1].rgb())
+        report = video.report
+    assert [f.time_s for f in found] == [f.time_s for f in expected]
+    for frame, same in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(frame.gray, same.gray)
+    assert report.whole
+    assert report.delivered == 50
+    assert ahead.seconds > 0.0
+
+
+def test_an_error_comes_after_the_frames_before_it(tmp_path: Path) -> None:
+    broken = _Film(film(tmp_path, "mp4"), breaks_after=12)
+    with ReadAhead(broken) as ahead:
+        frames = iter(ahead)
+        for _ in range(12):
+            next(frames)
+            ahead.read_on(6)
+        with pytest.raises(VideoError, match="broken here"):
+            next(frames)
+
+
+def test_no_more_are_read_ahead_than_wanted_and_of_a_live_source_none(tmp_path: Path) -> None:
+    path = film(tmp_path, "mp4")
+    for live, most in ((False, 5), (True, 0)):
+        source = _Film(path, live=live)
+        with ReadAhead(source, most=5) as ahead:
+            frames = iter(ahead)
+            next(frames)
+            ahead.read_on(3)
+            ahead.read_on(30)
+        assert source.read <= 1 + most  # the last may be cancelled as it is left
+        with ReadAhead(_Film(path, live=live), most=5) as ahead:
+            assert sum(1 for _ in ahead) == 30
+
+
+def test_a_film_that_is_left_early_has_no_thread_left(tmp_path: Path) -> None:
+    with open_video(film(tmp_path, "mp4")) as video, ReadAhead(video) as ahead:
+        for frame in ahead:
+            ahead.read_on(10)
+            if frame.index == 3:
+                break
+    assert not [t.name for t in threading.enumerate() if t.name.startswith("decoding")]
+
+
+def test_nothing_to_read_ahead_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidValueError, match="1 frame or more"):
+        ReadAhead(_Film(film(tmp_path, "mp4")), most=0)
