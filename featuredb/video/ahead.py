@@ -18,7 +18,10 @@ from types import TracebackType
 from typing import Self
 
 from featuredb.errors import InvalidValueError
-from featuredb.video.film import Video, VideoFrame
+from featuredb.video.film import Video, VideoFrame, VideoInfo
+
+# Of pictures that wait, for their greys and, as 4:2:0, their colours: at 3840x2160 ten frames.
+_MOST_BYTES = 1 << 27
 
 
 class ReadAhead:
@@ -31,12 +34,12 @@ class ReadAhead:
     def __init__(self, video: Video, most: int = 24) -> None:
         """
         Args:
-            most: frames that are decoded before they are used; each holds its picture, 2.5 bytes a pixel.
+            most: frames that are decoded before they are used; fewer of large films, for their memory.
         """
         if most < 1:
             raise InvalidValueError(f"most: expected 1 frame or more to be read ahead, found {most}")
         self._frames: Iterator[VideoFrame] | None = None
-        self._video, self._most = video, 0 if video.info.live else most
+        self._video, self._most = video, 0 if video.info.live else min(most, _fitting(video.info))
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="decoding")
         self._ahead: deque[Future[VideoFrame | None]] = deque()
         self._seconds = 0.0
@@ -55,7 +58,9 @@ class ReadAhead:
         return self._seconds
 
     def read_on(self, frames: int) -> None:
-        """Decode so many more frames in the background, up to `most` that are not yet used."""
+        """Decode so many more frames in the background, up to `most` not yet used; none before the first."""
+        if self._frames is None:
+            return
         for _ in range(min(frames, self._most - len(self._ahead))):
             self._ahead.append(self._pool.submit(self._next))
 
@@ -74,8 +79,15 @@ class ReadAhead:
             yield frame
 
     def _next(self) -> VideoFrame | None:
+        assert self._frames is not None
         began = time.perf_counter()
         try:
-            return None if self._frames is None else next(self._frames, None)
+            return next(self._frames, None)
         finally:
             self._seconds += time.perf_counter() - began
+
+
+def _fitting(info: VideoInfo) -> int:
+    """Frames that fit into the memory that they may take, one at least."""
+    each = info.frame_width * info.frame_height + 3 * info.width * info.height // 2
+    return max(1, _MOST_BYTES // each)

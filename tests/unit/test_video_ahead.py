@@ -86,6 +86,32 @@ def test_no_more_are_read_ahead_than_wanted_and_of_a_live_source_none(tmp_path: 
             assert sum(1 for _ in ahead) == 30
 
 
+@pytest.mark.parametrize(
+    ("width", "height", "most"), [(1280, 720, 24), (3840, 2160, 10), (7680, 4320, 2), (16_384, 8_192, 1)]
+)
+def test_large_films_are_read_ahead_as_far_as_their_memory_goes(
+    tmp_path: Path, width: int, height: int, most: int
+) -> None:
+    source = _Film(film(tmp_path, "mp4", 40))
+    small = (width, height) if width <= 1280 else (1280, 720)
+    source.info = replace(
+        source.info, width=width, height=height, frame_width=small[0], frame_height=small[1]
+    )
+    with ReadAhead(source) as ahead:
+        frames = iter(ahead)
+        next(frames)
+        ahead.read_on(100)
+        for _ in range(most):  # from the background, and none is read for them
+            next(frames)
+        assert source.read == 1 + most
+
+
+def test_before_the_first_frame_nothing_is_read_ahead(tmp_path: Path) -> None:
+    with ReadAhead(_Film(film(tmp_path, "mp4"))) as ahead:
+        ahead.read_on(5)
+        assert [frame.index for frame in ahead] == list(range(30))
+
+
 def test_a_film_that_is_left_early_has_no_thread_left(tmp_path: Path) -> None:
     with open_video(film(tmp_path, "mp4")) as video, ReadAhead(video) as ahead:
         for frame in ahead:
