@@ -49,6 +49,10 @@ class MapNotFoundError(StoreError):
     """The snapshot has no map with that id."""
 
 
+class UnplacedMapError(StoreError):
+    """What was asked for needs a place on Earth, and the map has none; the message says what gives it one."""
+
+
 class SnapshotNotFoundError(StoreError):
     """The database has no snapshot with that number or before that time."""
 

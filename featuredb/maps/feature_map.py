@@ -1,12 +1,15 @@
-"""A feature map: a sparse reconstruction of a place, placed on Earth, with descriptors.
+"""A feature map with a place: a sparse reconstruction, placed on Earth, with descriptors.
+
+A reconstruction whose place nobody knows yet is an `UnplacedMap` (featuredb/maps/unplaced_map.py).
 
 One map has one UTM zone and one local east-north-up frame. Poses and covariances are held in the
 local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes between the two.
 """
 
+from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -92,38 +95,69 @@ class MapImage:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapPoints:
-    """The 3D points of a map.
+class PointColumns:
+    """What is known of 3D points besides their coordinates; see `MapPoints` and `OwnPoints`.
 
     Attributes:
-        utm: (n, 3) float64 easting, northing, height in metres; EPSG code and datum are the map's.
         rgb: (n, 3) uint8.
         track_length: (n,) int32, number of images that see the point.
         error_px: (n,) float32, mean reprojection error in full-size pixels.
-        covariance: (n, 6) float32, upper triangle (ee, en, eu, nn, nu, uu) of the covariance in the map's
-            local frame, square metres, relative to the map's gauge.
+        covariance: (n, 6) float32, upper triangle (xx, xy, xz, yy, yz, zz) of the covariance along the axes of
+            the map's frame, square units of it, relative to the map's gauge.
     """
 
-    utm: FloatArray
     rgb: NDArray[np.uint8]
     track_length: NDArray[np.int32]
     error_px: NDArray[np.float32]
     covariance: NDArray[np.float32]
 
+    def columns(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> dict[str, Any]:
+        """Some rows of each of these columns, by name."""
+        return {name: getattr(self, name)[rows] for name in _POINT_COLUMNS}
+
+
+_POINT_COLUMNS = ("rgb", "track_length", "error_px", "covariance")
+
+
+def check_points(points: PointColumns, coordinates: str) -> None:
+    """Make the arrays read-only and raise InvalidValueError where they do not fit together.
+
+    Args:
+        coordinates: name of the field with the (n, 3) coordinates, which decides how many points there are.
+    """
+    kind = type(points).__name__
+    xyz = frozen_array(f"{kind}.{coordinates}", getattr(points, coordinates), (None, 3))
+    n = len(xyz)
+    for name, value in (
+        (coordinates, xyz),
+        ("rgb", frozen_array(f"{kind}.rgb", points.rgb, (n, 3), np.uint8)),
+        ("track_length", frozen_array(f"{kind}.track_length", points.track_length, (n,), np.int32)),
+        ("error_px", frozen_array(f"{kind}.error_px", points.error_px, (n,), np.float32)),
+        ("covariance", frozen_array(f"{kind}.covariance", points.covariance, (n, 6), np.float32)),
+    ):
+        object.__setattr__(points, name, value)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapPoints(PointColumns):
+    """The 3D points of a map with a place.
+
+    Attributes:
+        utm: (n, 3) float64 easting, northing, height in metres; EPSG code and datum are the map's.
+        covariance: as in PointColumns: (ee, en, eu, nn, nu, uu) in the map's local frame, square metres.
+    """
+
+    utm: FloatArray
+
     def __post_init__(self) -> None:
-        utm = frozen_array("MapPoints.utm", self.utm, (None, 3))
-        n = len(utm)
-        for name, value in (
-            ("utm", utm),
-            ("rgb", frozen_array("MapPoints.rgb", self.rgb, (n, 3), np.uint8)),
-            ("track_length", frozen_array("MapPoints.track_length", self.track_length, (n,), np.int32)),
-            ("error_px", frozen_array("MapPoints.error_px", self.error_px, (n,), np.float32)),
-            ("covariance", frozen_array("MapPoints.covariance", self.covariance, (n, 6), np.float32)),
-        ):
-            object.__setattr__(self, name, value)
+        check_points(self, "utm")
 
     def __len__(self) -> int:
         return len(self.utm)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "MapPoints":
+        """Some rows, by a mask (n,) or their numbers."""
+        return MapPoints(utm=self.utm[rows], **self.columns(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -252,22 +286,7 @@ class FeatureMap:
         check_datum(self.height_datum)
         if self.status not in MAP_STATUSES:
             raise InvalidValueError(f"{where}: expected a status of {MAP_STATUSES}, found {self.status!r}")
-        if self.camera_keys and len(self.camera_keys) != len(self.cameras):
-            raise InvalidValueError(
-                f"{where}: expected as many camera keys as cameras ({len(self.cameras)}) or none, "
-                f"found {len(self.camera_keys)}"
-            )
-        ids = [image.image_id for image in self.images]
-        if len(set(ids)) != len(ids):
-            raise InvalidValueError(f"{where}: image ids repeat")
-        if any(not 0 <= image.camera_id < len(self.cameras) for image in self.images):
-            raise InvalidValueError(f"{where}: an image names a camera that the map does not have")
-        observations = self.observations
-        if len(observations):
-            if observations.point_index.min() < 0 or observations.point_index.max() >= len(self.points):
-                raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
-            if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
-                raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
+        check_parts(where, self)
 
     def points_local(self, frame: LocalFrame | None = None) -> FloatArray:
         """Points (n, 3) in metres in the given local frame (default: the map's own)."""
@@ -275,6 +294,41 @@ class FeatureMap:
 
     def with_status(self, status: MapStatus) -> "FeatureMap":
         return replace(self, status=status)
+
+
+class MapParts(Protocol):
+    """What maps with and without a place have in common."""
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]: ...
+    @property
+    def camera_keys(self) -> tuple[str, ...]: ...
+    @property
+    def images(self) -> tuple[MapImage, ...]: ...
+    @property
+    def observations(self) -> MapObservations: ...
+    @property
+    def points(self) -> Sized: ...
+
+
+def check_parts(where: str, parts: MapParts) -> None:
+    """Raise InvalidValueError where images, cameras, points and observations contradict each other."""
+    if parts.camera_keys and len(parts.camera_keys) != len(parts.cameras):
+        raise InvalidValueError(
+            f"{where}: expected as many camera keys as cameras ({len(parts.cameras)}) or none, "
+            f"found {len(parts.camera_keys)}"
+        )
+    ids = [image.image_id for image in parts.images]
+    if len(set(ids)) != len(ids):
+        raise InvalidValueError(f"{where}: image ids repeat")
+    if any(not 0 <= image.camera_id < len(parts.cameras) for image in parts.images):
+        raise InvalidValueError(f"{where}: an image names a camera that the map does not have")
+    observations = parts.observations
+    if len(observations):
+        if observations.point_index.min() < 0 or observations.point_index.max() >= len(parts.points):
+            raise InvalidValueError(f"{where}: an observation names a point that the map does not have")
+        if not np.isin(observations.image_id, np.asarray(ids, dtype=np.int32)).all():
+            raise InvalidValueError(f"{where}: an observation names an image that the map does not have")
 
 
 def _covariance(name: str, value: ArrayLike, size: int) -> FloatArray:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.maps.feature_map import FeatureMap, MapObservations, MapPoints
+from featuredb.maps.feature_map import MapObservations
+from featuredb.maps.unplaced_map import MapKind
 
 _PER_OBSERVATION = ("image_id", "xy", "scale", "angle", "has_descriptor", "descriptors")
 
 
-def only_images(feature_map: FeatureMap, image_ids: Collection[int], min_views: int = 2) -> FeatureMap:
+def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int = 2) -> MapKind:
     """The map with some of its images, their cameras, observations and points.
 
     Image ids stay; cameras and points are numbered anew. Coordinates, covariances and reprojection errors of
@@ -48,7 +49,7 @@ def only_images(feature_map: FeatureMap, image_ids: Collection[int], min_views: 
     return only_points(part, views >= min_views)
 
 
-def only_points(feature_map: FeatureMap, stays: NDArray[np.bool_]) -> FeatureMap:
+def only_points(feature_map: MapKind, stays: NDArray[np.bool_]) -> MapKind:
     """The map with some of its points (n,) and their observations; points are numbered anew."""
     if stays.all():
         return feature_map
@@ -56,19 +57,8 @@ def only_points(feature_map: FeatureMap, stays: NDArray[np.bool_]) -> FeatureMap
     seen = take_observations(feature_map.observations, stays[feature_map.observations.point_index])
     return replace(
         feature_map,
-        points=take_points(feature_map.points, stays),
+        points=feature_map.points.take(stays),
         observations=replace(seen, point_index=new_row[seen.point_index]),
-    )
-
-
-def take_points(points: MapPoints, rows: NDArray[np.bool_]) -> MapPoints:
-    """Some rows (n,)."""
-    return MapPoints(
-        utm=points.utm[rows],
-        rgb=points.rgb[rows],
-        track_length=points.track_length[rows],
-        error_px=points.error_px[rows],
-        covariance=points.covariance[rows],
     )
 
 

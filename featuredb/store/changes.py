@@ -9,6 +9,7 @@ from featuredb.store.encode import Row
 ACTIVE = "active"
 QUARANTINED = "quarantined"
 RETIRED = "retired"
+UNPLACED = "unplaced"
 # Columns that say where a map lies; equal ones mean that it was not placed anew.
 _PLACE = (
     "epsg",
@@ -136,6 +137,8 @@ def change_status(
     for map_id in map_ids:
         if map_id not in known:
             raise MapNotFoundError(f"no map {map_id}; `featuredb maps` lists what there is")
+        if known[map_id]["status"] == UNPLACED:
+            raise StoreError(f"map {map_id} has no place, so it cannot be {status}; place it first")
         if known[map_id]["status"] == RETIRED:
             raise StoreError(f"map {map_id} is retired ({known[map_id]['status_reason']}); commit it again")
     wanted = [m for m in dict.fromkeys(map_ids) if known[m]["status"] != status]

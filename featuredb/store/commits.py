@@ -11,6 +11,7 @@ from featuredb.errors import SnapshotNotFoundError, StoreError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Commit, Table
 from featuredb.store.encode import Row, map_rows_table
+from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
 # orphans; it is well below the vacuum's shortest default grace of a day.
@@ -71,6 +72,9 @@ def read_rows(maps: Table) -> list[Row]:
     try:
         table = maps.dataset().to_table()
         # Arrow would look up "UTC" in the system's time zone files, which small machines do not have.
+        for field in SPECS[MAPS].schema:  # those that an older format does not have
+            if field.name not in table.column_names:
+                table = table.append_column(field.name, pa.nulls(len(table), field.type))
         created = table["created_at"].cast(pa.timestamp("us")).to_pylist()
         rows: list[Row] = table.drop_columns("created_at").to_pylist()
         for row, time in zip(rows, created, strict=True):
@@ -105,6 +109,11 @@ def commit_as_of(as_of: int | datetime, commits: Sequence[Commit]) -> Commit:
 def oldest_kept_version(commits: Sequence[Commit]) -> int:
     """The oldest version whose files no vacuum has taken; vacuum notes it in its commit."""
     return max((int(c.metadata.get(KEPT_FROM, 0)) for c in commits), default=0)
+
+
+def upgrade_metadata() -> dict[str, str]:
+    """What an upgrade's commit to `maps` says about itself."""
+    return {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
 
 
 def apply_change(

@@ -8,7 +8,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from featuredb.errors import ConflictError, StoreError
-from featuredb.maps.feature_map import FeatureMap, MapStatus
+from featuredb.maps.feature_map import MapStatus
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.changes import RETIRED, Change, add_maps, change_status, live_row, retire_map
 from featuredb.store.commits import (
     LONGEST_COMMIT,
@@ -18,11 +19,12 @@ from featuredb.store.commits import (
     history_entry,
     new_write_id,
     read_rows,
+    upgrade_metadata,
 )
 from featuredb.store.delta import Commit, Table, retry_stale
-from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
+from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
 from featuredb.store.snapshot import Snapshot
-from featuredb.store.tables import CHILD_TABLES, MAPS, SPECS
+from featuredb.store.tables import CHILD_TABLES, FORMAT_VERSION, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +142,7 @@ class Database:
 
     def commit_map(
         self,
-        feature_map: FeatureMap,
+        feature_map: AnyMap,
         *,
         replaces: str | None = None,
         based_on: str | None = None,
@@ -161,7 +163,7 @@ class Database:
 
     def commit_maps(
         self,
-        feature_maps: Sequence[FeatureMap],
+        feature_maps: Sequence[AnyMap],
         *,
         replaces: Sequence[str] = (),
         based_on: Mapping[str, str] | None = None,
@@ -185,8 +187,11 @@ class Database:
             ConflictError: other writers were faster too many times, or a map of `based_on` has been placed
                 anew, retired or rolled back since it was read; nothing is visible.
             MapNotFoundError: a map to be replaced is not there.
-            StoreError: the store failed, map ids repeat, or a map is retired without a reason.
+            StoreError: the store failed, map ids repeat, a map is retired without a reason, or one without a
+                place comes to a database of format 1.
         """
+        if any(isinstance(feature_map, UnplacedMap) for feature_map in feature_maps):
+            self.require_newest_format("keep maps without a place")
         ids = [feature_map.map_id for feature_map in feature_maps]
         if len(set(ids)) != len(ids):
             raise StoreError(f"commit_maps: expected different map ids, found {ids}")
@@ -314,6 +319,44 @@ class Database:
 
         return retry_stale(f"rollback to {as_of}", attempt)
 
+    @property
+    def format(self) -> int:
+        """Format of the database: of the oldest of its tables of maps."""
+        return min(self.table(name).format for name in (*CHILD_TABLES, MAPS))
+
+    def require_newest_format(self, purpose: str) -> None:
+        """Refuse what an older format cannot hold.
+
+        Raises:
+            StoreError: the database has an older format.
+        """
+        if self.format < FORMAT_VERSION:
+            raise StoreError(
+                f"{self.url} has format {self.format}, which cannot {purpose}: expected format "
+                f"{FORMAT_VERSION}; run `featuredb upgrade {self.url}` (featuredb before it cannot read the "
+                "database any more then)"
+            )
+
+    def upgrade(self) -> int:
+        """Bring the tables of maps to the newest format; returns the format that the database had.
+
+        All maps and snapshots stay as they are. `maps` comes last: until then the database is of the old format.
+
+        Raises:
+            ConflictError: other writers were faster too many times.
+            StoreError: the store failed.
+        """
+        found = self.format
+        for name in CHILD_TABLES:
+            retry_stale(f"upgrade of {name}", lambda name=name: self.table(name).upgrade())  # type: ignore[misc]
+
+        def attempt() -> None:
+            maps = self.table(MAPS)
+            maps.upgrade(map_rows_table(read_rows(maps)), upgrade_metadata())
+
+        retry_stale("upgrade of maps", attempt)
+        return found
+
     def history(self) -> list[HistoryEntry]:
         """All versions, newest first."""
         return [history_entry(commit) for commit in self.table(MAPS).commits()]
@@ -326,7 +369,7 @@ class Database:
             children={name: self.table(name) for name in CHILD_TABLES},
         )
 
-    def _write_children(self, feature_map: FeatureMap) -> EncodedMap:
+    def _write_children(self, feature_map: AnyMap) -> EncodedMap:
         """Write the rows that stay invisible until a row of `maps` names them."""
         now = datetime.now(UTC)
         encoded = encode_map(feature_map, new_write_id(now), now)

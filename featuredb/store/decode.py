@@ -1,7 +1,7 @@
-"""Rows of the tables back to the FeatureMap that was committed."""
+"""Rows of the tables back to the map that was committed."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from typing import Any
 
@@ -17,20 +17,41 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage, MapObservations, MapPoints, Placement
+from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store.encode import Row
-from featuredb.store.tables import IMAGES, OBSERVATIONS, POINT_COVARIANCE, POINTS
+from featuredb.store.tables import IMAGES, OBSERVATIONS, OWN_COORDINATES, POINT_COVARIANCE, POINTS
 
 
-def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> FeatureMap:
+def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> AnyMap:
     """The map of a row of `maps` and the batches of its child rows, in any order.
 
     Raises:
         StoreError: rows are missing, double or do not fit together.
     """
     try:
+        shared: dict[str, Any] = {
+            "map_id": row["map_id"],
+            "name": row["name"],
+            "cameras": tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
+            "camera_keys": tuple(row["camera_keys"]),
+            "images": _decode_images(children[IMAGES], row["images"]),
+            "observations": _decode_observations(children[OBSERVATIONS], row["observations"]),
+            "extractor_fingerprint": row["extractor_fingerprint"],
+            "status": row["status"],
+            "parents": tuple(row["parents"]),
+            "source": row["source"],
+            "licence": row["licence"],
+            "provenance": json.loads(row["provenance"]),
+        }
+        points = _decode_points(children[POINTS], row["points"], _coordinate_columns(row))
+        if not has_place(row):
+            return UnplacedMap(
+                frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
+                points=OwnPoints(xyz=points.pop("coordinates"), **points),
+                no_place=decode_no_place(row),
+                **shared,
+            )
         return FeatureMap(
-            map_id=row["map_id"],
-            name=row["name"],
             epsg=row["epsg"],
             height_datum=row["height_datum"],
             frame=LocalFrame(
@@ -38,24 +59,30 @@ def decode_map(row: Row, children: Mapping[str, Iterable[pa.RecordBatch]]) -> Fe
                 longitude_deg=row["origin_longitude_deg"],
                 height_m=row["origin_height_m"],
             ),
-            cameras=tuple(Camera(**{**c, "params": tuple(c["params"])}) for c in row["cameras"]),
-            camera_keys=tuple(row["camera_keys"]),
-            images=_decode_images(children[IMAGES], row["images"]),
-            points=_decode_points(children[POINTS], row["points"]),
-            observations=_decode_observations(children[OBSERVATIONS], row["observations"]),
+            points=MapPoints(utm=points.pop("coordinates"), **points),
             placement=_decode_placement(row),
-            extractor_fingerprint=row["extractor_fingerprint"],
-            status=row["status"],
             generation=row["generation"],
-            parents=tuple(row["parents"]),
-            source=row["source"],
-            licence=row["licence"],
-            provenance=json.loads(row["provenance"]),
+            **shared,
         )
     except (FeatureDbError, ValueError, TypeError, KeyError) as error:
         raise StoreError(
             f"map {row['map_id']}: stored rows do not make a map ({error}); run `featuredb verify`"
         ) from error
+
+
+def has_place(row: Row) -> bool:
+    """Whether a row of `maps` is of a map with a place."""
+    return row["epsg"] is not None
+
+
+def decode_no_place(row: Row) -> NoPlace:
+    """Why the map of a row without a place has none."""
+    said = json.loads(row["no_place"])
+    return NoPlace(**{**said, "ways": tuple(said["ways"])})
+
+
+def _coordinate_columns(row: Row) -> tuple[str, ...]:
+    return ("easting", "northing", "height") if has_place(row) else OWN_COORDINATES
 
 
 def _decode_placement(row: Row) -> Placement:
@@ -130,15 +157,18 @@ class _Scatter:
             )
 
 
-def _decode_points(batches: Iterable[pa.RecordBatch], count: int) -> MapPoints:
-    utm: FloatArray = np.empty((count, 3))
+def _decode_points(
+    batches: Iterable[pa.RecordBatch], count: int, coordinate_columns: Sequence[str]
+) -> dict[str, Any]:
+    """Arrays of PointColumns by name, and `coordinates` (count, 3)."""
+    coordinates: FloatArray = np.empty((count, 3))
     rgb, track = np.empty((count, 3), np.uint8), np.empty(count, np.int32)
     error, covariance = np.empty(count, np.float32), np.empty((count, 6), np.float32)
     scatter = _Scatter(POINTS, "point_index", count)
     for batch in batches:
         index = scatter.index(batch)
-        for axis, name in enumerate(("easting", "northing", "height")):
-            utm[index, axis] = batch.column(name).to_numpy()
+        for axis, name in enumerate(coordinate_columns):
+            coordinates[index, axis] = batch.column(name).to_numpy()
         for axis, name in enumerate(("red", "green", "blue")):
             rgb[index, axis] = batch.column(name).to_numpy()
         for axis, name in enumerate(POINT_COVARIANCE):
@@ -146,7 +176,13 @@ def _decode_points(batches: Iterable[pa.RecordBatch], count: int) -> MapPoints:
         track[index] = batch.column("track_length").to_numpy()
         error[index] = batch.column("error_px").to_numpy()
     scatter.check()
-    return MapPoints(utm=utm, rgb=rgb, track_length=track, error_px=error, covariance=covariance)
+    return {
+        "coordinates": coordinates,
+        "rgb": rgb,
+        "track_length": track,
+        "error_px": error,
+        "covariance": covariance,
+    }
 
 
 def _decode_observations(batches: Iterable[pa.RecordBatch], count: int) -> MapObservations:

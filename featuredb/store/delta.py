@@ -31,13 +31,14 @@ from deltalake import (
     CommitProperties,
     DeltaTable,
     PostCommitHookProperties,
+    Schema,
     WriterProperties,
     write_deltalake,
 )
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from featuredb.errors import ConflictError, DatabaseNotFoundError, SnapshotNotFoundError, StoreError
-from featuredb.store.tables import FORMAT_VERSION, TableSpec
+from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -122,7 +123,7 @@ class Table:
                 mode="ignore",
                 partition_by=list(spec.partition_by) or None,
                 name=f"featuredb.{spec.name}",
-                description=json.dumps({"featuredb_format": FORMAT_VERSION}),
+                description=_description(),
                 configuration={
                     "delta.logRetentionDuration": LOG_RETENTION,
                     "delta.dataSkippingStatsColumns": ",".join(spec.statistics),
@@ -161,6 +162,36 @@ class Table:
     @property
     def version(self) -> int:
         return int(self._delta.version())
+
+    @property
+    def format(self) -> int:
+        """Format of the table, one of READABLE_FORMATS."""
+        return int(_format_of(self._delta.metadata()))
+
+    def upgrade(self, rows: pa.Table | None = None, metadata: Mapping[str, str] | None = None) -> None:
+        """Make a table of the newest format of one of an older one; harmless where it is of the newest.
+
+        New columns are null in the rows that are there. Each step is one commit; after a crash the next call
+        goes on where it was.
+
+        Args:
+            rows: all rows of the table, where columns must become nullable: they are written anew.
+
+        Raises:
+            StaleVersionError: someone committed in between; with `rows` nothing of theirs is overwritten.
+            StoreError: the store failed.
+        """
+        if self.format == FORMAT_VERSION:
+            return
+        there = {field.name for field in self._delta.schema().fields}
+        new = [field for field in Schema.from_arrow(self.spec.schema).fields if field.name not in there]
+        if rows is not None and new:
+            self.swap(rows, mode="overwrite", metadata=dict(metadata or {}), schema_mode="overwrite")
+        with _as_store_error(f"cannot upgrade {self._delta.table_uri}"):
+            if rows is None and new:
+                self._delta.alter.add_columns(new)
+            self._delta.alter.set_table_description(_description())
+            self.refresh()
 
     def refresh(self) -> None:
         """Move to the newest version.
@@ -222,7 +253,14 @@ class Table:
         """
         self._write(rows, mode="append", properties=CommitProperties(max_commit_retries=ATTEMPTS))
 
-    def swap(self, rows: pa.Table, *, mode: Literal["append", "overwrite"], metadata: dict[str, str]) -> int:
+    def swap(
+        self,
+        rows: pa.Table,
+        *,
+        mode: Literal["append", "overwrite"],
+        metadata: dict[str, str],
+        schema_mode: Literal["overwrite"] | None = None,
+    ) -> int:
         """Commit as the version right after the one this object holds, and return it.
 
         Raises:
@@ -231,7 +269,7 @@ class Table:
         expected = self.version + 1
         properties = CommitProperties(max_commit_retries=0, custom_metadata=metadata)
         try:
-            self._write(rows, mode=mode, properties=properties)
+            self._write(rows, mode=mode, properties=properties, schema_mode=schema_mode)
         except ConflictError as error:
             raise StaleVersionError(str(error)) from error
         if self.version != expected:
@@ -299,12 +337,14 @@ class Table:
         *,
         mode: Literal["append", "overwrite"],
         properties: CommitProperties,
+        schema_mode: Literal["overwrite"] | None = None,
     ) -> None:
         try:
             write_deltalake(
                 self._delta,
-                rows,
+                rows if schema_mode else self._in_its_format(rows),
                 mode=mode,
+                schema_mode=schema_mode,
                 writer_properties=_writer_properties(self.spec),
                 commit_properties=properties,
                 post_commithook_properties=PostCommitHookProperties(cleanup_expired_logs=False),
@@ -313,6 +353,13 @@ class Table:
             raise ConflictError(f"commit to {self._delta.table_uri}: {error}") from error
         except (DeltaError, OSError) as error:
             raise StoreError(f"cannot write {self._delta.table_uri}: {error}") from error
+
+    def _in_its_format(self, rows: pa.Table | pa.RecordBatchReader) -> pa.Table | pa.RecordBatchReader:
+        """Rows without the columns that a table of an older format does not have."""
+        if self.format == FORMAT_VERSION or isinstance(rows, pa.RecordBatchReader):
+            return rows
+        there = {field.name for field in self._delta.schema().fields}
+        return rows.select([name for name in rows.column_names if name in there])
 
     def _maintain(self, operation: Callable[[], T]) -> T:
         """Run an operation that rewrites files, again if a concurrent writer got in between."""
@@ -341,11 +388,19 @@ def _check_format(url: str, spec: TableSpec, delta: Any) -> None:
     metadata = delta.metadata()
     if metadata.name != f"featuredb.{spec.name}":
         raise DatabaseNotFoundError(f"{url} is a Delta table named {metadata.name!r}, not one of featuredb")
-    found = json.loads(metadata.description or "{}").get("featuredb_format")
-    if found != FORMAT_VERSION:
+    found = _format_of(metadata)
+    if found not in READABLE_FORMATS:
         raise StoreError(
-            f"{url} has featuredb format {found}, expected {FORMAT_VERSION}; use a matching featuredb"
+            f"{url} has featuredb format {found}, expected {FORMAT_VERSION} or older; use a newer featuredb"
         )
+
+
+def _format_of(metadata: Any) -> Any:
+    return json.loads(metadata.description or "{}").get("featuredb_format")
+
+
+def _description() -> str:
+    return json.dumps({"featuredb_format": FORMAT_VERSION})
 
 
 def _writer_properties(spec: TableSpec) -> WriterProperties:

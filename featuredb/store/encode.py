@@ -1,5 +1,6 @@
-"""A FeatureMap as rows of the tables, without loss: float64 stays float64, order stays order."""
+"""A map as rows of the tables, without loss: float64 stays float64, order stays order."""
 
+import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass
@@ -14,10 +15,24 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.tiles import tile_of
+from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations
-from featuredb.store.tables import BOUNDS, IMAGES, MAPS, OBSERVATIONS, POINT_COVARIANCE, POINTS, SPECS
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
+from featuredb.store.tables import (
+    BOUNDS,
+    IMAGES,
+    MAPS,
+    NO_TILE,
+    NO_ZONE,
+    OBSERVATIONS,
+    OWN_COORDINATES,
+    POINT_COVARIANCE,
+    POINTS,
+    SPECS,
+)
 
 Row = dict[str, Any]
+_UTM_COLUMNS = ("easting", "northing", "height")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,35 +43,38 @@ class EncodedMap:
     children: dict[str, pa.Table]
 
 
-def encode_map(feature_map: FeatureMap, write_id: str, created_at: datetime) -> EncodedMap:
+def encode_map(feature_map: AnyMap, write_id: str, created_at: datetime) -> EncodedMap:
     """The rows of a map under the given write id.
 
     Raises:
         InvalidValueError: provenance or evidence that JSON cannot hold.
     """
     ids = {"write_id": write_id, "map_id": feature_map.map_id}
-    point_tiles = np.asarray(tile_of(feature_map.points.utm), dtype=object)
+    point_tiles = _point_tiles(feature_map)
     children = {
         IMAGES: _image_rows(feature_map, ids),
         POINTS: _point_rows(feature_map, ids, point_tiles),
         OBSERVATIONS: _observation_rows(feature_map, ids, point_tiles),
     }
-    tiles = sorted({tile for table in children.values() for tile in table["tile"].unique().to_pylist()})
+    found = {tile for table in children.values() for tile in table["tile"].unique().to_pylist()}
+    tiles = sorted(found - {NO_TILE})
     return EncodedMap(row=_map_row(feature_map, write_id, created_at, tiles), children=children)
 
 
-def content_digest(feature_map: FeatureMap) -> str:
+def content_digest(feature_map: AnyMap) -> str:
     """SHA-256 over everything in the map but its status: equal digests are equal maps."""
     digest = hashlib.sha256()
     row = _map_row(feature_map, "", datetime.fromtimestamp(0, tz=UTC), [], digest="")
-    for name in ("status", "status_reason"):
+    # A placed map has the digest that format 1 gave it.
+    new = _OWN_COLUMNS if isinstance(feature_map, FeatureMap) else ()
+    for name in ("status", "status_reason", *new):
         row.pop(name)
     row["created_at"] = ""
     digest.update(json.dumps(row, sort_keys=True).encode())
     digest.update(json.dumps([_image_row(image) for image in feature_map.images]).encode())
     points, seen = feature_map.points, feature_map.observations
     for array in (
-        points.utm, points.rgb, points.track_length, points.error_px, points.covariance,
+        _coordinates(feature_map), points.rgb, points.track_length, points.error_px, points.covariance,
         seen.point_index, seen.image_id, seen.xy, seen.scale, seen.angle, seen.has_descriptor,
         _masked_descriptors(seen),
     ):  # fmt: skip
@@ -64,30 +82,40 @@ def content_digest(feature_map: FeatureMap) -> str:
     return digest.hexdigest()
 
 
-def _map_row(
-    feature_map: FeatureMap, write_id: str, created_at: datetime, tiles: list[str], digest: str | None = None
-) -> Row:
+_OWN_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")
+
+
+def _coordinates(feature_map: AnyMap) -> FloatArray:
+    """(n, 3): UTM of a map with a place, those of the own frame of one without."""
+    return feature_map.points.xyz if isinstance(feature_map, UnplacedMap) else feature_map.points.utm
+
+
+def _point_tiles(feature_map: AnyMap) -> NDArray[Any]:
+    if isinstance(feature_map, UnplacedMap):
+        return np.full(len(feature_map.points), NO_TILE, dtype=object)
+    return np.asarray(tile_of(feature_map.points.utm), dtype=object)
+
+
+def _place_columns(feature_map: AnyMap) -> Row:
+    """Where the map lies, or why nobody knows."""
+    if isinstance(feature_map, UnplacedMap):
+        no_place = dataclasses.asdict(feature_map.no_place)
+        return {
+            **dict.fromkeys(_PLACE_COLUMNS),
+            "generation": 0,
+            "frame_is_metric": feature_map.frame.metric,
+            "frame_is_upright": feature_map.frame.upright,
+            "no_place": _json(feature_map, "no_place", no_place),
+        }
     utm, placement, frame = feature_map.points.utm, feature_map.placement, feature_map.frame
     bounds = [*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()] if len(utm) else [None] * 6
     return {
-        "map_id": feature_map.map_id,
-        "write_id": write_id,
-        "content_digest": content_digest(feature_map) if digest is None else digest,
-        "name": feature_map.name,
-        "status": feature_map.status,
-        "status_reason": "",
-        "created_at": created_at,
+        **dict.fromkeys(_OWN_COLUMNS),
         "epsg": feature_map.epsg,
         "height_datum": feature_map.height_datum,
         **dict(zip(BOUNDS, bounds, strict=True)),
-        "tiles": tiles,
-        "images": len(feature_map.images),
-        "points": len(feature_map.points),
-        "observations": len(feature_map.observations),
-        "descriptors": int(feature_map.observations.has_descriptor.sum()),
         "method": placement.method,
         "generation": feature_map.generation,
-        "parents": list(feature_map.parents),
         "residual_rms_m": float(placement.residual_rms_m),
         "origin_latitude_deg": frame.latitude_deg,
         "origin_longitude_deg": frame.longitude_deg,
@@ -97,6 +125,44 @@ def _map_row(
         "local_from_sfm_translation": placement.local_from_sfm.translation.tolist(),
         "placement_covariance": placement.covariance.ravel().tolist(),
         "placement_evidence": _json(feature_map, "placement.evidence", placement.evidence),
+    }
+
+
+_PLACE_COLUMNS = (
+    "epsg",
+    "height_datum",
+    *BOUNDS,
+    "method",
+    "residual_rms_m",
+    "origin_latitude_deg",
+    "origin_longitude_deg",
+    "origin_height_m",
+    "local_from_sfm_scale",
+    "local_from_sfm_rotation",
+    "local_from_sfm_translation",
+    "placement_covariance",
+    "placement_evidence",
+)
+
+
+def _map_row(
+    feature_map: AnyMap, write_id: str, created_at: datetime, tiles: list[str], digest: str | None = None
+) -> Row:
+    return {
+        "map_id": feature_map.map_id,
+        "write_id": write_id,
+        "content_digest": content_digest(feature_map) if digest is None else digest,
+        "name": feature_map.name,
+        "status": feature_map.status,
+        "status_reason": "",
+        "created_at": created_at,
+        **_place_columns(feature_map),
+        "tiles": tiles,
+        "images": len(feature_map.images),
+        "points": len(feature_map.points),
+        "observations": len(feature_map.observations),
+        "descriptors": int(feature_map.observations.has_descriptor.sum()),
+        "parents": list(feature_map.parents),
         "camera_keys": list(feature_map.camera_keys),
         "cameras": [
             {"model": c.model, "width": c.width, "height": c.height, "params": list(c.params)}
@@ -109,12 +175,12 @@ def _map_row(
     }
 
 
-def _json(feature_map: FeatureMap, field: str, value: dict[str, Any]) -> str:
+def _json(feature_map: AnyMap, field: str, value: dict[str, Any]) -> str:
     try:
         return json.dumps(value, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InvalidValueError(
-            f"FeatureMap {feature_map.map_id}.{field}: expected values that JSON can hold: {error}"
+            f"{type(feature_map).__name__} {feature_map.map_id}.{field}: expected values that JSON can hold: {error}"
         ) from error
 
 
@@ -139,9 +205,22 @@ def _image_row(image: MapImage) -> Row:
     }
 
 
-def _image_rows(feature_map: FeatureMap, ids: Row) -> pa.Table:
+def _image_places(feature_map: AnyMap) -> tuple[FloatArray, list[str]]:
+    """UTM (n, 3) and tiles of the cameras; NaN and `NO_TILE` where the map has no place."""
+    count = len(feature_map.images)
+    if isinstance(feature_map, UnplacedMap):
+        return np.full((count, 3), np.nan), [NO_TILE] * count
     centers = np.array([i.cam_from_local.center for i in feature_map.images], dtype=np.float64).reshape(-1, 3)
     utm = feature_map.frame.utm_from_enu(centers, feature_map.epsg)
+    return utm, list(tile_of(utm))
+
+
+def _zone(feature_map: AnyMap) -> int:
+    return NO_ZONE if isinstance(feature_map, UnplacedMap) else feature_map.epsg
+
+
+def _image_rows(feature_map: AnyMap, ids: Row) -> pa.Table:
+    utm, tiles = _image_places(feature_map)
     rows = [
         {
             **ids,
@@ -150,35 +229,39 @@ def _image_rows(feature_map: FeatureMap, ids: Row) -> pa.Table:
             "easting": easting,
             "northing": northing,
             "height": height,
-            "zone": feature_map.epsg,
+            "zone": _zone(feature_map),
             "tile": tile,
         }
         for index, (image, (easting, northing, height), tile) in enumerate(
-            zip(feature_map.images, utm.tolist(), tile_of(utm), strict=True)
+            zip(feature_map.images, utm.tolist(), tiles, strict=True)
         )
     ]
     return pa.Table.from_pylist(rows, schema=SPECS[IMAGES].schema)
 
 
-def _point_rows(feature_map: FeatureMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
+def _point_rows(feature_map: AnyMap, ids: Row, tiles: NDArray[Any]) -> pa.Table:
     points = feature_map.points
     columns: dict[str, Any] = {
         "point_index": np.arange(len(points), dtype=np.int64),
-        "easting": points.utm[:, 0],
-        "northing": points.utm[:, 1],
-        "height": points.utm[:, 2],
         "track_length": points.track_length,
         "error_px": points.error_px,
         "tile": tiles,
     }
+    here, empty = _UTM_COLUMNS, OWN_COORDINATES
+    if isinstance(feature_map, UnplacedMap):
+        here, empty = OWN_COORDINATES, _UTM_COLUMNS
+        columns |= {name: np.full(len(points), np.nan) for name in empty}
+    else:
+        columns |= {name: pa.nulls(len(points), pa.float64()) for name in empty}
+    columns |= dict(zip(here, _coordinates(feature_map).T, strict=True))
     for axis, name in enumerate(("red", "green", "blue")):
         columns[name] = points.rgb[:, axis].astype(np.int16)
     for axis, name in enumerate(POINT_COVARIANCE):
         columns[name] = points.covariance[:, axis]
-    return _table(POINTS, feature_map.epsg, ids, columns, len(points))
+    return _table(POINTS, _zone(feature_map), ids, columns, len(points))
 
 
-def _observation_rows(feature_map: FeatureMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
+def _observation_rows(feature_map: AnyMap, ids: Row, point_tiles: NDArray[Any]) -> pa.Table:
     seen = feature_map.observations
     columns = {
         "observation_index": np.arange(len(seen), dtype=np.int64),
@@ -192,12 +275,12 @@ def _observation_rows(feature_map: FeatureMap, ids: Row, point_tiles: NDArray[An
         # An observation lies with its point, so that a tile's points come with all their descriptors.
         "tile": point_tiles[seen.point_index],
     }
-    return _table(OBSERVATIONS, feature_map.epsg, ids, columns, len(seen))
+    return _table(OBSERVATIONS, _zone(feature_map), ids, columns, len(seen))
 
 
-def _table(name: str, epsg: int, ids: Row, columns: dict[str, Any], count: int) -> pa.Table:
+def _table(name: str, zone: int, ids: Row, columns: dict[str, Any], count: int) -> pa.Table:
     """Columns in the order and types of the table's schema; constants are repeated."""
-    constants = {**ids, "zone": epsg}
+    constants = {**ids, "zone": zone}
     arrays = []
     for field in SPECS[name].schema:
         if field.name in constants:

@@ -8,11 +8,12 @@ from datetime import datetime
 import pyarrow as pa
 import pyarrow.dataset as ds
 
-from featuredb.errors import MapNotFoundError, StoreError
+from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.maps.lineage import Lineage, drift_and_budget, trace
+from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
-from featuredb.store.decode import decode_map
+from featuredb.store.decode import decode_map, decode_no_place, has_place
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS, CHILD_TABLES
@@ -41,7 +42,7 @@ class UtmBox:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapSummary:
-    """A map as its row in `maps` describes it, without its points.
+    """A map with a place as its row in `maps` describes it, without its points.
 
     Attributes:
         write_id: names the child rows; changes with each re-placement, so it is a key for derived artefacts.
@@ -82,6 +83,28 @@ class MapSummary:
     budget_m: float | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnplacedSummary:
+    """A map without a place as its row in `maps` describes it; attributes as in MapSummary and UnplacedMap."""
+
+    map_id: str
+    write_id: str
+    content_digest: str
+    name: str
+    status: UnplacedStatus
+    status_reason: str
+    created_at: datetime
+    frame: OwnFrame
+    no_place: NoPlace
+    images: int
+    points: int
+    observations: int
+    descriptors: int
+    extractor_fingerprint: str
+    source: str
+    licence: str
+
+
 class Snapshot:
     """Maps as of one version of the table `maps`.
 
@@ -99,17 +122,38 @@ class Snapshot:
         self._children = children
 
     def maps(self, *, include_retired: bool = False) -> list[MapSummary]:
-        """The maps of the snapshot, oldest first."""
+        """The maps with a place, oldest first; those without are `unplaced_maps`."""
+        return [_summary(row) for row in self._oldest_first(include_retired) if has_place(row)]
+
+    def unplaced_maps(self, *, include_retired: bool = False) -> list[UnplacedSummary]:
+        """The maps without a place, oldest first."""
+        rows = self._oldest_first(include_retired)
+        return [_unplaced_summary(row) for row in rows if not has_place(row)]
+
+    def _oldest_first(self, include_retired: bool) -> list[Row]:
         rows = [row for row in self._rows.values() if include_retired or row["status"] != RETIRED]
-        return [_summary(row) for row in sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))]
+        return sorted(rows, key=lambda r: (r["created_at"], r["map_id"]))
 
     def get(self, map_id: str) -> MapSummary:
+        """The summary of one map with a place, retired or not.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map.
+            UnplacedMapError: it has no place.
+        """
+        row = self._row(map_id)
+        if not has_place(row):
+            raise _without_place(row)
+        return _summary(row)
+
+    def get_any(self, map_id: str) -> MapSummary | UnplacedSummary:
         """The summary of one map, retired or not.
 
         Raises:
             MapNotFoundError: the snapshot has no such map.
         """
-        return _summary(self._row(map_id))
+        row = self._row(map_id)
+        return _summary(row) if has_place(row) else _unplaced_summary(row)
 
     def lineages(self) -> dict[str, Lineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""
@@ -121,7 +165,33 @@ class Snapshot:
         return [m for m in self.maps() if m.epsg == epsg and m.box and m.box.touches(e0, n0, e1, n1)]
 
     def load_map(self, map_id: str) -> FeatureMap:
-        """The map exactly as it was committed; only its status may differ.
+        """The map with a place exactly as it was committed; only its status may differ.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map.
+            UnplacedMapError: it has no place.
+            StoreError: rows are missing or unreadable.
+        """
+        if not has_place(self._row(map_id)):
+            raise _without_place(self._row(map_id))
+        loaded = self.load_any(map_id)
+        assert isinstance(loaded, FeatureMap)
+        return loaded
+
+    def load_unplaced(self, map_id: str) -> UnplacedMap:
+        """The map without a place exactly as it was committed; only its status may differ.
+
+        Raises:
+            MapNotFoundError: the snapshot has no such map, or it has a place.
+            StoreError: rows are missing or unreadable.
+        """
+        loaded = self.load_any(map_id)
+        if isinstance(loaded, FeatureMap):
+            raise MapNotFoundError(f"map {map_id} has a place; expected one without")
+        return loaded
+
+    def load_any(self, map_id: str) -> AnyMap:
+        """The map, with a place or without, exactly as it was committed; only its status may differ.
 
         Raises:
             MapNotFoundError: the snapshot has no such map.
@@ -172,6 +242,28 @@ class Snapshot:
             filter=ds.field("write_id") == write_id, use_threads=False
         ).to_batches()
         return batches
+
+
+def _without_place(row: Row) -> UnplacedMapError:
+    no_place = decode_no_place(row)
+    ways = "; ".join(no_place.ways) or "docs/anchoring.md has the ways"
+    return UnplacedMapError(
+        f"map {row['map_id']} has no place on Earth ({no_place.reason}), and this needs one; {ways}"
+    )
+
+
+def _unplaced_summary(row: Row) -> UnplacedSummary:
+    return UnplacedSummary(
+        frame=OwnFrame(metric=row["frame_is_metric"], upright=row["frame_is_upright"]),
+        no_place=decode_no_place(row),
+        **{name: row[name] for name in _AS_STORED},
+    )
+
+
+_AS_STORED = (
+    "map_id", "write_id", "content_digest", "name", "status", "status_reason", "created_at", "images",
+    "points", "observations", "descriptors", "extractor_fingerprint", "source", "licence",
+)  # fmt: skip
 
 
 def _summary(row: Row) -> MapSummary:

@@ -22,10 +22,12 @@ from featuredb.store.tables import (
     CANARIES,
     CANDIDATES,
     CHILD_TABLES,
+    IMAGES,
     LIDAR,
     LIDAR_POINTS,
     LIDAR_TABLES,
     MAPS,
+    POINTS,
     SPECS,
 )
 
@@ -39,6 +41,17 @@ _CAMERAS_VIEW = """
     FROM (SELECT map_id, camera_keys, unnest(cameras) AS c, generate_subscripts(cameras, 1) - 1 AS camera_id
           FROM stored_maps WHERE status <> 'retired')
 """
+# Rows of maps without a place have no UTM coordinates, zone and tile.
+_CHILD_VIEW = """
+    CREATE VIEW {name} AS
+    SELECT * EXCLUDE (write_id) REPLACE ({places} nullif(zone, 0) AS zone,
+        CASE WHEN zone <> 0 THEN tile END AS tile)
+    FROM stored_{name}
+"""
+_UTM_OR_NULL = "".join(
+    f"CASE WHEN zone <> 0 THEN {name} END AS {name}, " for name in ("easting", "northing", "height")
+)
+_PLACES = {IMAGES: _UTM_OR_NULL, POINTS: _UTM_OR_NULL}
 _LIDAR_VIEW = f"CREATE VIEW {LIDAR} AS SELECT * EXCLUDE (write_id, points_checksum) FROM stored_{LIDAR}"
 _LIDAR_POINTS_VIEW = f"""
     CREATE VIEW {LIDAR_POINTS} AS
@@ -108,7 +121,7 @@ class SqlSession:
         self._connection.execute(_CAMERAS_VIEW)
         for name in CHILD_TABLES:
             self._connection.register(f"stored_{name}", self.snapshot.dataset(name, include_retired=False))
-            self._connection.execute(f"CREATE VIEW {name} AS SELECT * EXCLUDE (write_id) FROM stored_{name}")
+            self._connection.execute(_CHILD_VIEW.format(name=name, places=_PLACES.get(name, "")))
 
     def _register_scans(self, database: Database) -> None:
         rows = _without_zone(scan_rows_table(scan_rows(database)))

@@ -11,7 +11,12 @@ from dataclasses import dataclass
 
 import pyarrow as pa
 
-FORMAT_VERSION = 1
+# Format 2 holds maps without a place: what says where a map lies may be null in `maps`, and `points` have
+# coordinates in the map's own frame. Format 1 is read and written, and becomes 2 by `featuredb upgrade`.
+FORMAT_VERSION = 2
+READABLE_FORMATS = (1, 2)
+# Partition of rows of maps without a place; their easting, northing and height are NaN.
+NO_ZONE, NO_TILE = 0, "unplaced"
 
 MAPS = "maps"
 IMAGES = "images"
@@ -70,6 +75,7 @@ _UTM = [_required(name, pa.float64()) for name in ("easting", "northing", "heigh
 _PARTITION = [_required("zone", pa.int32()), _required("tile", pa.string())]
 
 BOUNDS = ("min_easting", "min_northing", "min_height", "max_easting", "max_northing", "max_height")
+OWN_COORDINATES = ("x", "y", "z")  # of points of maps without a place, in their own frame
 POINT_COVARIANCE = ("cov_ee", "cov_en", "cov_eu", "cov_nn", "cov_nu", "cov_uu")
 
 _MAPS_SCHEMA = pa.schema(
@@ -81,32 +87,35 @@ _MAPS_SCHEMA = pa.schema(
         _required("status", pa.string()),
         _required("status_reason", pa.string()),
         _required("created_at", pa.timestamp("us", tz="UTC")),
-        _required("epsg", pa.int32()),
-        _required("height_datum", pa.string()),
+        pa.field("epsg", pa.int32()),
+        pa.field("height_datum", pa.string()),
         *(pa.field(name, pa.float64()) for name in BOUNDS),
         _required("tiles", _STRINGS),
         _required("images", pa.int64()),
         _required("points", pa.int64()),
         _required("observations", pa.int64()),
         _required("descriptors", pa.int64()),
-        _required("method", pa.string()),
+        pa.field("method", pa.string()),
         _required("generation", pa.int32()),
         _required("parents", _STRINGS),
-        _required("residual_rms_m", pa.float64()),
-        _required("origin_latitude_deg", pa.float64()),
-        _required("origin_longitude_deg", pa.float64()),
-        _required("origin_height_m", pa.float64()),
-        _required("local_from_sfm_scale", pa.float64()),
-        _required("local_from_sfm_rotation", _DOUBLES),
-        _required("local_from_sfm_translation", _DOUBLES),
-        _required("placement_covariance", _DOUBLES),
-        _required("placement_evidence", pa.string()),
+        pa.field("residual_rms_m", pa.float64()),
+        pa.field("origin_latitude_deg", pa.float64()),
+        pa.field("origin_longitude_deg", pa.float64()),
+        pa.field("origin_height_m", pa.float64()),
+        pa.field("local_from_sfm_scale", pa.float64()),
+        pa.field("local_from_sfm_rotation", _DOUBLES),
+        pa.field("local_from_sfm_translation", _DOUBLES),
+        pa.field("placement_covariance", _DOUBLES),
+        pa.field("placement_evidence", pa.string()),
         _required("camera_keys", _STRINGS),
         _required("cameras", pa.list_(pa.field("element", _CAMERA, nullable=False))),
         _required("extractor_fingerprint", pa.string()),
         _required("source", pa.string()),
         _required("licence", pa.string()),
         _required("provenance", pa.string()),
+        pa.field("frame_is_metric", pa.bool_()),
+        pa.field("frame_is_upright", pa.bool_()),
+        pa.field("no_place", pa.string()),
     ]
 )
 
@@ -146,6 +155,7 @@ _POINTS_SCHEMA = pa.schema(
         _required("error_px", pa.float32()),
         *(_required(name, pa.float32()) for name in POINT_COVARIANCE),
         *_PARTITION,
+        *(pa.field(name, pa.float64()) for name in OWN_COORDINATES),
     ]
 )
 

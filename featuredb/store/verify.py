@@ -17,6 +17,7 @@ from featuredb.store.candidate_upkeep import check_canaries, check_candidates, g
 from featuredb.store.candidates import count_candidates
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
+from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
@@ -37,7 +38,10 @@ from featuredb.store.tables import (
     LIDAR_POINTS,
     LIDAR_TABLES,
     MAPS,
+    NO_TILE,
+    NO_ZONE,
     OBSERVATIONS,
+    OWN_COORDINATES,
     POINTS,
     TABLES,
 )
@@ -145,7 +149,8 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
     tables: dict[str, pa.Table] = {}
     for name in CHILD_TABLES:
         try:
-            tables[name] = snapshot.dataset(name).to_table(_LIGHT_COLUMNS[name], filter=mine)
+            columns = [*_LIGHT_COLUMNS[name], *(OWN_COORDINATES if not has_place(row) and name == POINTS else ())]
+            tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
             yield Problem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
     if len(tables) < len(CHILD_TABLES):
@@ -153,13 +158,13 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
     found = [
         *_check_counts(row, tables),
         *_check_references(row, tables),
-        *_check_places(row, tables),
+        *(_check_places(row, tables) if has_place(row) else _check_no_place(tables)),
     ]
     yield from (Problem(where=where, what=what) for what in found)
     if found:
         return
     try:
-        digest = content_digest(snapshot.load_map(row["map_id"]))
+        digest = content_digest(snapshot.load_any(row["map_id"]))
     except FeatureDbError as error:
         yield Problem(where=where, what=f"cannot be loaded: {_one_line(error)}")
         return
@@ -219,6 +224,22 @@ def _check_references(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
     lost = int(((camera < 0) | (camera >= len(row["cameras"]))).sum())
     if lost:
         yield f"{lost} images name a camera that is not there"
+
+
+def _check_no_place(tables: dict[str, pa.Table]) -> Iterator[str]:
+    """Coordinates of the own frame finite; nothing that could be taken for a place."""
+    for name, table in tables.items():
+        if pc.any(pc.not_equal(table["zone"], NO_ZONE)).as_py() or pc.any(
+            pc.not_equal(table["tile"], NO_TILE)
+        ).as_py():
+            yield f"{name}: rows in a zone or tile, of a map without a place"
+    for name in (IMAGES, POINTS):
+        if np.isfinite(_utm(tables[name])).any():
+            yield f"{name}: UTM coordinates, of a map without a place"
+    points = tables[POINTS]
+    own = np.column_stack([points[name].to_numpy() for name in OWN_COORDINATES])
+    if not np.isfinite(own).all():
+        yield "points: coordinates that are not finite"
 
 
 def _check_places(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:

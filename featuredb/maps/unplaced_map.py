@@ -1,0 +1,141 @@
+"""A feature map without a place on Earth: a reconstruction in a frame of its own.
+
+It is another type than `FeatureMap`, so that nothing that needs a place takes one by mistake. A placement makes
+a FeatureMap of it, under the same map id.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, TypeAlias, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import (
+    FeatureMap,
+    MapImage,
+    MapObservations,
+    PointColumns,
+    check_parts,
+    check_points,
+)
+
+UnplacedStatus = Literal["unplaced", "retired"]
+UNPLACED_STATUSES: tuple[UnplacedStatus, ...] = ("unplaced", "retired")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnFrame:
+    """The right-handed frame of a map without a place; its origin means nothing.
+
+    Attributes:
+        metric: one unit is one metre, up to what the map's evidence says. Otherwise the scale is arbitrary: the
+            median distance from a camera to the points that it sees is set to `NOMINAL_DISTANCE`.
+        upright: z is up. Otherwise the axes are arbitrary.
+    """
+
+    metric: bool
+    upright: bool
+
+
+# Units; between a photo of a front and one from a drone, so that numbers are of a size that people expect.
+NOMINAL_DISTANCE = 50.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NoPlace:
+    """Why a map has no place, and what would give it one.
+
+    Attributes:
+        reason_code: as in ingest reports (TOO_FEW, RESIDUALS, DEGENERATE_LINE, ...).
+        reason: a sentence for people.
+        ways: commands or means that would place it, a sentence each.
+        evidence: figures behind the reason, JSON-able.
+    """
+
+    reason_code: str
+    reason: str
+    ways: tuple[str, ...] = ()
+    evidence: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.reason_code or not self.reason:
+            raise InvalidValueError("NoPlace: expected a reason code and a reason, found none")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OwnPoints(PointColumns):
+    """The 3D points of a map without a place.
+
+    Attributes:
+        xyz: (n, 3) float64 in the map's own frame.
+    """
+
+    xyz: FloatArray
+
+    def __post_init__(self) -> None:
+        check_points(self, "xyz")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "OwnPoints":
+        """Some rows, by a mask (n,) or their numbers."""
+        return OwnPoints(xyz=self.xyz[rows], **self.columns(rows))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class UnplacedMap:
+    """A reconstruction without a place, complete.
+
+    Attributes:
+        map_id, name, cameras, camera_keys, observations, extractor_fingerprint, parents, source, licence,
+            provenance: as in FeatureMap.
+        frame: of poses, points and covariances.
+        images: as in FeatureMap; `cam_from_local` leads from the own frame to the camera.
+        points: in the own frame.
+        no_place: why it has no place, and what would give it one.
+        status: unplaced or retired.
+
+    Raises:
+        InvalidValueError: parts that contradict each other, or an unknown status.
+    """
+
+    map_id: str
+    name: str
+    frame: OwnFrame
+    cameras: tuple[Camera, ...]
+    images: tuple[MapImage, ...]
+    points: OwnPoints
+    observations: MapObservations
+    no_place: NoPlace
+    extractor_fingerprint: str
+    camera_keys: tuple[str, ...] = ()
+    status: UnplacedStatus = "unplaced"
+    parents: tuple[str, ...] = ()
+    source: str = ""
+    licence: str = ""
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not self.map_id:
+            raise InvalidValueError("UnplacedMap: expected a map_id, found an empty one")
+        if self.status not in UNPLACED_STATUSES:
+            raise InvalidValueError(
+                f"UnplacedMap {self.map_id}: expected a status of {UNPLACED_STATUSES}, found {self.status!r}"
+            )
+        check_parts(f"UnplacedMap {self.map_id}", self)
+
+    def points_local(self) -> FloatArray:
+        """Points (n, 3) in the own frame."""
+        return self.points.xyz
+
+    def with_status(self, status: UnplacedStatus) -> "UnplacedMap":
+        return replace(self, status=status)
+
+
+AnyMap: TypeAlias = FeatureMap | UnplacedMap
+# A function over maps of either kind that gives back what it was given.
+MapKind = TypeVar("MapKind", FeatureMap, UnplacedMap)
