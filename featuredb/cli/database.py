@@ -6,7 +6,7 @@
 import argparse
 import csv
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from featuredb.cli import candidates, lineage
@@ -21,10 +21,11 @@ from featuredb.cli.common import (
     version_or_time,
     write_json,
 )
-from featuredb.store import Database
+from featuredb.store import Database, UnplacedSummary
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.scans import list_scans, retire_scan
 from featuredb.store.sql import SqlResult, SqlSession
+from featuredb.store.tables import FORMAT_VERSION
 from featuredb.store.verify import verify
 
 _DEFAULTS = VacuumOptions()
@@ -63,6 +64,7 @@ def register(subparsers: Any) -> None:
     lineage.register(subparsers)
     candidates.register(subparsers)
     _command(subparsers, "compact", run_compact, "merge small files")
+    _command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
 
 
@@ -75,8 +77,9 @@ def run_init(args: argparse.Namespace) -> int:
 def run_maps(args: argparse.Namespace) -> int:
     snapshot = open_database(args).snapshot(args.as_of)
     maps = snapshot.maps(include_retired=args.all)
+    unplaced = snapshot.unplaced_maps(include_retired=args.all)
     if args.json:
-        wanted = {m.map_id for m in maps}
+        wanted = {m.map_id for m in maps} | {m.map_id for m in unplaced}
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0
@@ -93,7 +96,36 @@ def run_maps(args: argparse.Namespace) -> int:
         for m in maps
     ]  # fmt: skip
     sys.stdout.write(format_table(header, rows_))
+    _write_unplaced(unplaced)
     return 0
+
+
+def _write_unplaced(unplaced: Sequence[UnplacedSummary]) -> None:
+    """The maps without a place, with what would give them one."""
+    if not unplaced:
+        return
+    header = (
+        "map without a place",
+        "name",
+        "status",
+        "metric",
+        "upright",
+        "images",
+        "points",
+        "why",
+        "committed",
+    )
+    rows = [
+        (
+            m.map_id, m.name, m.status, "yes" if m.frame.metric else "no", "yes" if m.frame.upright else "no",
+            m.images, m.points, m.no_place.reason_code, m.created_at,
+        )
+        for m in unplaced
+    ]  # fmt: skip
+    sys.stdout.write("\n" + format_table(header, rows))
+    for m in unplaced:
+        sys.stdout.write(f"{m.map_id}: {m.no_place.reason}\n")
+        sys.stdout.writelines(f"  {way}\n" for way in m.no_place.ways)
 
 
 def run_history(args: argparse.Namespace) -> int:
@@ -162,6 +194,15 @@ def run_rollback(args: argparse.Namespace) -> int:
 def run_compact(args: argparse.Namespace) -> int:
     for table, saved in compact(open_database(args)).items():
         sys.stdout.write(f"{table}: {saved} files less\n")
+    return 0
+
+
+def run_upgrade(args: argparse.Namespace) -> int:
+    found = open_database(args).upgrade()
+    if found == FORMAT_VERSION:
+        sys.stdout.write(f"format {found} already, nothing to do\n")
+    else:
+        sys.stdout.write(f"format {found} became {FORMAT_VERSION}; older releases cannot read it any more\n")
     return 0
 
 

@@ -102,8 +102,8 @@ class PointColumns:
         rgb: (n, 3) uint8.
         track_length: (n,) int32, number of images that see the point.
         error_px: (n,) float32, mean reprojection error in full-size pixels.
-        covariance: (n, 6) float32, upper triangle (xx, xy, xz, yy, yz, zz) of the covariance along the axes of
-            the map's frame, square units of it, relative to the map's gauge.
+        covariance: (n, 6) float32, upper triangle (xx, xy, xz, yy, yz, zz) of the covariance along the axes
+            of the map's frame, square units of it, relative to the map's gauge.
     """
 
     rgb: NDArray[np.uint8]

@@ -1,7 +1,7 @@
 """A feature map without a place on Earth: a reconstruction in a frame of its own.
 
-It is another type than `FeatureMap`, so that nothing that needs a place takes one by mistake. A placement makes
-a FeatureMap of it, under the same map id.
+It is another type than `FeatureMap`, so that nothing that needs a place takes one by mistake. A placement
+makes a FeatureMap of it, under the same map id.
 """
 
 from dataclasses import dataclass, field, replace
@@ -31,8 +31,8 @@ class OwnFrame:
     """The right-handed frame of a map without a place; its origin means nothing.
 
     Attributes:
-        metric: one unit is one metre, up to what the map's evidence says. Otherwise the scale is arbitrary: the
-            median distance from a camera to the points that it sees is set to `NOMINAL_DISTANCE`.
+        metric: one unit is one metre, up to what the map's evidence says. Otherwise the scale is arbitrary:
+            the median distance from a camera to the points that it sees is set to `NOMINAL_DISTANCE`.
         upright: z is up. Otherwise the axes are arbitrary.
     """
 

@@ -4,4 +4,13 @@ from featuredb.store.commits import HistoryEntry
 from featuredb.store.database import CommitResult, Database, StatusResult
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary, UtmBox
 
-__all__ = ["CommitResult", "Database", "HistoryEntry", "MapSummary", "Snapshot", "StatusResult", "UnplacedSummary", "UtmBox"]
+__all__ = [
+    "CommitResult",
+    "Database",
+    "HistoryEntry",
+    "MapSummary",
+    "Snapshot",
+    "StatusResult",
+    "UnplacedSummary",
+    "UtmBox",
+]

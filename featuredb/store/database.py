@@ -340,7 +340,7 @@ class Database:
     def upgrade(self) -> int:
         """Bring the tables of maps to the newest format; returns the format that the database had.
 
-        All maps and snapshots stay as they are. `maps` comes last: until then the database is of the old format.
+        All maps and snapshots stay as they are. `maps` comes last: until then the format is the old one.
 
         Raises:
             ConflictError: other writers were faster too many times.

@@ -22,10 +22,12 @@ from featuredb.store.tables import (
     BOUNDS,
     IMAGES,
     MAPS,
+    NO_PLACE_COLUMNS,
     NO_TILE,
     NO_ZONE,
     OBSERVATIONS,
     OWN_COORDINATES,
+    PLACE_COLUMNS,
     POINT_COVARIANCE,
     POINTS,
     SPECS,
@@ -66,7 +68,7 @@ def content_digest(feature_map: AnyMap) -> str:
     digest = hashlib.sha256()
     row = _map_row(feature_map, "", datetime.fromtimestamp(0, tz=UTC), [], digest="")
     # A placed map has the digest that format 1 gave it.
-    new = _OWN_COLUMNS if isinstance(feature_map, FeatureMap) else ()
+    new = NO_PLACE_COLUMNS if isinstance(feature_map, FeatureMap) else ()
     for name in ("status", "status_reason", *new):
         row.pop(name)
     row["created_at"] = ""
@@ -80,9 +82,6 @@ def content_digest(feature_map: AnyMap) -> str:
     ):  # fmt: skip
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-_OWN_COLUMNS = ("frame_is_metric", "frame_is_upright", "no_place")
 
 
 def _coordinates(feature_map: AnyMap) -> FloatArray:
@@ -101,7 +100,7 @@ def _place_columns(feature_map: AnyMap) -> Row:
     if isinstance(feature_map, UnplacedMap):
         no_place = dataclasses.asdict(feature_map.no_place)
         return {
-            **dict.fromkeys(_PLACE_COLUMNS),
+            **dict.fromkeys((*PLACE_COLUMNS, *BOUNDS)),
             "generation": 0,
             "frame_is_metric": feature_map.frame.metric,
             "frame_is_upright": feature_map.frame.upright,
@@ -110,7 +109,7 @@ def _place_columns(feature_map: AnyMap) -> Row:
     utm, placement, frame = feature_map.points.utm, feature_map.placement, feature_map.frame
     bounds = [*utm.min(axis=0).tolist(), *utm.max(axis=0).tolist()] if len(utm) else [None] * 6
     return {
-        **dict.fromkeys(_OWN_COLUMNS),
+        **dict.fromkeys(NO_PLACE_COLUMNS),
         "epsg": feature_map.epsg,
         "height_datum": feature_map.height_datum,
         **dict(zip(BOUNDS, bounds, strict=True)),
@@ -126,23 +125,6 @@ def _place_columns(feature_map: AnyMap) -> Row:
         "placement_covariance": placement.covariance.ravel().tolist(),
         "placement_evidence": _json(feature_map, "placement.evidence", placement.evidence),
     }
-
-
-_PLACE_COLUMNS = (
-    "epsg",
-    "height_datum",
-    *BOUNDS,
-    "method",
-    "residual_rms_m",
-    "origin_latitude_deg",
-    "origin_longitude_deg",
-    "origin_height_m",
-    "local_from_sfm_scale",
-    "local_from_sfm_rotation",
-    "local_from_sfm_translation",
-    "placement_covariance",
-    "placement_evidence",
-)
 
 
 def _map_row(
@@ -180,7 +162,8 @@ def _json(feature_map: AnyMap, field: str, value: dict[str, Any]) -> str:
         return json.dumps(value, sort_keys=True, allow_nan=False)
     except (TypeError, ValueError) as error:
         raise InvalidValueError(
-            f"{type(feature_map).__name__} {feature_map.map_id}.{field}: expected values that JSON can hold: {error}"
+            f"{type(feature_map).__name__} {feature_map.map_id}.{field}: expected values that JSON can hold: "
+            f"{error}"
         ) from error
 
 

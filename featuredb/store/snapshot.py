@@ -85,7 +85,7 @@ class MapSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UnplacedSummary:
-    """A map without a place as its row in `maps` describes it; attributes as in MapSummary and UnplacedMap."""
+    """A map without a place as its row in `maps` describes it; attributes as in the map and MapSummary."""
 
     map_id: str
     write_id: str

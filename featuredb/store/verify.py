@@ -149,7 +149,10 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
     tables: dict[str, pa.Table] = {}
     for name in CHILD_TABLES:
         try:
-            columns = [*_LIGHT_COLUMNS[name], *(OWN_COORDINATES if not has_place(row) and name == POINTS else ())]
+            columns = [
+                *_LIGHT_COLUMNS[name],
+                *(OWN_COORDINATES if not has_place(row) and name == POINTS else ()),
+            ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
             yield Problem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
@@ -229,9 +232,10 @@ def _check_references(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:
 def _check_no_place(tables: dict[str, pa.Table]) -> Iterator[str]:
     """Coordinates of the own frame finite; nothing that could be taken for a place."""
     for name, table in tables.items():
-        if pc.any(pc.not_equal(table["zone"], NO_ZONE)).as_py() or pc.any(
-            pc.not_equal(table["tile"], NO_TILE)
-        ).as_py():
+        if (
+            pc.any(pc.not_equal(table["zone"], NO_ZONE)).as_py()
+            or pc.any(pc.not_equal(table["tile"], NO_TILE)).as_py()
+        ):
             yield f"{name}: rows in a zone or tile, of a map without a place"
     for name in (IMAGES, POINTS):
         if np.isfinite(_utm(tables[name])).any():

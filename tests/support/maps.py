@@ -17,6 +17,7 @@ from featuredb.maps.feature_map import (
     MapPoints,
     Placement,
 )
+from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 
 EPSG = 32632
 EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0
@@ -159,3 +160,28 @@ def _observations(rng: np.random.Generator, points: int, images: int, count: int
 def _covariance(rng: np.random.Generator, size: int) -> NDArray[np.float64]:
     half = rng.normal(0, 0.1, (size, size))
     return half @ half.T
+
+
+def random_unplaced_map(seed: int = 0, *, map_id: str | None = None) -> UnplacedMap:
+    """A map without a place, of the content of `random_map`."""
+    placed = random_map(seed, map_id=map_id)
+    return UnplacedMap(
+        map_id=placed.map_id,
+        name=placed.name,
+        frame=OwnFrame(metric=False, upright=True),
+        cameras=placed.cameras,
+        camera_keys=placed.camera_keys,
+        images=placed.images,
+        points=OwnPoints(xyz=placed.points_local(), **placed.points.columns(np.arange(len(placed.points)))),
+        observations=placed.observations,
+        no_place=NoPlace(
+            reason_code="TOO_FEW",
+            reason="no photo has GPS",
+            ways=("place it by picks",),
+            evidence={"with_gps": 0},
+        ),
+        extractor_fingerprint=placed.extractor_fingerprint,
+        source="random",
+        licence="CC0-1.0",
+        provenance={"seed": seed},
+    )

@@ -24,7 +24,10 @@ class Columns:
 
 
 _DOUBLES = pa.list_(pa.field("element", pa.float64(), nullable=False))
-_STORE_ONLY = ("write_id", "tiles", "zone", "tile", "cameras", "camera_keys")
+_STORE_ONLY = (
+    *("write_id", "tiles", "zone", "tile", "cameras", "camera_keys"),
+    *store.NO_PLACE_COLUMNS,  # a dataset has maps with a place only
+)
 _TYPES = {
     "red": pa.uint8(),
     "green": pa.uint8(),
@@ -150,8 +153,10 @@ def _columns(table: str | None, meaning: dict[str, str], more: list[pa.Field], *
     """The store's columns of a table, retyped, and more."""
     fields = []
     for field in () if table is None else store.SPECS[table].schema:
-        if field.name not in _STORE_ONLY:
-            fields.append(field.with_type(_TYPES.get(field.name, field.type)))
+        own = table == store.POINTS and field.name in store.OWN_COORDINATES
+        if field.name not in _STORE_ONLY and not own:
+            nullable = field.nullable and field.name not in store.PLACE_COLUMNS
+            fields.append(field.with_type(_TYPES.get(field.name, field.type)).with_nullable(nullable))
     schema = pa.schema([*fields, *more])
     assert schema.names == list(meaning)
     return Columns(schema=schema, meaning=meaning, repeating=repeating)

@@ -73,6 +73,8 @@ def load_map(folder: Path, row: Row, listed: frozenset[str]) -> FeatureMap:
             f"{folder}, map {map_id}: the files hold another map than the one that was exported "
             f"(its digest was {row['content_digest']}); get the dataset once more from its source"
         )
+    if not isinstance(feature_map, FeatureMap):
+        raise ExportError(f"{folder}, map {map_id}: expected a map with a place, found one without")
     return feature_map
 
 
