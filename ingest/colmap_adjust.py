@@ -58,7 +58,7 @@ class AdjustOptions:
         radial_evidence: how many times the information criterion's penalty the gain of RADIAL must be.
             Neighbouring residuals are not independent, as the criterion assumes, hence not 1.
         opencv_evidence: the same for OPENCV with a free principal point. Over flat ground these trade
-            against the cameras' tilt; tools/lens_study.py prints the gains: about 8 on `brighton`, where
+            against the cameras' tilt: the gain was about 8 on `brighton`, where
             they turned cameras by 0.9 degrees between subsets of the photos and fitted a laser scan no
             better than RADIAL, and far more on the simulated drone, whose lens truly is so.
         max_center_shift_rel: an OPENCV lens whose principal point moved further from the middle (a share of

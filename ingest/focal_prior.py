@@ -37,7 +37,7 @@ class FocalPriorOptions:
         weight: how many times an independent residual of one sigma the prior counts, of the size that the
             residuals have with what neighbours share (`ingest.precision.shared_variance_px2`). Above one
             because a lens model's faults are common to whole photos too, which neighbours do not show: with
-            50 `brighton` comes to 2325 px (`tools/lens_study.py --focal-weights`). Where residuals are those
+            50 `brighton` comes to 2325 px, where its scan says 2296. Where residuals are those
             of keypoints alone, as in simulated photos, the photos still decide.
     """
 

@@ -32,8 +32,8 @@ class MatchOptions:
         max_angle_rad: no match between descriptors further apart (COLMAP's 0.7).
         max_error_px: of the two-view geometry, at `error_reference_side_px`, growing with the image.
         error_reference_side_px: keypoints are located on images of about this size.
-        min_inliers: pairs with fewer verified matches do not count. Pairs of different places had none at
-            all (tools/pair_inliers.py); repeated structure gives more, and two good photos hundreds.
+        min_inliers: pairs with fewer verified matches do not count. Pairs of `brighton` and `lewis` had
+            none at all; repeated structure gives more, and two good photos hundreds.
         overlays: what is a watermark, and what is a copy.
         seed: of RANSAC.
     """

@@ -39,8 +39,7 @@ class PairOptions:
         time_neighbours: following photos of the same owner and camera by capture time, each photo.
         look_neighbours: photos most similar by aggregated descriptor, each photo with a precise position:
             positions can be wrong. Most of them are GPS neighbours anyway.
-        retrieval_neighbours: the same for photos without a precise position; tools/retrieval_recall.py
-            prints the share of overlapping pairs that this finds.
+        retrieval_neighbours: the same for photos without a precise position.
         features_per_photo: strongest features that the aggregated descriptor is made of.
         pairs_per_photo: at most so many, best proposals first: a photo that everybody finds similar, a
             blank one for example, is matched with no more.

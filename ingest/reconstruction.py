@@ -51,8 +51,7 @@ class MapMakingOptions:
         cameras: which photos share intrinsics (ingest.photo_cameras).
         min_tie: points that two photos have in common if they tie the map together; what hangs on others by
             fewer is a map of its own, or in none. In a simulated community of 5,000 photos 58 of 70 that hung
-            by fewer than 30 were wrong, 44 of 126 that hung by 30 to 49, and 324 of 4,261 others
-            (`python -m tools.look_alike_joints`).
+            by fewer than 30 were wrong, 44 of 126 that hung by 30 to 49, and 324 of 4,261 others.
     """
 
     extractor: ExtractorOptions = field(default_factory=ExtractorOptions)

@@ -24,7 +24,7 @@ from ingest.register.gps import GpsPlacement
 class ElsewhereOptions:
     """When positions that do not fit say that their photos are elsewhere.
 
-    In two simulated communities (500 and 5,000 photos, geotags of 8 m; `python -m tools.look_alike_joints`)
+    In two simulated communities (500 and 5,000 photos, geotags of 8 m)
     five groups that look-alikes had joined were off by 5.4 to 11 times the noise, two that were wrong
     by 13 and 21 m by less; 62 groups of right photos by up to 4.1 times, one by 1.4 km: its tags were wrong.
 

@@ -10,13 +10,13 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import GeoPrior
 from reloc.result import Evidence, Reason
 
-# The fit that tools/acceptance_study.py prints.
+# Fitted on right and wrong poses of a simulated town and of real photos.
 _CONFIDENCE_BASE, _CONFIDENCE_PER_LOG, _CONFIDENCE_PER_RIVAL = -4.46, 1.36, -2.08
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AcceptanceOptions:
-    """Where the line is. tools/acceptance_study.py draws the distributions behind the numbers.
+    """Where the line is, by right and wrong poses of a simulated town and of real photos.
 
     Attributes:
         min_inliers: fewer are never believed.
@@ -27,8 +27,8 @@ class AcceptanceOptions:
         min_spread: smallest `spread` of a photo whose prior does not say where it was taken. A look-alike
             that fills a part of a photo gives many inliers there and none beside it. Photos of a simulated
             walk beyond the maps' reach, 116 and 601 m off, had 0.56 and 0.50 with 223 and 81 inliers; right
-            ones there 0.77 and more, in a town of look-alikes 0.62 and more (`tools/retrieval_study.py
-            --each`). It costs right photos half of which is covered by something else; they need a prior.
+            ones there 0.77 and more, in a town of look-alikes 0.62 and more. It costs right photos half of
+            which is covered by something else; they need a prior.
         prior_tells_m: largest standard deviation of a prior that tells look-alikes apart; that the pose
             agrees with it is asked of every prior.
         rival_share: a pose elsewhere with this share of the winner's inliers makes the answer ambiguous.
@@ -192,7 +192,7 @@ def verdict(
 def confidence(evidence: Evidence, rival_inliers: int) -> float:
     """Probability in [0, 1] that an accepted pose is right.
 
-    Logistic in the evidence, fitted by tools/acceptance_study.py on right and wrong poses of a simulated
+    Logistic in the evidence, fitted on right and wrong poses of a simulated
     town and of real photos (docs/localisation.md), right and wrong ones weighing the same.
     """
     rivalry = rival_inliers / max(evidence.inliers, 1)

@@ -52,7 +52,7 @@ class LensPriors:
             one radial coefficient leaves a pattern that passes for another focal length, and the covariance
             knows nothing of it: photos of a drone's lens had errors of 0.39 m at the median and 3.2 m at
             most, their squared normalised errors a mean of 66 where 3 is right; with whole lenses 0.17 m,
-            0.6 m and 4.4 (`tools/video_map.py`).
+            0.6 m and 4.4.
         second_radial, tangential, aspect: k2; p1 and p2; the second focal length over the first, less one.
     """
 

@@ -16,7 +16,7 @@ from reloc.candidates import Cluster
 from reloc.options import MatchOptions
 
 # Beyond the map's own views SIFT finds most of what there is to 30 degrees, some of it to 60, on flat walls
-# and from descents (tools/view_change.py): up to the first a point is missed where it is not found, up to the
+# and from descents: up to the first a point is missed where it is not found, up to the
 # second a match may be one. More is a scene seen from behind, or from under the ground.
 EXPECTED_DEG, POSSIBLE_DEG = 30.0, 60.0
 

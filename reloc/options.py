@@ -18,7 +18,7 @@ class CandidateOptions:
         max_cluster_images: images of one covisibility cluster; about what one photo can see.
         shortlist, shortlist_features: clusters with most votes; where the first of them does not settle it,
             so many of the best spread features are matched against each of the others, and those that match
-            best are tried. `tools/retrieval_study.py` prints what votes alone would miss.
+            best are tried.
         max_clusters: clusters that are tried, best first.
         single_cluster_points: an area with at most so many points in reach is matched as a whole, without
             voting: exhaustive matching against it costs less than voting would.

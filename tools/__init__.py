@@ -1,1 +1,1 @@
-"""Evaluation, benchmark and check programs. Nothing imports them."""
+"""The scoreboard, the programs that its rows run, and checks. Nothing imports them."""

@@ -1,14 +1,13 @@
 """Photos and a scan end to end: a map placed by GPS is anchored on the scan; held-out photos judge it.
 
-    python -m tools.scan_poses SCAN.laz FOLDER --poses poses.json
     python -m tools.anchor_brighton --photos FOLDER --scan SCAN.laz --poses poses.json --held-out A.JPG ...
 
 1. `featuredb ingest photos` makes a map of all photos but the held-out ones (or --database names a database
    that has one, which is copied and left alone).
 2. `featuredb lidar add` adds the scan; `featuredb anchor --auto` places the map by it.
 3. A server answers for each held-out photo, as `featuredb query` asks: nothing but the file.
-4. The answers are compared with poses that tools/scan_poses.py found by registering each photo to the scan
-   directly. Before anchoring, too, to show what it changed.
+4. The answers are compared with poses that tools/scan_poses.py finds by registering each photo to the scan
+   directly (kept in the file of --poses). Before anchoring, too, to show what it changed.
 
 Exit code 0 if the medians lie within the limits and all were answered, else 1.
 """
@@ -28,13 +27,17 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
-from tools.real_photos import Row, ask_poses, ingest, table
+from tools import scan_poses
+from tools.figures import add_json_option, write_figures
+from tools.real_photos import Row, ask_poses, error_figures, ingest, table
 
 _ROOT = Path(__file__).resolve().parent.parent
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
+    if not args.poses.exists():
+        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
     frame, poses = read_poses(args.poses)
     with tempfile.TemporaryDirectory() as scratch:
         work = args.work or Path(scratch)
@@ -56,6 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.write("after, anchored on the scan\n")
         after = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
         sys.stdout.write(table(after, args.max_m, args.max_deg) + "\n")
+    figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
+    write_figures(args.json, figures)
     return _verdict(after, args.max_m, args.max_deg)
 
 
@@ -113,6 +118,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--work", type=Path, default=None, help="keep the database and the report there")
     parser.add_argument("--max-m", type=float, default=0.30, help="of the median; default: 0.30")
     parser.add_argument("--max-deg", type=float, default=0.25, help="of the median; default: 0.25")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -28,6 +28,7 @@ from featuredb.simworld.scan_world import ScanWorld, make_scan_world
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
 from tools.asked_photos import ask
+from tools.figures import add_json_option, write_figures
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -45,8 +46,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         queries = world.world.images("queries") if args.queries else []
         say = sys.stdout.write
         say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
-        for name, path in (("placed by GPS", mapped), ("placed by the scan", database)):
-            _tell(name, Database.open(path), world.world.truth, queries)
+        figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
+        for name, path in (("gps", mapped), ("scan", database)):
+            found = judged(Database.open(path), world.world.truth, queries)
+            say(f"placed by {name}: {found}\n")
+            figures |= {f"{name}_{key}": value for key, value in found.items()}
+        write_figures(args.json, figures)
     return 0 if placed and not refused else 1
 
 
@@ -64,24 +69,21 @@ def anchored(work: Path, mapped: Path, world: ScanWorld, ortho: bool, *, other: 
     return database, featuredb(*words, may_refuse=True) == 0
 
 
-def _tell(name: str, database: Database, truth: Truth, queries: Sequence[Path]) -> None:
+def judged(database: Database, truth: Truth, queries: Sequence[Path]) -> dict[str, float]:
+    """Errors of the map's cameras and of what is answered to queries."""
     snapshot = database.snapshot()
-    feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
-    metres, degrees = camera_errors(feature_map, truth)
-    sys.stdout.write(
-        f"{name}: cameras of the map median {np.median(metres):.3f} m, {np.median(degrees):.3f} degrees; "
-        f"worst {metres.max():.3f} m\n"
-    )
-    if not queries:
-        return
-    errors = [answer.error for answer in ask(database, truth, queries).values() if answer is not None]
-    if errors:
-        position = np.array([e.position_m for e in errors])
-        angle = np.array([e.angle_deg for e in errors])
-        sys.stdout.write(
-            f"{name}: {len(errors)} of {len(queries)} queries answered, median {np.median(position):.3f} m, "
-            f"{np.median(angle):.3f} degrees; worst {position.max():.3f} m\n"
-        )
+    metres, degrees = camera_errors(snapshot.load_map(snapshot.maps()[0].map_id), truth)
+    answers = [a.error for a in ask(database, truth, queries).values() if a is not None] if queries else []
+    asked_m = [e.position_m for e in answers] or [float("nan")]
+    return {
+        "cameras_m": float(np.median(metres)),
+        "cameras_deg": float(np.median(degrees)),
+        "cameras_largest_m": float(metres.max()),
+        "queries": len(queries),
+        "answered": len(answers),
+        "queries_m": float(np.median(asked_m)),
+        "queries_largest_m": max(asked_m),
+    }
 
 
 def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, FloatArray]:
@@ -121,6 +123,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--queries", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
     parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

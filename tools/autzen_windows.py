@@ -1,6 +1,6 @@
 """Windows of an ortho image registered to an airborne scan as nadir telephoto photos, from intensity alone.
 
-    python -m tools.autzen_windows STADIUM.laz STADIUM_ORTHO.tif [--photos FOLDER ...] [--json OUT] [--seed 0]
+    python -m tools.autzen_windows STADIUM.laz STADIUM_ORTHO.tif [--photos FOLDER ...] [--seed 0]
     python -m tools.autzen_windows --given OUT ... --figure docs/figures/autzen_windows.png
 
 The scan is added to a database as any other; its colours are thrown away, for they come from that ortho
@@ -53,6 +53,7 @@ from ingest.register.frame.confirmation import ConfirmOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import VerdictOptions
 from ingest.register.frame_registration import FramePrior
+from tools.figures import add_json_option, write_figures
 from tools.ortho_place import WINDOW_PX, Floats, Place, has_structure, measured_offset, place_of
 
 _STEPS = (225, 200)  # columns, rows between windows
@@ -85,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cv2.setNumThreads(1)
     if args.given:
         rows = [row for path in args.given for row in json.loads(path.read_text())["rows"]]
-        return _report([Outcome(**row) for row in rows], args.figure)
+        return _report([Outcome(**row) for row in rows], args.figure, args.json)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
         added = add_scan(database, [args.scan])
@@ -106,9 +107,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         outcome = _one(place, cloud, kind, column, row, photo, offset, rng)
         outcomes.append(outcome)
         print(_line(outcome), flush=True)
-    if args.json:
-        args.json.write_text(json.dumps({"offset_m": offset.tolist(), "rows": [asdict(o) for o in outcomes]}))
-    return _report(outcomes, args.figure)
+    if args.windows:
+        args.windows.write_text(
+            json.dumps({"offset_m": offset.tolist(), "rows": [asdict(o) for o in outcomes]})
+        )
+    return _report(outcomes, args.figure, args.json)
 
 
 def _photos(
@@ -228,10 +231,10 @@ def _line(o: Outcome) -> str:
     )
 
 
-def _report(outcomes: Sequence[Outcome], figure: Path | None) -> int:
+def _report(outcomes: Sequence[Outcome], figure: Path | None, figures: Path | None) -> int:
     if figure is not None:
         _draw(outcomes, figure)
-    return _summary(outcomes)
+    return _summary(outcomes, figures)
 
 
 def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
@@ -256,7 +259,7 @@ def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
     chart.savefig(path)
 
 
-def _summary(outcomes: Sequence[Outcome]) -> int:
+def _summary(outcomes: Sequence[Outcome], figures: Path | None) -> int:
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
     close = [o for o in structured if o.accepted and o.error_m is not None and o.error_m <= _LIMIT_M]
@@ -275,6 +278,18 @@ def _summary(outcomes: Sequence[Outcome]) -> int:
     print(f"accepted and wrong by more than {_WRONG_M} m: {len(wrong)}")
     print(f"windows of another place: {len(foreign)}, accepted: {len(taken)}")
     print(f"CPU seconds each: median {np.median([o.seconds for o in outcomes]):.1f}")
+    write_figures(
+        figures,
+        {
+            "structured": len(structured),
+            "close": len(close),
+            "rate": rate,
+            "largest_m": max(errors, default=float("nan")),
+            "wrong": len(wrong),
+            "foreign": len(foreign),
+            "foreign_accepted": len(taken),
+        },
+    )
     return 0 if (rate >= _WANTED or not windows) and not wrong and not taken else 1
 
 
@@ -293,7 +308,8 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--kinds", nargs="*", default=list(_KINDS), choices=_KINDS)
     parser.add_argument("--offset", nargs=2, type=float, default=(-7.0, -2.0), help="columns, rows")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--windows", type=Path, help="write what became of each window, for --given")
+    add_json_option(parser)
     args = parser.parse_args(argv)
     if not args.given and args.ortho is None:
         parser.error("give a scan and an ortho image, or --given")

@@ -15,7 +15,6 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
@@ -33,14 +32,13 @@ from ingest.growth.map_graph import drift_m, places_of
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.register.gps import GpsOptions, place_by_gps
+from tools.figures import write_figures
 
 mpl.use("Agg")  # no display is needed
 
 WRONG_M = 2.0  # a photo registered further off than this is wrong
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
-_APART_M, _FIT_SIGMA_M = 1.0, 0.3
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
 _COLOURS = ("tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:brown", "tab:pink")
 
@@ -106,19 +104,6 @@ class Verdict:
     name: str
     text: str
     holds: bool
-
-
-def with_the_rest(centers: FloatArray, true_centers: FloatArray) -> NDArray[np.bool_]:
-    """Which photos (k,) of a model are within a metre of where its others say, by a robust fit to the truth.
-
-    Args:
-        centers: (k, 3) of the cameras in any similar frame. true_centers: (k, 3) metres.
-    """
-    if len(centers) < 3:  # no similarity is known
-        return np.ones(len(centers), dtype=bool)
-    sigmas = np.full(true_centers.shape, _FIT_SIGMA_M)
-    fit = place_by_gps(centers, true_centers, sigmas, GpsOptions())
-    return np.asarray(np.linalg.norm(fit.residuals_m, axis=1) <= _APART_M)
 
 
 def say(text: str) -> None:
@@ -288,8 +273,10 @@ def conclude(out: Path, name: str, verdicts: Sequence[Verdict], figures: dict[st
     document = {
         "lines": {v.name: {"figure": v.text, "holds": v.holds} for v in verdicts},
         "figures": figures,
+        "failed": sum(not v.holds for v in verdicts),
+        "summary": "; ".join(f"{v.name}: {v.text}" for v in verdicts),
     }
-    (out / f"{name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_figures(out / f"{name}.json", document)
     return 0 if all(v.holds for v in verdicts) else 1
 
 

@@ -51,6 +51,7 @@ from ingest.register.gps import similarity_closed_form
 from ingest.scan import ScanOptions, require_usable, scan_folder
 from ingest.workspace import Workspace
 from reloc.localiser import Localiser
+from tools.figures import add_json_option, write_figures
 from tools.growth_common import log_to_stderr
 
 _PORTIONS = 3
@@ -294,6 +295,9 @@ def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: fl
         f"{sim.scale * _viewing_distance(joint):.0f} m; CPU {joint_s:.0f} s joint, {grown_s:.0f} s grown"
         f"{'; missing ' + ', '.join(missing) if missing else ''}"
     )
+    largest_m = float(apart.max(initial=0))
+    figures = {"photos": len(state.photos), "joint": len(reference), "grown": len(both)}
+    write_figures(args.json, figures | {"missing": len(missing), "median_m": median, "largest_m": largest_m})
     return 0 if not missing and median <= _LIMIT_M else 1
 
 
@@ -313,6 +317,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--adjust", action="store_true", help="adjust all maps together at the end")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

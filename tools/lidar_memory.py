@@ -23,6 +23,8 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from pyproj import CRS
 
+from tools.figures import add_json_option, write_figures
+
 CHUNK = 500_000
 EPSG = 32632
 WEST, SOUTH = 560_000.0, 5_930_000.0
@@ -125,6 +127,7 @@ def main() -> int:
     parser.add_argument("--density", type=float, default=20.0, help="points per square metre; default: 20")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--folder", type=Path, required=True, help="for the scan and the database")
+    add_json_option(parser)
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     scan = args.folder / f"scan-{args.points}-{args.density:g}-{args.seed}.las"
@@ -139,7 +142,9 @@ def main() -> int:
     figures["points_per_second"] = args.points / figures["seconds"]
     figures["points_per_cpu_second"] = args.points / figures["cpu_seconds"]
     figures["database_bytes"] = sum(f.stat().st_size for f in database.rglob("*") if f.is_file())
-    sys.stdout.write(json.dumps({k: round(v, 1) for k, v in figures.items()}, indent=2) + "\n")
+    figures = {k: round(v, 1) for k, v in figures.items()}
+    sys.stdout.write(json.dumps(figures, indent=2) + "\n")
+    write_figures(args.json, figures)
     return 0
 
 

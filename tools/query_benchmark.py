@@ -48,6 +48,7 @@ from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.service.threads import capped_process
 from reloc.wire import LocaliseWireRequest, RequestOptions
+from tools.figures import add_json_option, write_figures
 
 MAX_QUERY_MS, MAX_TRANSPORT_MS = 250.0, 10.0
 _SUM_TOLERANCE_MS, _SUM_TOLERANCE_REL = 1.0, 0.02
@@ -118,9 +119,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         localiser = Localiser.open(database)
         direct = run_direct(localiser, args.images, args.repeat)
         served = run_served(database, args.images, args.repeat, args.threads)
-        holds = report_ours(direct, served)
+        holds, figures = report_ours(direct, served)
         if args.pycolmap_images:
             compare(localiser, database, args, direct)
+    write_figures(args.json, figures)
     return 0 if holds else 1
 
 
@@ -163,8 +165,8 @@ def _rounds(ask: Callable[[bytes], LocaliseReply], images: Sequence[Path], repea
     return timed
 
 
-def report_ours(direct: Sequence[Timed], served: Sequence[Timed]) -> bool:
-    """Print both ways of asking; whether the promises hold."""
+def report_ours(direct: Sequence[Timed], served: Sequence[Timed]) -> tuple[bool, dict[str, float]]:
+    """Print both ways of asking; whether the promises hold, and the figures."""
     names = list(dict.fromkeys(name for one in served for name in one.stages_ms))
     lines = [f"{'median ms':<16}{'in process':>12}{'over Zenoh':>12}"]
     for name in names:
@@ -187,7 +189,14 @@ def report_ours(direct: Sequence[Timed], served: Sequence[Timed]) -> bool:
     lines += [f"{'holds' if holds else 'FAILS'}  {text}" for text, holds in checks.items()]
     sys.stdout.write("\n".join(lines) + "\n\n")
     sys.stdout.flush()
-    return all(checks.values())
+    figures = {
+        "wall_ms": walls[1],
+        "in_process_ms": walls[0],
+        "transport_ms": median(transport),
+        "asked": len(served),
+        "localised": localised,
+    }
+    return all(checks.values()), figures
 
 
 def compare(
@@ -366,6 +375,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         metavar="N",
         help="images that pycolmap is asked too; a minute and more each; default: 1",
     )
+    add_json_option(parser)
     parser.add_argument("--own-limits", action="store_true", help="pycolmap's own image size and limits")
     return parser.parse_args(argv)
 

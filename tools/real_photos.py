@@ -19,9 +19,10 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+
+import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
@@ -31,6 +32,7 @@ from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from tools.figures import add_json_option, write_figures
 
 _ROOT = Path(__file__).resolve().parent.parent
 _EVERY = 5  # without --held-out, one photo in so many is held out
@@ -94,9 +96,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"({'within' if in_time else 'more than'} {args.max_ingest_s:g} s); "
         f"{close} of {len(rows)} held-out photos within {args.max_m:g} m and {args.max_deg:g} degrees\n"
     )
-    if args.json is not None:
-        document = {"part": asdict(part), "whole": asdict(whole), "queries": [_plain(r) for r in rows]}
-        args.json.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_figures(
+        args.json,
+        {"usable": part.usable, "registered": part.registered, "ingest_s": part.wall_s} | error_figures(rows),
+    )
     return 0 if complete and in_time and close == len(rows) else 1
 
 
@@ -221,9 +224,19 @@ def _tell(done: Ingest, what: str) -> None:
     sys.stdout.flush()
 
 
-def _plain(row: Row) -> dict[str, Any]:
-    position = None if row.error is None else row.error.position_m
-    return asdict(row) | {"position_m": position}
+def error_figures(rows: Sequence[Row]) -> dict[str, float]:
+    """How many photos were answered, and the errors of the answers."""
+    errors = [row.error for row in rows if row.error is not None]
+    metres = [e.position_m for e in errors] or [float("nan")]
+    degrees = [e.angle_deg for e in errors] or [float("nan")]
+    return {
+        "asked": len(rows),
+        "answered": len(errors),
+        "median_m": float(np.median(metres)),
+        "largest_m": max(metres),
+        "median_deg": float(np.median(degrees)),
+        "largest_deg": max(degrees),
+    }
 
 
 def _children_cpu_s() -> float:
@@ -243,7 +256,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
         "--max-ingest-s", type=float, default=60.0, help="of the photos that are not held out; default: 60"
     )
     parser.add_argument("--work", type=Path, default=None, help="keep both databases and reports there")
-    parser.add_argument("--json", type=Path, default=None, metavar="FILE")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

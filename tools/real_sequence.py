@@ -29,6 +29,7 @@ from ingest.register.gps import similarity_closed_form
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video
+from tools.figures import add_json_option, write_figures
 from tools.growth_common import table
 from tools.real_photos import ingest, reference
 
@@ -74,6 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"largest {largest:.3f} m; {unknown} with a pose that the reconstruction has not; both "
         f"reconstructions differ by {off_m:.3f} m at the median camera\n"
     )
+    figures = {"frames": len(rows), "lost": lost, "median_m": float(middle), "largest_m": float(largest)}
+    write_figures(args.json, figures | {"unknown": unknown})
     return 0 if metres and max(metres) <= _NEAR_M and unknown == 0 else 1
 
 
@@ -108,6 +111,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--photos", type=Path, required=True)
     parser.add_argument("--seconds", type=float, default=1.0, help="from photo to photo (1)")
     parser.add_argument("--work", type=Path, default=None, help="keep databases and cache there")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

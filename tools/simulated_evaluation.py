@@ -17,13 +17,12 @@ for every held-out photo and every negative, and compares with the truth:
   reconstruction itself stays that of the exact positions.
   calibration.png shows normalised errors against their chi-square distribution.
 
-Writes answers.csv, calibration.png, evaluation.json. Exit code 0 if all figures hold, or are too cautious
-where EXIF's sigmas were, else 1.
+Writes answers.csv, calibration.png, and the figures to --json. Exit code 0 if all figures hold, or are too
+cautious where EXIF's sigmas were, else 1.
 """
 
 import argparse
 import csv
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -48,6 +47,7 @@ from reloc.result import LocaliseResult
 from reloc.service.handler import localise_request
 from reloc.wire import LocaliseWireRequest
 from tools.calibration import RECEIVERS, Calibration, Coverage, as_reported, over_placements
+from tools.figures import add_json_option, write_figures
 
 mpl.use("Agg")  # no display is needed
 
@@ -95,7 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         name: {"figure": text, "holds": holds} for name, (text, holds) in figures.items()
     }
     document["coverage"] = {name: asdict(one.coverage) for name, one in calibrations.items()}
-    (args.out / "evaluation.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    write_figures(args.json, document | flat_figures(asked))
     return 0 if all(holds for _, holds in figures.values()) else 1
 
 
@@ -165,6 +165,25 @@ def evaluate(asked: Sequence[Asked], calibrations: dict[str, Calibration]) -> di
         expected = ("holds", "too cautious") if name in CAUTIOUS else ("holds",)
         figures[f"68 % radii, {name}"] = (f"{verdict}, {_shares(one.coverage)}", verdict in expected)
     return figures
+
+
+def flat_figures(asked: Sequence[Asked]) -> dict[str, float]:
+    """Answers to held-out drone photos with their errors; answers where there should be none."""
+    drone = summarise([a.error for a in asked if a.group == "drone"])
+    negatives = [a for a in asked if a.group in NEGATIVE_KINDS]
+    street = [a for a in asked if a.group == "street"]
+    return {
+        "asked": drone.queries,
+        "answered": sum(a.result.pose is not None for a in asked if a.group == "drone"),
+        "within": drone.within,
+        "median_m": drone.position_m[0],
+        "median_deg": drone.angle_deg[0],
+        "wrong": sum(a.error is not None and a.error.position_m > 5.0 for a in asked),
+        "negatives": len(negatives),
+        "negatives_answered": sum(a.result.pose is not None for a in negatives),
+        "street": len(street),
+        "street_answered": sum(a.result.pose is not None for a in street),
+    }
 
 
 def _shares(coverage: Coverage) -> str:
@@ -276,6 +295,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--limit", type=int, default=None, metavar="N", help="ask for N photos of each kind only"
     )
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

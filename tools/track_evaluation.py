@@ -94,13 +94,15 @@ class Tracked:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    database = anchored_map(args.out, args.size, args.seed, args.workers)
+    inputs = args.inputs or args.out
+    database = anchored_map(args.out, args.size, args.seed, args.workers, inputs)
     results: dict[str, Tracked] = {}
     figure, axes = plt.subplots(len(args.films), 1, figsize=(9, 2.4 * len(args.films)), squeeze=False)
     for name, ax in zip(args.films, axes[:, 0], strict=True):
         options = film_options(name, args.size, args.seed, args.frames, args.readout_ms)
         rolling = f"-{args.readout_ms:g}ms" if args.readout_ms else ""
-        folder = write_film(args.out / f"film-{name}{rolling}", options, args.workers, _progress(name))
+        film = inputs / f"film-{args.size}-{args.seed}-{name}-{args.frames}{rolling}"
+        folder = write_film(film, options, args.workers, _progress(name))
         truth = read_film_truth(folder)
         camera = None if args.lens == "estimated" else truth.camera
         finder = finder_on(args.on, database, truth, args.seed)
@@ -124,11 +126,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return conclude(args.out, "track", verdicts(results, args.on), {n: asdict(r) for n, r in results.items()})
 
 
-def anchored_map(out: Path, size: str, seed: int, workers: int) -> Path:
+def anchored_map(out: Path, size: str, seed: int, workers: int, inputs: Path | None = None) -> Path:
     """A database with the map of the drone's photos, placed on the scan; kept in a folder of `out`."""
     out = out / f"{size}-{seed}"
     out.mkdir(parents=True, exist_ok=True)
-    world = make_scan_world(out / "world", seed, "short" if size == "short" else "full", workers)
+    folder = out / "world" if inputs is None else inputs / f"scan-world-{size}-{seed}"
+    world = make_scan_world(folder, seed, "short" if size == "short" else "full", workers)
     done = out / "anchored.txt"
     if not done.exists():
         mapped = out / "mapped"
@@ -323,6 +326,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--readout-ms", type=float, default=0.0, help="rolling shutter, from the first row to the last (0)"
     )
+    parser.add_argument("--inputs", type=Path, default=None, help="keep world and films there, not in --out")
     parser.add_argument("--overlay", action="store_true", help="track once more and draw it")
     parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
     return parser.parse_args(argv)

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -80,7 +81,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             holds=done - began <= _SECONDS,
         ),
     ]
-    figures: dict[str, dict[str, float | None]] = {}
+    figures: dict[str, Any] = {
+        "keyframes": len(feature_map.images),
+        "keyframes_m": float(np.median(off)),
+        "keyframes_largest_m": float(off.max()),
+        "placed": int(placed),
+        "made_s": ingested - began,
+        "anchored_s": done - ingested,
+    }
     served = Database.open(database)
     for name, answers in (
         ("photos of a known lens", ask(served, truth, asked, lens="known")),

@@ -28,8 +28,8 @@ class IndexOptions:
     """How the index of a large area is built and searched.
 
     Attributes:
-        probes: inverted lists visited for each query descriptor. Recall of the true neighbour against
-            probes is printed by tools/index_recall.py.
+        probes: inverted lists visited for each query descriptor. More find the true neighbour oftener, and
+            take longer.
         mmap_from_bytes: files at least this large are memory-mapped instead of read.
     """
 

@@ -31,7 +31,7 @@ def _search(
     """FAISS's search in one thread.
 
     Its OpenMP and that of its OpenBLAS get into each other's way: two threads take two thirds of the time on
-    two idle cores, and three times as long beside other work (tools/nearest_threads.py, alone and so).
+    two idle cores, and three times as long beside other work.
     """
     before = faiss.omp_get_max_threads()
     faiss.omp_set_num_threads(1)

@@ -3,7 +3,7 @@
 How far a chain of maps may have drifted, the pose graph says well; in which direction, it does not. It finds
 height and tilt the weakest, and takes what lenses turn for equal about all axes that they turn; a chain may
 bend to one side by more than it says for that side, while the bound of each map, that of its worst direction,
-holds (`tools/drift_axes.py` prints both along a simulated walk; docs/growth.md).
+holds (measured along a simulated walk; docs/growth.md).
 """
 
 from dataclasses import replace

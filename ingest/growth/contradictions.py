@@ -23,7 +23,7 @@ from ingest.precision import linearise
 
 # What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
 # corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
-# `brighton`'s lens is off by 1.3 % (tools/lens_study.py).
+# `brighton`'s lens is off by 1.3 %.
 FOCAL_REL = 0.01
 
 

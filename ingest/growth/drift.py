@@ -38,8 +38,8 @@ class DriftOptions:
         own_focal_rel, own_distortion: the same for a lens that was refined here; wide, the photos tell.
         exif_focal_rel: and where EXIF held its focal length.
         pattern_px: of a lens that nobody knew before: what SIMPLE_RADIAL, RADIAL and fuller models leave over
-            in all their photos alike, as far as it passes for another focal length
-            (`tools/lens_patterns.py` prints it). Flat places from above know nothing better.
+            in all their photos alike, as far as it passes for another focal length,
+            measured on a simulated album. Flat places from above know nothing better.
         max_photos: of more, the rest is taken to be no worse; the equations are dense.
         max_points: free points that take part; fewer know less, so the bound stays one.
     """

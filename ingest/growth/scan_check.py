@@ -44,8 +44,6 @@ _OPEN = np.diag([1.0] * 3 + [1e-8] * 3)  # 1 rad and 10 km: what nothing holds
 class ScanCheckOptions:
     """When a scan says that a map is elsewhere.
 
-    `tools/scan_check_study.py` prints the figures of honest maps and of maps that were moved.
-
     Attributes:
         surface: the scan as the comparison sees it.
         min_views: of the points that take part; two views leave points along a ray.

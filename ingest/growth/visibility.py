@@ -34,7 +34,7 @@ class VisibilityOptions:
             its parts, right photos 0.22 and more.
         min_witnessed: the same where the points of its own reconstruction are asked for as well. Another
             re-upload, 13.3 m off, showed 0.17; right photos of that database 0.32 and more, of the one that
-            grew with this limit 0.23 and more (`tools/witnessed_parts.py`).
+            grew with this limit 0.23 and more.
         min_points: a photo that should see fewer says nothing.
         min_witnesses: photos that see a point of the reconstruction before it may be asked for. What two
             photos alone see says where the one is from the other, not what is there.

@@ -40,7 +40,7 @@ _SHOWN_KEYFRAMES = 4
 # A film's frames are small and often near to what they show: at a pixel for each point of the scan most have
 # too few pieces to say anything. In frames of the simulated flight, half a metre between the points and
 # 50 m away, 38 to 63 % of the pieces agree at poses that were fitted to from 0.3 m off
-# (`tools/scan_keyframes.py`), 8 % at most at those fitted to from 8 m off, and 18 % in frames of a town with
+# and 8 % at most at those fitted to from 8 m off, and 18 % in frames of a town with
 # the same streets. A frame that a track leads to is asked for what lies between. One that is looked for over
 # metres has more chances to be at a wrong place: frames of that town had 26 to 28 %, and with a limit of 30 %
 # one was believed.

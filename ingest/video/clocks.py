@@ -33,7 +33,7 @@ _OVERRIDE = "give --film-start with when it begins, --gcp, or --no-telemetry"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockOptions:
-    """When a film's place on a log's clock is believed; `python -m tools.clock_study` prints the shares.
+    """When a film's place on a log's clock is believed.
 
     Attributes:
         drift_s: how wrong a camera's clock may be beside its zone: one that is set by hand once a month.

@@ -33,10 +33,6 @@ NOT_RUN = {
     "tools/descriptor_study.py": _REAL_DATA,
     "tools/frame_real_photos.py": _REAL_DATA,
     "tools/autzen_windows.py": _REAL_DATA,
-    "tools/thinning_study.py": _REAL_DATA,
-    "tools/frame_evaluation.py": _STUDY,
-    "tools/view_change.py": _STUDY,
-    "tools/street_views.py": _STUDY,
 }
 # Python of these pages is run elsewhere, or is a fragment; it compiles in any case.
 PYTHON_NOT_RUN = {

@@ -17,7 +17,6 @@ from featuredb.simworld.community import CommunityOptions, write_community
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.photograph import render_view
 from featuredb.simworld.poison_world import POISONS, PoisonOptions, plan_poison, poison_places
-from featuredb.simworld.scale_world import ScaleOptions, write_scale
 from featuredb.simworld.truth import read_truth
 from featuredb.simworld.walk_world import WalkOptions, plan_walk
 from ingest.photo_table import read_table
@@ -126,38 +125,6 @@ def test_an_interrupted_album_goes_on_and_ends_the_same(album: Path, tmp_path: P
     assert sorted(p.relative_to(tmp_path) for p in tmp_path.rglob("*.*")) == files
     for file in files:
         assert (tmp_path / file).read_bytes() == (album / file).read_bytes(), file
-
-
-def test_more_districts_keep_the_photos_of_the_first(tmp_path: Path) -> None:
-    """Poses of another district are in the first one's frame: geodetic positions agree with its geotags."""
-    options = ScaleOptions(
-        seed=3,
-        districts=2,
-        per_district=3,
-        town_size_m=(180.0, 170.0),
-        sights=1,
-        width=160,
-        texel_m=0.3,
-        pieces=1,
-    )
-    exact = replace(options, geotags=replace(options.geotags, sigma_m=0.0, far_share=0.0))
-    one = write_scale(tmp_path / "one", replace(exact, districts=1), workers=1)
-    two = write_scale(tmp_path / "two", exact, workers=1)
-    for file in one.rglob("*.jpg"):
-        assert file.read_bytes() == (two / file.relative_to(one)).read_bytes()
-    truth, facts = read_truth(two), read_facts(two)
-    lines = {r["path"]: r for r in map(json.loads, (two / "table.jsonl").read_text().splitlines())}
-    checked = 0
-    for name, image in truth.images.items():
-        row = lines[name]
-        if row["lat"] is None or facts[name].batch != 1:
-            continue
-        center = truth.frame.geodetic_from_enu(image.cam_from_local.center)
-        np.testing.assert_allclose(center[:2], [row["lat"], row["lon"]], atol=2e-7)
-        checked += 1
-    distance = np.linalg.norm([i.cam_from_local.center[:2] for i in truth.images.values()], axis=1)
-    assert checked >= 1
-    assert (distance > 1000.0).sum() == 3
 
 
 def test_a_walk_advances_step_by_step_from_anchor_to_anchor() -> None:

@@ -134,10 +134,16 @@ def call_of(command: Command) -> Call:
             extras.append(words[1])
             words = words[2:]
     if words[0] == "python" and words[1] == "-m" and words[2].startswith("tools."):
-        words = [words[2].replace(".", "/") + ".py", *words[3:]]
+        words = [_file_of(words[2]), *words[3:]]
     elif words[0] == "python" and _TOOL.fullmatch(words[1]):
         words = words[1:]
     return Call(words[0], tuple(words[1:]), tuple(extras))
+
+
+def _file_of(module: str) -> str:
+    """The file that `python -m` runs: the module's own, or that of its package."""
+    path = module.replace(".", "/")
+    return f"{path}/__main__.py" if (ROOT / path).is_dir() else f"{path}.py"
 
 
 def _without_pattern(word: str) -> str:

@@ -1,7 +1,5 @@
 """Verdicts of the programs that measure growth: each line holds, and fails where it should."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +11,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.walk_world import WalkOptions
-from tools import growth_community, growth_poison, growth_scale, growth_walk
+from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict
 from tools.growth_poison import Outcome
 from tools.growth_walk import Probe, Step, worst_map
@@ -137,37 +135,3 @@ def test_poison_that_gets_in_fails() -> None:
         assert not holding(growth_poison.judge([clean], 0.01, bad))["retire"]
     held = replace(clean, forced=1, restored=False)
     assert not holding(growth_poison.judge([held], 0.01, good))["retire"]
-
-
-def test_the_parts_of_an_ingest_that_was_killed_add_up(tmp_path: Path) -> None:
-    file = tmp_path / "so-far.json"
-    work = [sys.executable, "-c", "sum(range(3_000_000)); import time; time.sleep(0.2)"]
-    seen = []
-    for _ in range(2):
-        spent = growth_scale.Spent.read(file)
-        spent.parts += 1
-        with subprocess.Popen(work) as process:
-            growth_scale.watch(process, spent, file)
-        seen.append(growth_scale.Spent.read(file))
-    first, both = seen
-    assert (first.parts, both.parts) == (1, 2)
-    assert both.wall_s > first.wall_s > 0.2
-    assert both.cpu_s > first.cpu_s > 0.0
-    assert both.peak >= first.peak > 0
-
-
-def test_an_ingest_that_registers_nothing_is_not_quick(tmp_path: Path) -> None:
-    small = growth_scale.Ingest(
-        photos=500, wall_s=500.0, cpu_s=900.0, peak_gib=1.0, registered=400, apart=0, maps=3
-    )
-    large = replace(small, photos=5000, wall_s=6000.0, registered=2100)
-    assert all(holding(growth_scale.judge(tmp_path, {"small": small, "large": large})).values())
-    for bad, name in (
-        (replace(large, registered=1900), "registered"),
-        (replace(large, wall_s=6600.0), "time per photo"),
-        (replace(large, peak_gib=6.5), "peak memory"),
-    ):
-        held = holding(growth_scale.judge(tmp_path, {"small": small, "large": bad}))
-        assert [n for n, holds in held.items() if not holds] == [name]
-    none = replace(small, registered=0)
-    assert not holding(growth_scale.judge(tmp_path, {"small": none, "large": large}))["registered"]

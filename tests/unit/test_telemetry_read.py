@@ -11,7 +11,6 @@ from featuredb.video.telemetry import read_telemetry, telemetry_of_video
 from featuredb.video.telemetry import text as telemetry_text
 from featuredb.video.telemetry.assemble import MAX_SAMPLES, About, SampleTable, assemble, check_count
 from tests.support.telemetry_files import device, gps5, mov_text, write_mp4
-from tools.telemetry_table import main as telemetry_table
 
 SRT = "1\n00:00:00,000 --> 00:00:01,000\n2023-04-05 06:07:08.250\n[latitude: 47.500000] [longitude: 8.25]\n"
 DIALOGUE = "1\n00:00:00,000 --> 00:00:01,000\nWhere did you put it?\n"
@@ -209,18 +208,6 @@ def test_absurd_values_become_unknown() -> None:
     assert value.gimbal_ypr_deg[0, 1] != value.gimbal_ypr_deg[0, 1]
     assert value.clock == "none"
     assert len(value.warnings) == 6
-
-
-def test_the_table_for_people(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    put(tmp_path, "a.srt", SRT)
-    put(tmp_path, "b.gpx", "broken")
-    put(tmp_path, "c.jpg", "not looked at")
-    assert telemetry_table([str(tmp_path)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 4
-    assert lines[2] == "| a.srt | SRT, bracketed | 1 | 1 | 0.000 | 0.000 | 47.500000 | 8.250000 | local |  |"
-    assert lines[3].startswith("| b.gpx | refused |")
-    assert "no well-formed XML" in lines[3]
 
 
 @settings(deadline=None, max_examples=100, derandomize=True)

@@ -15,8 +15,8 @@ class LevelOptions:
 
     Attributes:
         sigma_tilt_deg: of the plane through the block's points, about each axis. Windows of 60 m of the
-            ground in public airborne scans slope by 1.7 to 3.5 degrees (tools/ground_slopes.py), larger
-            ones by less. The cameras' mean axis is no better: a mount may be tilted by more (7 degrees
+            ground in public airborne scans slope by 1.7 to 3.5 degrees, larger ones by
+            less. The cameras' mean axis is no better: a mount may be tilted by more (7 degrees
             against the plane in `copr`).
         ground_up_m: height of the control points in metres, where somebody knows it about.
         sigma_ground_m: its standard deviation; 1000 m is that of not knowing: most land lies lower.

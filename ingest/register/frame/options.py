@@ -47,7 +47,7 @@ class FrameOptions:
             understate them, and what matches leave open stays well within what the verdict bears.
         correlated_inliers: so many inliers count as one measurement. shared_point_share: standard
             deviation of what all inliers share, as a share of the scan's spacing. Both from the
-            normalised errors that tools/frame_evaluation.py prints.
+            normalised errors of registered photos of the simulated town.
         threads: for renders and features; 0 takes as many as the process may use, up to four.
         seed: of RANSAC.
         confirm: how the pictures are asked.

@@ -13,7 +13,7 @@ from ingest.register.frame_registration import FrameReason
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerdictOptions:
-    """Where the line is. tools/frame_evaluation.py draws the distributions behind the numbers.
+    """Where the line is, by right and wrong registrations of the simulated town (docs/registration.md).
 
     Attributes:
         min_cover: smallest share of a render that shows the scan.

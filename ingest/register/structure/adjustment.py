@@ -39,7 +39,7 @@ class AdjustLidarOptions:
         min_sigma_rel: least standard deviation of keypoints and of correspondences with the scan, as a share
             of the photo's longer side: a pixel in 4000. Tracks alone may fit to a third of that, but what
             lens models leave is common to neighbours and does not average out; trusted to their noise,
-            thousands of tracks outvote the frames' correspondences (tools/scan_poses.py shows it).
+            thousands of tracks outvote the frames' correspondences.
         min_surface_m: of a scan's surface against map points; roughness of grass and pavement.
         focal_rel: standard deviation of the focal length's prior: structure from motion over flat ground
             was 25 % off on `brighton`.

@@ -29,7 +29,7 @@ class SurfaceOptions:
         max_gicp_points: of the map, evenly chosen; six parameters need no more.
         min_gain: share by which GICP must lower the median distance; less is chance: on maps of the
             simulated town that GICP moved for a gain of a few percent, points were 0.056 m off instead of
-            0.052 (`tools/structure_study.py`).
+            0.052.
         max_move_sigmas: how far it may move the evidence, in standard deviations of the placement there.
         min_move_m: a move below the scan's own noise is always allowed.
         threads: of small_gicp. Its threads are OpenMP's, after which a process should not fork.

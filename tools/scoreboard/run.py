@@ -1,0 +1,59 @@
+"""Runs a row: its commands in processes of their own, and the figures that the last one wrote."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from tools.scoreboard.results import ROOT, Result, result_now
+from tools.scoreboard.row import Row
+
+_LAST_LINES = 3  # of a command that failed, in its result
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Places:
+    """Folders: of the real sets, and for work."""
+
+    data: Path
+    work: Path
+
+    def missing(self, row: Row) -> list[Path]:
+        """What the row needs and the data have not."""
+        return [self.data / name for name in row.needs if not (self.data / name).exists()]
+
+
+def run(row: Row, places: Places, commit: str) -> Result:
+    """Measure a row. A command that fails leaves a result that says so; its output stays in `row.log`."""
+    work = places.work / row.name
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    cache = places.work / "cache"
+    cache.mkdir(exist_ok=True)
+    names = {"data": str(places.data.resolve()), "work": str(work), "cache": str(cache)}
+    start, code, failure = time.monotonic(), 0, ""
+    figures_file = Path(row.json.format(**names))
+    with (places.work / f"{row.name}.log").open("w+", encoding="utf-8") as log:
+        for words in row.commands:
+            command = [sys.executable, "-m", *(word.format(**names) for word in words)]
+            log.write(f"$ {' '.join(command[1:])}\n")
+            log.flush()
+            code = subprocess.run(
+                command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=os.environ, check=False
+            ).returncode
+            if code not in (0, 1):  # 1: measured, and some line of the program's own does not hold
+                failure = f"exit code {code}"
+                break
+        log.seek(0)
+        tail = " / ".join(log.read().strip().splitlines()[-_LAST_LINES:])
+    seconds = time.monotonic() - start
+    if not failure and not figures_file.is_file():
+        failure = f"no figures were written, exit code {code}"
+    if failure:
+        return result_now(row.name, commit, {}, seconds, f"{failure}: {tail[-300:]}")
+    figures = row.read(json.loads(figures_file.read_text(encoding="utf-8")))
+    return result_now(row.name, commit, figures | {"seconds": round(seconds, 1)}, seconds)
