@@ -1,0 +1,149 @@
+"""How many of the photos that COLMAP reconstructs together stay together in one reconstruction of ours.
+
+    python -m tools.colmap_baseline FOLDER [--no-positions] --work DIR [--json FILE]
+
+COLMAP is pycolmap with its defaults: SIFT, exhaustive matching, incremental mapping of every picture in the
+folder. Ours is an ingest of the same folder up to its components, whatever becomes of their place; with
+`--no-positions` what the photos say of where they were taken is forgotten. Prints the photos of COLMAP's
+largest model, how many of these are in our largest component, and the time of both; exit code 1 below
+`--least-share`. COLMAP's result stays in the work folder and is made once.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import pycolmap
+
+from ingest.executor import PoolExecutor
+from ingest.map_builder import MapIdentity
+from ingest.photo import Photo
+from ingest.placed_models import place_models
+from ingest.reconstruction import MapMakingOptions, reconstruct_photos
+from ingest.scan import require_usable, scan_folder
+from ingest.workspace import Workspace
+
+_PICTURES = {".jpg", ".jpeg", ".png"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Grouped:
+    """Photos that one program put together.
+
+    Attributes:
+        groups: names of the photos of each reconstruction, largest first.
+        wall_s: from the files to the reconstructions.
+    """
+
+    groups: tuple[tuple[str, ...], ...]
+    wall_s: float
+
+    @property
+    def largest(self) -> frozenset[str]:
+        """Photos of the largest reconstruction."""
+        return frozenset(self.groups[0]) if self.groups else frozenset()
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    args.work.mkdir(parents=True, exist_ok=True)
+    theirs = colmap_groups(args.folder, args.work)
+    mine = our_groups(args.folder, args.work, positions=not args.no_positions, workers=args.workers)
+    both = len(theirs.largest & mine.largest)
+    figures = {
+        "photos": len(pictures(args.folder)),
+        "positions": not args.no_positions,
+        "colmap_largest": len(theirs.largest),
+        "ours_largest": len(mine.largest),
+        "ours_of_colmap_largest": both,
+        "share": both / max(1, len(theirs.largest)),
+        "colmap_groups": [len(g) for g in theirs.groups],
+        "our_groups": [len(g) for g in mine.groups],
+        "colmap_s": theirs.wall_s,
+        "ours_s": mine.wall_s,
+    }
+    sys.stdout.write(
+        f"{args.folder}: COLMAP {len(theirs.largest)} of {figures['photos']} photos in one model, "
+        f"{theirs.wall_s:.0f} s; ours {len(mine.largest)} in one, {both} of COLMAP's "
+        f"({figures['share']:.1%}), {mine.wall_s:.0f} s; parts {figures['our_groups']}\n"
+    )
+    missing = sorted(theirs.largest - mine.largest)
+    if missing:
+        sys.stdout.write(f"of COLMAP's not in ours: {', '.join(missing)}\n")
+    if args.json is not None:
+        args.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    return 0 if figures["share"] >= args.least_share else 1
+
+
+def pictures(folder: Path) -> list[str]:
+    """Names of the pictures in the folder and its folders."""
+    found = (p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES)
+    return sorted(p.relative_to(folder).as_posix() for p in found)
+
+
+def colmap_groups(folder: Path, work: Path) -> Grouped:
+    """COLMAP's reconstructions, made now or read from the work folder."""
+    kept = work / "colmap.json"
+    if kept.exists():
+        document = json.loads(kept.read_text(encoding="utf-8"))
+        return Grouped(groups=tuple(tuple(g) for g in document["groups"]), wall_s=document["wall_s"])
+    started = time.perf_counter()
+    with tempfile.TemporaryDirectory(dir=work) as scratch:
+        database, output = Path(scratch) / "colmap.db", Path(scratch) / "models"
+        output.mkdir()
+        pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
+        pycolmap.set_random_seed(0)
+        pycolmap.extract_features(str(database), str(folder), image_names=pictures(folder))
+        pycolmap.match_exhaustive(str(database))
+        models = pycolmap.incremental_mapping(str(database), str(folder), str(output)).values()
+        names = [sorted(m.image(i).name for i in m.reg_image_ids()) for m in models]
+    groups = tuple(tuple(g) for g in sorted(names, key=lambda g: (-len(g), g)))
+    found = Grouped(groups=groups, wall_s=time.perf_counter() - started)
+    kept.write_text(json.dumps(asdict(found), indent=1) + "\n", encoding="utf-8")
+    return found
+
+
+def our_groups(folder: Path, work: Path, *, positions: bool, workers: int) -> Grouped:
+    """The components of an ingest from a cold start, placed or not; what is in none is left out."""
+    started = time.perf_counter()
+    options = MapMakingOptions()
+    photos = require_usable(scan_folder(folder), folder, least=options.sfm.min_model_photos)
+    if not positions:
+        photos = tuple(_without_position(photo) for photo in photos)
+    with tempfile.TemporaryDirectory(dir=work) as scratch, PoolExecutor(workers) as executor:
+        workspace = Workspace(root=Path(scratch), job_id="colmap-baseline")
+        done = reconstruct_photos(photos, workspace, options, executor)
+        components = list(place_models(done, options, identity=_identity))
+    names = [tuple(p.name for p in c.photos) for c in components]
+    return Grouped(
+        groups=tuple(sorted(names, key=lambda g: (-len(g), g))), wall_s=time.perf_counter() - started
+    )
+
+
+def _without_position(photo: Photo) -> Photo:
+    return replace(photo, gps=None, relative_altitude_m=None)
+
+
+def _identity(number: int) -> MapIdentity:
+    name = f"component-{number}"
+    return MapIdentity(map_id=name, name=name, source="", licence="", provenance={})
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--no-positions", action="store_true")
+    parser.add_argument("--work", type=Path, required=True, help="where COLMAP's result is kept")
+    parser.add_argument("--least-share", type=float, default=0.9, help="of COLMAP's largest model in ours")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path, default=None)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
