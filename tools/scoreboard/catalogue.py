@@ -1,5 +1,7 @@
 """The rows: what README and docs claim, and the command that measures each claim."""
 
+from typing import Any
+
 from tools.scoreboard.row import Limit, Row
 
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
@@ -47,6 +49,21 @@ def _sequence(photos: str, median_m: float, minutes: float) -> Row:
         limits=(Limit(figure="median_m", most=median_m), Limit(figure="largest_m", most=1.0)),
         needs=(photos,),
         minutes=minutes,
+    )
+
+
+def _made(name: str, claim: str, words: tuple[str, ...], need: str, least: int, **more: Any) -> Row:
+    return Row(
+        name=name,
+        group="real",
+        form="full",
+        claim=claim,
+        commands=(("tools.made_maps", *words, "--work", "{work}/maps", *_OUT),),
+        figures=_same("photos", "largest", "mapped", "maps", "placed"),
+        text="{largest} in the largest of {maps} maps, {mapped} in all",
+        limits=(Limit(figure="largest", least=least),),
+        needs=(need,),
+        **more,
     )
 
 
@@ -130,6 +147,56 @@ _REAL = (
         needs=("autzen", "brighton/images", "lewis/images"),
         readme=True,
         minutes=40,
+    ),
+    Row(
+        name="brighton-by-picks",
+        group="real",
+        form="full",
+        claim="`brighton` without GPS: a map of 14 photos, placed on the scan by six picks (3 px) in one; "
+        "20 draws, the 4 others asked of each",
+        commands=(
+            (
+                *("tools.unplaced_brighton", "--photos", _BRIGHTON, "--scan", _SCAN),
+                *("--poses", "{cache}/brighton-poses.json", *_OUT),
+            ),
+        ),
+        figures=_same(
+            *("maps", "largest", "draws", "placed", "refused", "wrong"),
+            *("median_m", "worst_m", "median_deg", "worst_deg"),
+        ),
+        text="{placed} of {draws} placed, {wrong} wrong; median {median_m:.2f} m and "
+        "{median_deg:.2f} degrees, worst draw {worst_m:.2f} m",
+        limits=(
+            Limit(figure="maps", least=1, most=1),
+            Limit(figure="largest", least=14),
+            Limit(figure="refused", most=2),
+            Limit(figure="wrong", most=0),
+            Limit(figure="median_m", most=0.25),
+            Limit(figure="median_deg", most=0.25),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        readme=True,
+        minutes=40,
+    ),
+    _made(
+        *("karma-map", "`karma.mp4`, 12 s by a drone, becomes a map"),
+        *(("--film", "{data}/video/karma.mp4"), "video/karma.mp4", 6),
+        minutes=3,
+    ),
+    _made(
+        *("reichstag-map", "`reichstag`: 74 photos of one landmark by many people become a map"),
+        *(("--photos", "{data}/reichstag/images"), "reichstag/images", 60),
+        minutes=30,
+    ),
+    _made(
+        *("sacre_coeur-map", "`sacre_coeur`: 10 photos by strangers, no EXIF, become a map"),
+        *(("--photos", "{data}/sacre_coeur/mapping"), "sacre_coeur/mapping", 9),
+        minutes=3,
+    ),
+    _made(
+        *("strecha-map", "`strecha`: 11 photos of a fountain without positions become a map"),
+        *(("--photos", "{data}/strecha/fountain-P11"), "strecha/fountain-P11", 11),
+        minutes=3,
     ),
     _portions("brighton/images", "interleaved", 4),
     _portions("brighton/images", "consecutive", 4),
@@ -251,6 +318,21 @@ _SIMULATED = (
         "{made_s:.0f} s, and {anchored_s:.0f} s for placing",
         limits=(Limit(figure="placed", least=1), Limit(figure="keyframes_largest_m", most=0.10)),
         minutes=20,
+    ),
+    Row(
+        name="paper-film",
+        group="simulated",
+        form="full",
+        claim="a film of 1,200 frames without telemetry and an intensity-only scan: placed by six picks in "
+        "one frame, tracked from end to end",
+        commands=(("tools.paper", "--out", "{work}", "--inputs", "{cache}", "--only", "film"),),
+        json="{work}/paper.json",
+        figures=_same("placed", "lost", "mean_m", "first_m", "last_m", "largest_m", "rate_hz", "made_s"),
+        text="mean {mean_m:.3f} m (first quarter {first_m:.3f}, last {last_m:.3f}), {lost} lost, "
+        "{rate_hz:.0f} frames/s",
+        limits=(Limit(figure="placed", least=1), Limit(figure="mean_m", most=0.10)),
+        readme=True,
+        minutes=15,
     ),
     _growth(
         *("growth-community", "300 photos of the town by twelve people: growth finds their places"),

@@ -1,0 +1,150 @@
+"""What becomes of a folder of photos, or a film, whose positions nobody knows: maps, and photos in them.
+
+    python -m tools.made_maps --photos FOLDER [--names A.JPG ...] [--strip]
+    python -m tools.made_maps --film FILM.mp4
+
+The folder (with --strip: copies of it without any position) or the film is ingested into a new database.
+Prints how many photos or keyframes are in the largest map, in any map, and in how many, placed or not. Exit
+code 0 if there is a map.
+"""
+
+import argparse
+import io
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from PIL import Image
+
+from featuredb.store import Database
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+
+_SUFFIXES = (".jpg", ".jpeg", ".png")
+_GPS_IFD = 34853
+_EXIF, _XMP = b"Exif\x00\x00", b"http://ns.adobe.com/"
+_APP1, _SCAN = 0xE1, 0xDA
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Made:
+    """What an ingest came to.
+
+    Attributes:
+        photos: given; 0 for a film. largest, mapped: photos in the largest map, and in any.
+        maps: with a place and without. seconds: of the command.
+    """
+
+    photos: int
+    largest: int
+    mapped: int
+    maps: int
+    placed: int
+    seconds: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        if args.film is not None:
+            made = make(work / "db", "video", bare_film(args.film, work / "film"), 0)
+        else:
+            names = args.names or photo_names(args.photos)
+            folder = args.photos
+            if args.strip or args.names:
+                folder = copied(args.photos, names, work / "photos", strip=args.strip)
+            made = make(work / "db", "photos", folder, len(names))
+    sys.stdout.write(f"{made}\n")
+    write_figures(args.json, asdict(made))
+    return 0 if made.maps else 1
+
+
+def make(database: Path, kind: str, source: Path, photos: int) -> Made:
+    """Ingest photos or a film and count what is in maps."""
+    start = time.monotonic()
+    featuredb("ingest", kind, str(database), str(source), "--quiet", may_refuse=True)
+    seconds = time.monotonic() - start
+    snapshot = Database.open(database).snapshot()
+    placed = [m.images for m in snapshot.maps()]
+    sizes = [*placed, *(m.images for m in snapshot.unplaced_maps())]
+    return Made(
+        photos=photos,
+        largest=max(sizes, default=0),
+        mapped=sum(sizes),
+        maps=len(sizes),
+        placed=len(placed),
+        seconds=seconds,
+    )
+
+
+def photo_names(folder: Path) -> list[str]:
+    """Names of the photos of a folder, sorted."""
+    return sorted(p.name for p in folder.iterdir() if p.suffix.lower() in _SUFFIXES)
+
+
+def bare_film(film: Path, folder: Path) -> Path:
+    """A copy of a film with nothing beside it."""
+    folder.mkdir(parents=True)
+    return Path(shutil.copy(film, folder))
+
+
+def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:
+    """Copies of photos, without positions where `strip` says so; the pictures stay bit for bit."""
+    target.mkdir(parents=True)
+    for name in names:
+        data = (folder / name).read_bytes()
+        (target / name).write_bytes(without_position(data) if strip else data)
+    return target
+
+
+def without_position(jpeg: bytes) -> bytes:
+    """A JPEG without the GPS directory of its EXIF and without XMP; all else as it was."""
+    with Image.open(io.BytesIO(jpeg)) as image:
+        exif = image.getexif()
+    exif.pop(_GPS_IFD, None)
+    parts = [jpeg[:2]]
+    for marker, content in _segments(jpeg):
+        body = content
+        if marker == _APP1 and content.startswith(_EXIF):
+            body = exif.tobytes()
+        elif marker == _APP1 and content.startswith(_XMP):
+            continue
+        parts.append(bytes((0xFF, marker)) + (len(body) + 2).to_bytes(2, "big") + body)
+    return b"".join([*parts, jpeg[_picture_start(jpeg) :]])
+
+
+def _segments(jpeg: bytes) -> Iterator[tuple[int, bytes]]:
+    """Markers and contents of the segments before the picture."""
+    at, end = 2, _picture_start(jpeg)
+    while at < end:
+        size = int.from_bytes(jpeg[at + 2 : at + 4], "big")
+        yield jpeg[at + 1], jpeg[at + 4 : at + 2 + size]
+        at += 2 + size
+
+
+def _picture_start(jpeg: bytes) -> int:
+    at = 2
+    while jpeg[at + 1] != _SCAN:
+        at += 2 + int.from_bytes(jpeg[at + 2 : at + 4], "big")
+    return at
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--photos", type=Path, metavar="FOLDER")
+    source.add_argument("--film", type=Path, metavar="FILE")
+    parser.add_argument("--names", nargs="+", default=[], metavar="NAME", help="default: all of the folder")
+    parser.add_argument("--strip", action="store_true", help="of JPEGs: without EXIF's GPS and XMP")
+    parser.add_argument("--work", type=Path, default=None, help="keep database and copies there")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

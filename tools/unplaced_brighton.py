@@ -1,0 +1,141 @@
+"""A map without a place, placed on a scan by six picks in one photo: how often, and how right?
+
+    python -m tools.unplaced_brighton --photos FOLDER --scan SCAN.laz --poses poses.json [--draws 20]
+
+1. The photos but the held-out ones, without any position, become one map without a place.
+2. Each draw picks six points of the scan in one photo of the map, with the given error in pixels, and
+   `featuredb anchor --picks` places a copy of the map by them. True pixels come from the poses that
+   tools/scan_poses.py finds by the scan alone (kept in the file of --poses).
+3. The held-out photos are asked of the placed map and compared with those poses.
+
+A draw is placed, refused, or wrong: placed with the held-out photos a metre off or not answered. Exit code 0
+if there was one map of all photos, none is wrong, at most a tenth is refused, and the errors are within the
+limits.
+"""
+
+import argparse
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.store import Database
+from tools import scan_poses
+from tools.anchor_brighton import read_poses
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import copied, make, photo_names
+from tools.picked import picks, read_scan, write_picks
+from tools.real_photos import ask_poses, error_figures
+
+_HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
+_WRONG_M = 1.0
+_MAX_M, _MAX_DEG = 0.25, 0.25
+_MAX_REFUSED = 0.1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    if not args.poses.exists():
+        scan_poses.main([str(args.scan), str(args.photos), "--poses", str(args.poses)])
+    frame, poses = read_poses(args.poses)
+    document = json.loads(args.poses.read_text(encoding="utf-8"))
+    camera, epsg = camera_of(document), int(document["crs"].removeprefix("EPSG:"))
+    scan = read_scan(args.scan, frame, epsg)
+    names = [name for name in photo_names(args.photos) if name not in args.held_out]
+    figures: dict[str, object] = {"photos": len(names), "draws": args.draws}
+    placed: list[dict[str, float]] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        photos = copied(args.photos, names, work / "photos", strip=True)
+        copied(args.photos, args.held_out, work / "asked", strip=True)
+        made = make(work / "db", "photos", photos, len(names))
+        featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
+        (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
+        for number in range(args.draws):
+            rng = np.random.default_rng((args.seed, number))
+            image = str(rng.choice([name for name in names if name in poses]))
+            drawn = picks(scan, camera, poses[image], rng, args.sigma_px)
+            file = write_picks(work / f"picks-{number}.csv", image, *drawn)
+            database = work / "placed"
+            shutil.rmtree(database, ignore_errors=True)
+            shutil.copytree(work / "db", database)
+            words = ("anchor", str(database), summary.map_id, "--photos", str(photos), "--picks", str(file))
+            out = ("--image", image, "--out", str(work / f"anchor-{number}"), "--auto", "--quiet")
+            if featuredb(*words, *out, may_refuse=True) != 0:
+                sys.stdout.write(f"draw {number}, {image}: refused\n")
+                continue
+            placed.append(judged(database, work / "asked", args.held_out, frame, poses))
+            sys.stdout.write(f"draw {number}, {image}: {placed[-1]}\n")
+    figures |= {"maps": made.maps, "largest": made.largest} | summed(placed, args.draws)
+    sys.stdout.write(f"{figures}\n")
+    write_figures(args.json, figures)
+    return 0 if holds(figures) else 1
+
+
+def camera_of(document: dict[str, dict[str, object]]) -> Camera:
+    """The camera that tools/scan_poses.py wrote."""
+    entry = {key: document["camera"][key] for key in ("model", "width", "height", "params")}
+    return Camera(**entry | {"params": tuple(entry["params"])})  # type: ignore[arg-type]
+
+
+def judged(
+    database: Path, photos: Path, names: Sequence[str], frame: LocalFrame, poses: dict[str, Rigid3]
+) -> dict[str, float]:
+    """Errors of the answers to the held-out photos."""
+    return error_figures(ask_poses(Database.open(database), photos, names, frame, poses))
+
+
+def summed(placed: Sequence[dict[str, float]], draws: int) -> dict[str, float]:
+    """How many were placed, refused, wrong; medians over the draws, and the worst draw's."""
+    nothing = float("nan")
+    metres = [one["median_m"] for one in placed] or [nothing]
+    degrees = [one["median_deg"] for one in placed] or [nothing]
+    wrong = [one for one in placed if not one["median_m"] <= _WRONG_M or one["answered"] < one["asked"]]
+    return {
+        "placed": len(placed),
+        "refused": draws - len(placed),
+        "wrong": len(wrong),
+        "median_m": float(np.median(metres)),
+        "worst_m": max(metres),
+        "median_deg": float(np.median(degrees)),
+        "worst_deg": max(degrees),
+    }
+
+
+def holds(figures: dict[str, object]) -> bool:
+    """One map of all photos, none wrong, few refused, median errors within the limits."""
+    value = {key: float(one) for key, one in figures.items() if isinstance(one, int | float)}
+    return (
+        value["maps"] == 1
+        and value["largest"] == value["photos"]
+        and value["wrong"] == 0
+        and value["refused"] <= _MAX_REFUSED * value["draws"]
+        and value["median_m"] <= _MAX_M
+        and value["median_deg"] <= _MAX_DEG
+    )
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--scan", type=Path, required=True, metavar="LAZ")
+    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    parser.add_argument("--held-out", nargs="+", default=list(_HELD_OUT), metavar="NAME")
+    parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--sigma-px", type=float, default=3.0, help="of a pick, each axis")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--work", type=Path, default=None, help="keep databases and reports there")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
