@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ingest.pipeline import IngestOptions
     from ingest.register.control.model import Survey
-    from ingest.report import IngestReport
+    from ingest.report import IngestReport, MapOutcome
 
 _LISTED = 40  # photos that are named on the terminal
 _STAGES = ("scan", "extract", "match", "reconstruct", "build")
@@ -218,11 +218,14 @@ def summary(report: "IngestReport") -> str:
 
     lines = [
         f"{report.count('registered')} of {len(report.photos)} files registered, "
-        f"{report.count('not_registered')} not, {report.count('skipped')} skipped, {report.seconds:.1f} s"
+        f"{report.count('unplaced')} in maps without a place, {report.count('not_registered')} not, "
+        f"{report.count('skipped')} skipped, {report.seconds:.1f} s"
     ]
     for outcome in report.maps:
         if outcome.status == "refused":
             lines.append(f"refused: {outcome.name}: {outcome.reason_code}: {outcome.reason}")
+        elif outcome.status == "unplaced":
+            lines += _unplaced_lines(outcome)
         else:
             lines.append(
                 f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
@@ -232,7 +235,7 @@ def summary(report: "IngestReport") -> str:
         if outcome.control is not None and outcome.control.control.marks:
             lines.extend(f"note: {text}" for text in outcome.control.file.notes)
             lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
-    left_out = [photo for photo in report.photos if photo.status != "registered"]
+    left_out = [photo for photo in report.photos if photo.status in ("not_registered", "skipped")]
     lines.extend(f"  {p.name}: {p.reason_code}: {p.reason}" for p in left_out[:_LISTED])
     if len(left_out) > _LISTED:
         counts = Counter(p.reason_code for p in left_out[_LISTED:])
@@ -241,6 +244,14 @@ def summary(report: "IngestReport") -> str:
     lines.extend(f"warning: {warning}" for outcome in report.maps for warning in outcome.warnings)
     lines.extend(f"warning: {warning}" for warning in report.warnings)
     return "\n".join(lines) + "\n"
+
+
+def _unplaced_lines(outcome: "MapOutcome") -> list[str]:
+    return [
+        f"map {outcome.map_id} ({outcome.name}): without a place, {outcome.photos} photos, "
+        f"{outcome.points} points; {outcome.reason_code}: {outcome.reason}",
+        "  `featuredb maps` says what would give it one; named by --map it answers in its own frame",
+    ]
 
 
 def _options(args: argparse.Namespace) -> "IngestOptions":

@@ -1,4 +1,4 @@
-"""Stage: a placed reconstruction and the photos' features become a FeatureMap."""
+"""Stage: a reconstruction and the photos' features become a map, with a place or without."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +12,12 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
+from featuredb.maps.unplaced_map import NoPlace, OwnPoints, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
+from ingest.own_frame import own_frame_of
 from ingest.photo import Photo
 from ingest.precision import (
     Linearised,
@@ -68,34 +71,86 @@ def build_map(
         photos, features: of the model's registered photos, in the order of `model.rows`; features are read
             once, photo by photo.
     """
-    used = _used_features(features, model)
-    poses = [placement.local_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
-    enu = placement.local_from_sfm.act(model.xyz)
-    xy = used.xy.astype(np.float64)
-    linear = linearise(model.cameras, model.camera_of, poses, enu, model.point_of, model.photo_of, xy)
-    variance = residual_variance(linear, len(poses), len(enu))
-    covariances = point_covariances(linear, len(enu), variance)
-    pose_spread = pose_covariances(linear, len(poses), covariances, variance)
-    kept = _well_placed(enu, poses, covariances, model, options)
-    if not kept.any():
+    parts = _parts(model, placement.local_from_sfm, photos, features, identity, options)
+    if parts is None:
         return None
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     return FeatureMap(
-        map_id=identity.map_id,
-        name=identity.name,
         epsg=epsg,
         height_datum=options.height_datum,
         frame=frame,
-        cameras=model.cameras,
-        camera_keys=_camera_keys(model, photos),
-        images=tuple(_images(photos, model, poses, pose_spread)),
-        points=_points(model, used.rgb, frame.utm_from_enu(enu, epsg), linear, covariances, kept),
-        observations=_observations(model, used, kept, options),
+        points=MapPoints(utm=frame.utm_from_enu(parts.xyz, epsg), **parts.point_columns),
         placement=placement,
-        extractor_fingerprint=used.fingerprint,
-        source=identity.source,
-        licence=identity.licence,
-        provenance=identity.provenance | {"residual_sigma_px": variance**0.5},
+        **parts.shared,
+    )
+
+
+def build_unplaced_map(
+    model: Model,
+    no_place: NoPlace,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapOptions,
+) -> UnplacedMap | None:
+    """The map of a model whose place nobody knows, in a frame of its own; arguments as in `build_map`."""
+    own_from_sfm, frame = own_frame_of(model)
+    parts = _parts(model, own_from_sfm, photos, features, identity, options)
+    if parts is None:
+        return None
+    return UnplacedMap(
+        frame=frame,
+        points=OwnPoints(xyz=parts.xyz, **parts.point_columns),
+        no_place=no_place,
+        **parts.shared,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Parts:
+    """What a map has whatever is known of its place: points xyz (n, 3) in its frame with their other columns,
+    and the fields that FeatureMap and UnplacedMap share."""
+
+    xyz: FloatArray
+    point_columns: dict[str, Any]
+    shared: dict[str, Any]
+
+
+def _parts(
+    model: Model,
+    frame_from_sfm: Sim3,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapOptions,
+) -> _Parts | None:
+    """The model in its frame; None if no point is placed well enough."""
+    used = _used_features(features, model)
+    poses = [frame_from_sfm.act_on_pose(pose) for pose in model.cam_from_sfm]
+    xyz = frame_from_sfm.act(model.xyz)
+    xy = used.xy.astype(np.float64)
+    linear = linearise(model.cameras, model.camera_of, poses, xyz, model.point_of, model.photo_of, xy)
+    variance = residual_variance(linear, len(poses), len(xyz))
+    covariances = point_covariances(linear, len(xyz), variance)
+    pose_spread = pose_covariances(linear, len(poses), covariances, variance)
+    kept = _well_placed(xyz, poses, covariances, model, options)
+    if not kept.any():
+        return None
+    return _Parts(
+        xyz=xyz[kept],
+        point_columns=_point_columns(model, used.rgb, linear, covariances, kept),
+        shared={
+            "map_id": identity.map_id,
+            "name": identity.name,
+            "cameras": model.cameras,
+            "camera_keys": _camera_keys(model, photos),
+            "images": tuple(_images(photos, model, poses, pose_spread)),
+            "observations": _observations(model, used, kept, options),
+            "extractor_fingerprint": used.fingerprint,
+            "source": identity.source,
+            "licence": identity.licence,
+            "provenance": identity.provenance | {"residual_sigma_px": variance**0.5},
+        },
     )
 
 
@@ -127,24 +182,23 @@ def _images(
     ]
 
 
-def _points(
+def _point_columns(
     model: Model,
     rgb: NDArray[np.uint8],
-    utm: FloatArray,
     linear: Linearised,
     covariances: FloatArray,
     kept: NDArray[np.bool_],
-) -> MapPoints:
+) -> dict[str, Any]:
+    """Columns of PointColumns by name."""
     lengths = model.track_lengths()
     errors = np.linalg.norm(linear.residual, axis=1)
     mean_rgb = np.stack([_mean(c.astype(np.float64), model.point_of, lengths) for c in rgb.T], axis=1)
-    return MapPoints(
-        utm=utm[kept],
-        rgb=np.rint(mean_rgb[kept]).astype(np.uint8),
-        track_length=lengths[kept].astype(np.int32),
-        error_px=_mean(errors, model.point_of, lengths)[kept].astype(np.float32),
-        covariance=upper_triangle(covariances[kept]),
-    )
+    return {
+        "rgb": np.rint(mean_rgb[kept]).astype(np.uint8),
+        "track_length": lengths[kept].astype(np.int32),
+        "error_px": _mean(errors, model.point_of, lengths)[kept].astype(np.float32),
+        "covariance": upper_triangle(covariances[kept]),
+    }
 
 
 def _observations(

@@ -3,10 +3,12 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.photo import Photo
 from ingest.photo_cameras import shared_key
 from ingest.placed_models import Component
@@ -22,6 +24,8 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
     """
     placement, feature_map = component.placement, component.feature_map
     figures = component.control.evidence if component.control is not None else placement.figures
+    if component.unplaced is not None:
+        return _unplaced_outcome(component, component.unplaced, options)
     if feature_map is None:
         return MapOutcome(
             map_id="",
@@ -55,6 +59,26 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         track_lengths=feature_map.points.track_length,
         plan=_plan(component, feature_map),
         control=component.control,
+    )
+
+
+def _unplaced_outcome(component: Component, unplaced: UnplacedMap, options: MapMakingOptions) -> MapOutcome:
+    control = component.control
+    return MapOutcome(
+        map_id=unplaced.map_id,
+        name=unplaced.name,
+        status="unplaced",
+        reason_code=unplaced.no_place.reason_code,
+        reason=unplaced.no_place.reason,
+        photos=len(unplaced.images),
+        points=len(unplaced.points),
+        observations=len(unplaced.observations),
+        descriptors=int(unplaced.observations.has_descriptor.sum()),
+        gates=control.evidence if control is not None else component.placement.figures,
+        cameras=_cameras(component, options),
+        errors_px=unplaced.points.error_px,
+        track_lengths=unplaced.points.track_length,
+        control=control,
     )
 
 
@@ -99,6 +123,8 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
 def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
     """The photos of one component; those of a refused one are in no map, and have its reason."""
     feature_map = component.feature_map
+    if component.unplaced is not None:
+        return _in_unplaced_map(component, component.unplaced, result)
     if feature_map is None:
         return {
             p.name: _outcome(
@@ -110,13 +136,7 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
             )
             for p in component.photos
         }
-    observations, points = feature_map.observations, feature_map.points
-    counts = np.bincount(observations.image_id, minlength=len(component.photos))
-    errors = np.bincount(
-        observations.image_id,
-        weights=points.error_px[observations.point_index],
-        minlength=len(component.photos),
-    ) / np.maximum(counts, 1)
+    counts, errors = _counts_and_errors(feature_map)
     _, gps, residuals = _centers_and_gps(component, feature_map)
     used = _gps_used(component)
     return {
@@ -132,6 +152,34 @@ def registered_photos(component: Component, result: Reconstructed) -> dict[str, 
         )
         for k, photo in enumerate(component.photos)
     }
+
+
+def _in_unplaced_map(
+    component: Component, unplaced: UnplacedMap, result: Reconstructed
+) -> dict[str, PhotoOutcome]:
+    counts, errors = _counts_and_errors(unplaced)
+    return {
+        photo.name: _outcome(
+            photo,
+            result,
+            status="unplaced",
+            code=component.reason_code.lower(),
+            reason=component.reason,
+            observations=int(counts[k]),
+            map_id=unplaced.map_id,
+            reprojection_px=float(errors[k]),
+        )
+        for k, photo in enumerate(component.photos)
+    }
+
+
+def _counts_and_errors(any_map: AnyMap) -> tuple[NDArray[np.int64], FloatArray]:
+    """Observations of each image (k,), and the mean reprojection error of their points (k,), pixels."""
+    seen, photos = any_map.observations, len(any_map.images)
+    counts = np.bincount(seen.image_id, minlength=photos)
+    weights = any_map.points.error_px[seen.point_index]
+    errors = np.bincount(seen.image_id, weights=weights, minlength=photos) / np.maximum(counts, 1)
+    return counts, errors
 
 
 def _outcome(

@@ -97,13 +97,14 @@ def ingest_photos(
         folder: of photos, searched through, or a table of them (see ingest.photo_table).
 
     A killed ingest goes on where it was when it is called again with the same photos and options, and
-    gives the same maps under the same ids. Photos that cannot be placed are reported, and nothing of them
-    is committed.
+    gives the same maps under the same ids. What was reconstructed and cannot be placed is committed as a map
+    without a place; photos that are in no reconstruction are reported.
 
     Raises:
         IngestError: the folder cannot be read, has fewer than two usable photos, or a worker died.
-        StoreError: the database cannot be written.
+        StoreError: the database cannot be written, or is of an older format.
     """
+    database.require_newest_format("keep maps without a place, which an ingest may make")
     options = options or IngestOptions()
     started, clock = datetime.now(UTC), StageClock()
     root = options.work or default_root(database.url)
@@ -276,7 +277,7 @@ def _registered_all(batch: Sequence[Component], result: Reconstructed) -> dict[s
 def _commit(database: Database, batch: Sequence[Component], options: IngestOptions) -> list[MapOutcome]:
     """Make the placed maps visible in one commit; what became of each component."""
     created: dict[str, bool] = {}
-    maps = [c.feature_map for c in batch if c.feature_map is not None]
+    maps = [m for c in batch if (m := c.feature_map or c.unplaced) is not None]
     if options.stop_after == "build":
         return []
     if maps:

@@ -1,4 +1,4 @@
-"""From reconstructions to placed feature maps: by GPS or control points, one map at a time."""
+"""From reconstructions to feature maps: placed by GPS or control points, or without a place."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -9,11 +9,12 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import PhotoFeatures
 from ingest.links import tied_parts
-from ingest.map_builder import MapIdentity, build_map
+from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.photo import Photo
 from ingest.reconstruction import (
     MapMakingOptions,
@@ -38,6 +39,13 @@ _ELSEWHERE = (
 )
 
 
+_WAYS = (
+    "a scan and a person's hand: featuredb anchor DB MAP --page",
+    "ground control points: featuredb register DB MAP --gcp FILE",
+    "maps with a place that show the same: featuredb grow DB",
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Component:
     """One connected component of the photos and what became of it.
@@ -47,7 +55,8 @@ class Component:
         photos: its registered photos, in the order of model.rows.
         with_gps: positions in `photos` of those with GPS; rows of the placement's residuals.
         placement: accepted or refused with a reason.
-        feature_map: None where there is none, for `reason_code` and `reason`.
+        feature_map: with a place; None where there is none, for `reason_code` and `reason`.
+        unplaced: the map without a place that is kept instead, where there are points for one.
         control: of the placement by control points, where there are some.
     """
 
@@ -56,6 +65,7 @@ class Component:
     with_gps: tuple[int, ...]
     placement: GpsPlacement
     feature_map: FeatureMap | None
+    unplaced: UnplacedMap | None = None
     reason_code: str = ""
     reason: str = ""
     control: ControlledPlacement | None = None
@@ -85,14 +95,16 @@ def place_models(
 ) -> Iterator[Component]:
     """Place every model and build its map; one at a time, so that the caller can commit and forget it.
 
-    What hangs on the rest of its model by little is placed by itself. Where that is a photo or two, and where
-    the GPS of photos together contradicts that of the others, they follow as components without map.
+    What hangs on the rest of its model by little is placed by itself; where that is a photo or two, they
+    follow as a component without map. Photos whose GPS together contradicts that of the others become a map
+    without a place. So does every model whose place nothing tells.
 
     Args:
         identity: of the map of the component with that number.
         survey: control points, which then place the maps instead of GPS.
     """
     number = itertools.count()
+    elsewhere: list[tuple[Model, Elsewhere]] = []
     for whole in done.reconstruction.models():
         loose: list[int] = []
         for rows in tied_parts(whole, options.min_tie):
@@ -106,13 +118,18 @@ def place_models(
             if kept is not None:
                 features = done.features.of(kept.rows)
                 yield _component(kept, done.usable, features, identity(next(number)), options, survey)
-            for group in groups:
-                part = select_photos(model, model.rows[list(group.photos)].tolist())
-                reason = _ELSEWHERE.format(offset_m=group.offset_m)
-                yield _left_out(part, done.usable, options, "ELSEWHERE", reason)
+            elsewhere += [(model, group) for group in groups]
         if loose:
             reason = _WEAKLY_TIED.format(least=options.min_tie)
             yield _left_out(select_photos(whole, loose), done.usable, options, "WEAKLY_TIED", reason)
+    for model, group in elsewhere:
+        part = select_photos(model, model.rows[list(group.photos)].tolist())
+        reason = _ELSEWHERE.format(offset_m=group.offset_m)
+        component = _left_out(part, done.usable, options, "ELSEWHERE", reason)
+        if len(part.rows) >= options.sfm.min_model_photos:
+            features = done.features.of(part.rows)
+            component = _without_place(component, features, identity(next(number)), options)
+        yield component
 
 
 def placed_by_gps(
@@ -157,7 +174,7 @@ def _component(
     options: MapMakingOptions,
     survey: Survey | None,
 ) -> Component:
-    """Place one model and build its map where the placement is accepted.
+    """Place one model and build its map; without a place where no placement is accepted.
 
     Positions that nobody answers for place a quarantined map: it answers nothing and places nothing until
     something better confirms it.
@@ -185,7 +202,7 @@ def _component(
         or placed.local_from_sfm is None
         or placed.covariance is None
     ):
-        return component
+        return _without_place(component, features, identity, options)
     placement = Placement(
         method="gps",
         local_from_sfm=placed.local_from_sfm,
@@ -206,6 +223,22 @@ def _component(
     return replace(component, feature_map=feature_map, reason="")
 
 
+def _without_place(
+    component: Component, features: Sequence[PhotoFeatures], identity: MapIdentity, options: MapMakingOptions
+) -> Component:
+    """The component with a map in a frame of its own, which says why it has no place."""
+    no_place = NoPlace(
+        reason_code=component.reason_code,
+        reason=component.reason,
+        ways=_WAYS,
+        evidence=component.placement.figures,
+    )
+    unplaced = build_unplaced_map(
+        component.model, no_place, component.photos, features, identity, options.maps
+    )
+    return replace(component, unplaced=unplaced)
+
+
 def _by_control(
     component: Component,
     frame: LocalFrame | None,
@@ -219,7 +252,8 @@ def _by_control(
     component = replace(component, control=control)
     placed = control.placement
     if placed.reason is not None or control.map_placement is None:
-        return replace(component, reason_code=placed.reason or "", reason=placed.message)
+        component = replace(component, reason_code=placed.reason or "", reason=placed.message)
+        return _without_place(component, features, identity, options)
     datum = control.height_datum(options.maps.height_datum)
     feature_map = build_map(
         control.model,

@@ -15,8 +15,8 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.model import ControlledPlacement
 from ingest.workspace import atomic_file, write_json
 
-FileStatus = Literal["registered", "not_registered", "skipped"]
-MapOutcomeStatus = Literal["committed", "already_there", "refused"]
+FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
+MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
 SCHEMA_ID = "featuredb/ingest/report/1"
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 
@@ -50,7 +50,8 @@ class PhotoOutcome:
 
     Attributes:
         name: path within the folder.
-        status: registered (part of a map), not_registered (usable, but in no map), skipped (not usable).
+        status: registered (part of a map), unplaced (part of a map without a place), not_registered (usable,
+            but in no map), skipped (not usable).
         reason_code, reason: why it is in no map; "" where it is.
         width, height: pixels as stored, 0 where unknown.
         camera_key: its camera, "" where unknown.
@@ -135,8 +136,9 @@ class MapOutcome:
 
     Attributes:
         map_id: "" where it was refused.
-        status: committed, already_there (an earlier run committed it), refused.
-        reason_code, reason: the gate that refused it.
+        status: committed, already_there (an earlier run committed it), unplaced (kept without a place),
+            refused.
+        reason_code, reason: why it was refused or has no place.
         gates: figures of every gate, JSON-able.
         scale: metres per unit of the reconstruction.
         residual_rms_m: of the GPS positions that were used.
@@ -254,6 +256,7 @@ def report_json(report: IngestReport) -> dict[str, Any]:
             "files": {
                 "all": len(report.photos),
                 "registered": report.count("registered"),
+                "unplaced": report.count("unplaced"),
                 "not_registered": report.count("not_registered"),
                 "skipped": report.count("skipped"),
             },

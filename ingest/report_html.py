@@ -10,12 +10,14 @@ from ingest.report_plots import histograms_png, plan_png
 
 _FILE_PILLS = {
     "registered": ("good", "in a map"),
+    "unplaced": ("fair", "in a map without a place"),
     "not_registered": ("fair", "not registered"),
     "skipped": ("none", "skipped"),
 }
 _MAP_PILLS = {
     "committed": ("good", "committed"),
     "already_there": ("good", "was there already"),
+    "unplaced": ("fair", "kept without a place"),
     "refused": ("bad", "refused"),
 }
 
@@ -43,6 +45,7 @@ def _cards(report: IngestReport) -> str:
     points = sum(outcome.points for outcome in report.maps if outcome.status != "refused")
     figures = (
         (f"{report.count('registered')} of {len(report.photos)}", "files are in a map"),
+        (str(report.count("unplaced")), "files are in a map without a place"),
         (str(report.count("not_registered")), "usable, but not registered"),
         (str(report.count("skipped")), "skipped"),
         (str(placed), "map" if placed == 1 else "maps"),
@@ -55,7 +58,7 @@ def _cards(report: IngestReport) -> str:
 
 def _map(outcome: MapOutcome) -> str:
     reason = ""
-    if outcome.status == "refused":
+    if outcome.status in ("refused", "unplaced"):
         reason = f'<p class="note stop"><b>{escape(outcome.reason_code)}</b>: {escape(outcome.reason)}</p>'
     method = "GPS" if outcome.control is None else "control points"
     facts = [

@@ -391,7 +391,8 @@ def _check_format(url: str, spec: TableSpec, delta: Any) -> None:
     found = _format_of(metadata)
     if found not in READABLE_FORMATS:
         raise StoreError(
-            f"{url} has featuredb format {found}, expected {FORMAT_VERSION} or older; use a newer featuredb"
+            f"{url} has featuredb format {found}, expected {READABLE_FORMATS[-1]} or older; "
+            "use a newer featuredb"
         )
 
 

@@ -72,13 +72,25 @@ def test_only_long_tracks_carry_descriptors(hills: tuple[Path, list[HillPhoto]],
     np.testing.assert_array_equal(counted, feature_map.points.track_length)
 
 
-def test_photos_without_gps_are_refused_with_a_reason(tmp_path: Path) -> None:
+def test_photos_without_gps_become_a_map_without_a_place(tmp_path: Path) -> None:
     write_hill_photos(tmp_path / "photos", columns=2, rows=2, with_gps=False)
     database = Database.create(tmp_path / "db")
     report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
-    assert [(m.status, m.reason_code, m.map_id) for m in report.maps] == [("refused", "TOO_FEW", "")]
-    assert {p.reason_code for p in report.photos} == {"too_few"}
-    assert not database.snapshot().maps()
+    assert [(m.status, m.reason_code, m.photos) for m in report.maps] == [("unplaced", "TOO_FEW", 4)]
+    assert {(p.status, p.reason_code) for p in report.photos} == {("unplaced", "too_few")}
+    snapshot = database.snapshot()
+    assert not snapshot.maps()
+    (summary,) = snapshot.unplaced_maps()
+    assert summary.no_place.reason_code == "TOO_FEW"
+    unplaced = snapshot.load_unplaced(summary.map_id)
+    assert not unplaced.frame.metric
+    seen = unplaced.observations
+    centers = np.array([image.cam_from_local.center for image in unplaced.images])
+    distances = np.linalg.norm(unplaced.points.xyz[seen.point_index] - centers[seen.image_id], axis=1)
+    assert np.median(distances) == pytest.approx(50.0, rel=0.02)
+    again = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    assert [m.map_id for m in again.maps] == [summary.map_id]
+    assert len(database.snapshot().unplaced_maps()) == 1
 
 
 def test_two_places_become_two_maps(tmp_path: Path) -> None:

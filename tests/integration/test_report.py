@@ -144,7 +144,9 @@ def test_json_follows_its_schema_and_counts(tmp_path: Path) -> None:
     json_path, _ = write_report(tmp_path, report())
     document = json.loads(json_path.read_text(encoding="utf-8"), parse_constant=pytest.fail)  # no NaN
     jsonschema.validate(document, SCHEMA)
-    assert document["files"] == {"all": 3, "registered": 1, "not_registered": 1, "skipped": 1}
+    assert document["files"] == {
+        "all": 3, "registered": 1, "unplaced": 0, "not_registered": 1, "skipped": 1
+    }  # fmt: skip
     assert document["seconds"] == 1.5
     first = document["maps"][0]
     assert first["reprojection_px"] == pytest.approx({"p50": 1.0, "p90": 1.8, "p99": 1.98}, abs=1e-3)

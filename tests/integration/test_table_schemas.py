@@ -18,7 +18,7 @@ from featuredb.store.tables import TABLES as MAP_TABLES
 from schemas import load_schema, schema_names
 from tests.support.contributions import contribution, known_pose
 from tests.support.las_files import grid_points, write_scan
-from tests.support.maps import random_map
+from tests.support.maps import random_map, random_unplaced_map
 
 TABLES = (*MAP_TABLES, *LIDAR_TABLES, *CANDIDATE_TABLES, CANARIES)
 
@@ -29,6 +29,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Database:
     database.commit_map(random_map(1))
     database.commit_map(random_map(2, points=0, images=0, parents=("map-1",)))
     database.retire("map-1", "test")
+    database.commit_map(random_unplaced_map(3))
     folder = tmp_path_factory.mktemp("scans")
     add_scan(database, [write_scan(folder / "a.laz", grid_points(200), red=np.full(200, 9))])
     add_scan(database, [write_scan(folder / "b.laz", grid_points(200), point_format=6)])
