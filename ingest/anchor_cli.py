@@ -79,10 +79,6 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
 
     if args.auto and args.confirm:
         raise InvalidValueError("expected --auto or --confirm, found both")
-    if args.confirm and (args.pose or args.picks):
-        raise InvalidValueError(
-            "--confirm takes what was proposed; run once with --pose or --picks before it"
-        )
     if args.image and not (args.pose or args.picks):
         raise InvalidValueError("--image names the photo of --pose or --picks; give one of them")
     if args.frames is not None and args.frames < 1:

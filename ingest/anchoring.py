@@ -17,25 +17,29 @@ from featuredb.errors import InvalidValueError, MapNotFoundError, RegistrationEr
 from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
 from featuredb.lidar.load import load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
-from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.anchor_map import place_map
+from ingest.register.anchor.first_place import (
+    MARGIN_M,
+    FirstPlace,
+    StartFiles,
+    first_place,
+    plan_box,
+    started_images,
+)
 from ingest.register.anchor.frames import TriedFrames, try_frames
 from ingest.register.anchor.photo_files import PhotoFiles, find_photos
-from ingest.register.anchor.picks import pose_from_picks
 from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
 from ingest.register.anchor.report import AnchorReport, write_anchor_report
-from ingest.register.anchor.start import image_named, prior_from_rough_pose
-from ingest.register.anchor.start_files import read_picks, read_pose
+from ingest.register.anchor.start import image_named
 from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 
 _LOG = logging.getLogger(__name__)
-# Scan around the map's points and cameras that may be seen, metres: errors of GPS, and what frames show
-# beside the map's points.
-_MARGIN_M = 60.0
 _CONFIRM = "--confirm"
 
 
@@ -101,8 +105,9 @@ class _Job:
 
     request: AnchorRequest
     snapshot: Snapshot
-    summary: MapSummary
+    summary: MapSummary | UnplacedSummary
     feature_map: FeatureMap
+    first: FirstPlace | None
     files: PhotoFiles
     cloud: PointCloud
     scan_ids: tuple[str, ...]
@@ -212,6 +217,8 @@ def _confirm_command(database: Database, job: _Job) -> str:
     words = ["featuredb", "anchor", database.url, job.summary.map_id, "--photos", str(job.files.folder)]
     for option in job.request.storage_options:
         words += ["--storage-option", option]
+    if job.first is not None:  # where it was put for the proposals is found again by the same words
+        words += job.first.files.words()
     for scan_id in job.request.scan_ids:
         words += ["--scan", scan_id]
     words += ["--out", str(job.out)]
@@ -221,13 +228,26 @@ def _confirm_command(database: Database, job: _Job) -> str:
 def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:
     snapshot = database.snapshot()
     summary = _the_map(snapshot, request.map_id)
-    feature_map = snapshot.load_map(summary.map_id)
-    files = find_photos(feature_map, request.photos)
-    scan_ids = request.scan_ids or _scans_around(database, feature_map, summary)
-    cloud = load_cloud(database, feature_map.frame, _box(feature_map), scan_ids=scan_ids)
+    loaded = snapshot.load_any(summary.map_id)
+    files = find_photos(loaded, request.photos)
+    first: FirstPlace | None = None
+    if isinstance(loaded, UnplacedMap):
+        first = first_place(
+            database,
+            loaded,
+            StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image),
+            request.scan_ids,
+            options.frames.start,
+        )
+        feature_map, cloud, scan_ids = first.feature_map, first.cloud, first.scan_ids
+    else:
+        assert isinstance(summary, MapSummary)
+        feature_map = loaded
+        scan_ids = request.scan_ids or _scans_around(database, feature_map, summary)
+        cloud = load_cloud(database, feature_map.frame, plan_box(feature_map), scan_ids=scan_ids)
     if not len(cloud):
         raise RegistrationError(
-            f"scan {', '.join(scan_ids)} has no points within {_MARGIN_M:.0f} m of map {summary.map_id}; "
+            f"scan {', '.join(scan_ids)} has no points within {MARGIN_M:.0f} m of map {summary.map_id}; "
             "`featuredb lidar list` tells where scans lie"
         )
     return _Job(
@@ -235,6 +255,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         snapshot=snapshot,
         summary=summary,
         feature_map=feature_map,
+        first=first,
         files=files,
         cloud=cloud,
         scan_ids=tuple(scan_ids),
@@ -243,9 +264,9 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     )
 
 
-def _the_map(snapshot: Snapshot, map_id: str) -> MapSummary:
+def _the_map(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
     """The live map of that id, or of an id that begins so."""
-    maps = snapshot.maps()
+    maps: list[MapSummary | UnplacedSummary] = [*snapshot.maps(), *snapshot.unplaced_maps()]
     exact = [m for m in maps if m.map_id == map_id]
     found = exact or [m for m in maps if map_id and m.map_id.startswith(map_id)]
     if len(found) == 1:
@@ -272,15 +293,15 @@ def _scans_around(database: Database, feature_map: FeatureMap, summary: MapSumma
         for scan in scans
         if scan.epsg != feature_map.epsg
         or scan.box.touches(
-            box.min_easting - _MARGIN_M,
-            box.min_northing - _MARGIN_M,
-            box.max_easting + _MARGIN_M,
-            box.max_northing + _MARGIN_M,
+            box.min_easting - MARGIN_M,
+            box.min_northing - MARGIN_M,
+            box.max_easting + MARGIN_M,
+            box.max_northing + MARGIN_M,
         )
     ]
     if not around:
         raise RegistrationError(
-            f"no scan of {database.url} lies within {_MARGIN_M:.0f} m of map {summary.map_id} "
+            f"no scan of {database.url} lies within {MARGIN_M:.0f} m of map {summary.map_id} "
             f"(easting {box.min_easting:.0f} to {box.max_easting:.0f}, northing {box.min_northing:.0f} to "
             f"{box.max_northing:.0f}, EPSG:{feature_map.epsg}); add one that covers it by "
             "`featuredb lidar add`"
@@ -288,53 +309,22 @@ def _scans_around(database: Database, feature_map: FeatureMap, summary: MapSumma
     return tuple(around)
 
 
-def _box(feature_map: FeatureMap) -> tuple[float, float, float, float]:
-    """Plan box in the map's frame around its points and cameras."""
-    centers = np.array([image.cam_from_local.center for image in feature_map.images])
-    points = feature_map.points_local()
-    # A few wild points must not ask for a whole county.
-    inner = np.percentile(points[:, :2], (1, 99), axis=0)
-    both = np.vstack([inner, centers[:, :2]])
-    low, high = both.min(axis=0) - _MARGIN_M, both.max(axis=0) + _MARGIN_M
-    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
-
-
 def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     """Priors by a person, with a line on each."""
     request, feature_map = job.request, job.feature_map
-    starts: dict[int, FramePrior] = {}
-    notes: list[str] = []
-    if request.pose_file is not None:
-        rough = read_pose(request.pose_file, request.image)
-        image = image_named(feature_map, rough.image)
-        starts[image.image_id] = prior_from_rough_pose(rough, feature_map.frame, feature_map.epsg)
-        notes.append(f"{image.name} starts from the pose in {request.pose_file}")
-    if request.picks_file is not None:
-        for picks in read_picks(request.picks_file, request.image):
-            image = image_named(feature_map, picks.image)
-            found = pose_from_picks(
-                picks,
-                feature_map.frame.enu_from_utm(picks.utm, feature_map.epsg),
-                feature_map.cameras[image.camera_id],
-                image.cam_from_local,
-                job.options.frames.start,
-            )
-            starts[image.image_id] = found.prior
-            outliers = (
-                f"; they contradict the others: line {_numbers(found.outliers)}" if found.outliers else ""
-            )
-            notes.append(
-                f"{image.name} starts from {len(picks.pixels)} picks, median residual "
-                f"{float(np.median(found.residuals_px[found.inliers])):.1f} px{outliers}"
-            )
+    if job.first is not None:
+        starts, notes = dict(job.first.starts), list(job.first.notes)
+    else:
+        files = StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image)
+        found = started_images(
+            feature_map, files, feature_map.frame, feature_map.epsg, job.options.frames.start
+        )
+        starts = {f.image.image_id: f.prior for f in found}
+        notes = [f.note for f in found]
     for image_id in starts:
         image = next(i for i in feature_map.images if i.image_id == image_id)
         job.files.path(image)  # raises where the photo is missing
     return starts, notes
-
-
-def _numbers(rows: Sequence[int]) -> str:
-    return ", ".join(str(row + 1) for row in rows)
 
 
 def _confirmed(job: _Job) -> TriedFrames:

@@ -4,8 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.errors import RegistrationError
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import MapImage
 from featuredb.maps.photo_files import PhotoFolder
+from featuredb.maps.unplaced_map import AnyMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,7 @@ class PhotoFiles:
         return self.paths[image.image_id]
 
 
-def find_photos(feature_map: FeatureMap, folder: Path) -> PhotoFiles:
+def find_photos(feature_map: AnyMap, folder: Path) -> PhotoFiles:
     """Find the photos of a map by name, and where that fails by content, anywhere under the folder.
 
     A file counts only if its SHA-256 is the map's: another photo of the same name would be registered to the

@@ -2,8 +2,8 @@
 
 A person's picks are measurements with a known deviation. Their residuals therefore tell by chi-square whether
 they can all be right (Baarda's data snooping where they cannot): a set of picks is believed if the sum of its
-squared normalised residuals is likely for its redundancy, and a pick is called wrong if the others fit without
-it and no other pick's removal does nearly as well.
+squared normalised residuals is likely for its redundancy, and a pick is called wrong if the others fit
+without it and no other pick's removal does nearly as well.
 """
 
 from dataclasses import dataclass
@@ -108,7 +108,9 @@ class _Problem:
         o = self.options
         return o.sigma_px**2 * np.eye(2) + o.sigma_m**2 * by_point @ by_point.transpose(0, 2, 1)
 
-    def linear(self, pose: Rigid3, camera: Camera, rows: list[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def linear(
+        self, pose: Rigid3, camera: Camera, rows: list[int]
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residuals (k, 2), derivatives by pose and log focal length (k, 2, 7), inverse noise (k, 2, 2)."""
         points = self.points[rows]
         residual = self.pixels[rows] - camera.project(pose.act(points))
@@ -117,7 +119,11 @@ class _Problem:
         longer, shorter = (camera.with_focal(camera.focal_px * (1 + s)) for s in (step, -step))
         by_focal = (longer.project(pose.act(points)) - shorter.project(pose.act(points))) / (2 * step)
         jacobian = np.concatenate([by_pose, by_focal[:, :, None]], axis=2)
-        return residual, jacobian, np.linalg.inv(self.noise(by_point))
+        return (
+            np.asarray(residual),
+            np.asarray(jacobian, dtype=np.float64),
+            np.asarray(np.linalg.inv(self.noise(by_point)), dtype=np.float64),
+        )
 
     def focal_off(self, camera: Camera) -> float:
         return float(np.log(camera.focal_px / self.camera.focal_px))
@@ -152,7 +158,7 @@ def fit_picks(
     return PickFit(
         cam_from_local=state.pose,
         camera=state.camera,
-        covariance=np.linalg.pinv(state.information, hermitian=True)[:6, :6],
+        covariance=np.asarray(np.linalg.pinv(state.information, hermitian=True)[:6, :6], dtype=np.float64),
         residuals_px=_residuals(problem, state, rows),
         normalised=_normalised(problem, state, kept),
         chi_square=state.cost,
@@ -169,7 +175,8 @@ def _explanation(
 ) -> tuple[_State, list[int], tuple[int, ...], bool] | None:
     """State, picks believed, picks in doubt, and whether they agree: the fewest wrong picks that explain."""
     everything = _best(problem, starts, rows)
-    for count in range(min(problem.options.max_wrong, len(rows) - 4) + 1):
+    # Of n picks, k wrong ones are told from right ones if 4 + k of these agree.
+    for count in range(min(problem.options.max_wrong, (len(rows) - 4) // 2) + 1):
         tries = []
         for left_out in combinations(_suspects(problem, starts, rows, count), count):
             kept = [i for i in rows if i not in left_out]
@@ -227,7 +234,8 @@ def _rough_cost(problem: _Problem, pose: Rigid3, camera: Camera) -> float:
         return float("inf")
     off = np.nan_to_num(camera.project(in_camera) - problem.pixels, nan=1e6)
     sigma = np.hypot(
-        problem.options.sigma_px, problem.options.sigma_m * camera.focal_px / np.maximum(in_camera[:, 2], 1e-3)
+        problem.options.sigma_px,
+        problem.options.sigma_m * camera.focal_px / np.maximum(in_camera[:, 2], 1e-3),
     )
     return float(np.minimum((off**2).sum(axis=1) / (3 * sigma) ** 2, 25.0).sum())
 
@@ -260,7 +268,9 @@ def _refined(problem: _Problem, pose: Rigid3, camera: Camera, rows: list[int]) -
             state.information + damping * np.diag(np.diag(state.information)), gradient, rcond=None
         )[0]
         new_pose = _moved(state.pose, step)
-        new_camera = problem.camera.with_focal(state.camera.focal_px * float(np.exp(np.clip(step[6], -0.5, 0.5))))
+        new_camera = problem.camera.with_focal(
+            state.camera.focal_px * float(np.exp(np.clip(step[6], -0.5, 0.5)))
+        )
         new = _state(problem, new_pose, new_camera, rows)
         if new is None or new.cost > state.cost:
             damping *= 10.0
@@ -319,9 +329,7 @@ def _normalised(problem: _Problem, state: _State, kept: list[int]) -> FloatArray
     return out
 
 
-def _another(
-    problem: _Problem, starts: list[tuple[Rigid3, Camera]], kept: list[int], state: _State
-) -> bool:
+def _another(problem: _Problem, starts: list[tuple[Rigid3, Camera]], kept: list[int], state: _State) -> bool:
     """Whether a pose that is clearly elsewhere explains the picks nearly as well."""
     limit = max(state.cost + problem.options.apart, 0.0)
     spread = np.linalg.pinv(state.information, hermitian=True)[:6, :6]

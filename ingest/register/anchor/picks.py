@@ -3,17 +3,19 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from featuredb.errors import RegistrationError
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import MapImage
+from featuredb.maps.unplaced_map import AnyMap
+from ingest.register.anchor.pick_fit import PickFit, PickFitOptions, fit_picks
 from ingest.register.anchor.start import StartOptions
 from ingest.register.frame_registration import FramePrior
-from reloc.jacobians import pixel_jacobians
-from reloc.options import PoseOptions
-from reloc.pose import estimate_pose, pose_uncertainty, refine_pose, reprojection_errors
+
+KNOWN_FOCAL_REL = 0.03  # EXIF rounds, and reconstructions over flat ground drift from it by as much
+UNKNOWN_FOCAL_REL = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -42,94 +44,127 @@ class PickedPose:
 
     Attributes:
         prior: the pose with its deviations.
+        camera: the lens, its focal length as the picks have it.
         covariance: (6, 6) of the left perturbation of the pose.
-        residuals_px: (n,) of all picks.
-        inliers: (n,) bool.
+        fit: residuals and tests of the picks.
     """
 
     prior: FramePrior
+    camera: Camera
     covariance: FloatArray
-    residuals_px: FloatArray
-    inliers: NDArray[np.bool_]
+    fit: PickFit
+
+    @property
+    def residuals_px(self) -> FloatArray:
+        """(n,) of all picks."""
+        return self.fit.distances_px
 
     @property
     def outliers(self) -> list[int]:
         """Rows of the picks that contradict the others."""
-        return [int(i) for i in np.flatnonzero(~self.inliers)]
+        return list(self.fit.wrong)
+
+
+def focal_sigma_rel(feature_map: AnyMap, image: MapImage) -> float:
+    """How well the focal length of a photo's camera is known, relative.
+
+    An EXIF focal length held the reconstruction's within some percent; photos over flat ground trade a
+    free one for height.
+    """
+    keys = feature_map.camera_keys
+    known = bool(keys) and bool(keys[image.camera_id])
+    return KNOWN_FOCAL_REL if known else UNKNOWN_FOCAL_REL
+
+
+def least_picks(focal_rel: float) -> int:
+    """P3P takes three, a fourth chooses its solution; a focal length takes one, a check another."""
+    return 4 if focal_rel <= KNOWN_FOCAL_REL else 6
 
 
 def pose_from_picks(
-    picks: Picks, points: FloatArray, camera: Camera, present: Rigid3, options: StartOptions
+    picks: Picks,
+    points: FloatArray,
+    camera: Camera,
+    present: Rigid3 | None,
+    options: StartOptions,
+    focal_rel: float = KNOWN_FOCAL_REL,
 ) -> PickedPose:
-    """Robust pose from picked correspondences.
+    """Pose by picked correspondences, if they determine it and do not contradict each other.
 
     Args:
         points: (n, 3) the picks' coordinates in the local frame, metres.
-        present: where the map has the camera now, in the local frame; only its vertical counts.
+        present: where the map has the camera now, in the local frame, of which only the vertical counts; None
+            where the map does not know up.
+        focal_rel: standard deviation of the focal length, relative.
 
     Raises:
         RegistrationError: too few, contradictory, or badly spread picks.
     """
-    count = len(picks.pixels)
-    if count < options.min_picks:
+    count, least = len(picks.pixels), least_picks(focal_rel)
+    if count < least:
+        unknown = "" if least == 4 else ", since the focal length of its lens is not known"
         raise RegistrationError(
-            f"picks of {picks.image}: expected at least {options.min_picks}, found {count}; "
+            f"picks of {picks.image}: expected at least {least}{unknown}, found {count}; "
             "add well-spread points"
         )
-    settings = PoseOptions(tolerance_rel=options.pick_tolerance_rel, min_matches=options.min_picks)
-    found = estimate_pose(picks.pixels, points, camera, "map", settings)
-    if found is not None:
-        found = refine_pose(picks.pixels, points, found, settings)
-    if found is None or found.count < max(options.min_pick_share * count, options.min_picks - 1):
-        agreeing = 0 if found is None else found.count
+    sigma_px = options.pick_sigma_px_rel * max(camera.width, camera.height)
+    settings = PickFitOptions(sigma_px=sigma_px, sigma_m=options.pick_sigma_m)
+    fit = fit_picks(picks.pixels, points, camera, focal_rel, settings)
+    _check(picks, points, fit, present, options)
+    assert fit is not None
+    prior = _prior(fit.cam_from_local, fit.covariance, options)
+    widest_deg = max(prior.sigma_tilt_deg, prior.sigma_heading_deg)
+    if prior.sigma_horizontal_m > options.max_pick_sigma_m or widest_deg > options.max_pick_sigma_deg:
         raise RegistrationError(
-            f"picks of {picks.image}: only {agreeing} of {count} agree with one pose within "
-            f"{options.pick_tolerance_rel * max(camera.width, camera.height):.0f} px; check the order of the "
-            "columns (pixel x, pixel y, easting, northing, height), the zone, the heights and the photo"
+            f"picks of {picks.image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
+            f"{widest_deg:.0f} degrees; spread them over the photo"
         )
-    tilt = np.degrees(np.arccos(np.clip(found.cam_from_local.rotation[:, 2] @ present.rotation[:, 2], -1, 1)))
+    to_left = np.kron(np.eye(2), -fit.cam_from_local.rotation)
+    return PickedPose(
+        prior=prior, camera=fit.camera, covariance=to_left @ fit.covariance @ to_left.T, fit=fit
+    )
+
+
+def _check(
+    picks: Picks, points: FloatArray, fit: PickFit | None, present: Rigid3 | None, options: StartOptions
+) -> None:
+    """Refuse what contradicts itself or the map.
+
+    Raises:
+        RegistrationError
+    """
+    if fit is None or not fit.consistent:
+        far = "" if fit is None else f"; they miss one pose by up to {fit.distances_px.max():.0f} px"
+        raise RegistrationError(
+            f"picks of {picks.image}: they contradict each other{far}; check the order of the columns "
+            "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add picks: "
+            "of eight, two wrong ones are found"
+        )
+    if fit.doubtful:
+        raise RegistrationError(
+            f"picks of {picks.image}: one of {', '.join(str(i + 1) for i in fit.doubtful)} is wrong, and the "
+            "others do not tell which; add a pick"
+        )
+    if fit.other_pose:
+        raise RegistrationError(
+            f"picks of {picks.image}: two poses explain them equally well; add a pick, best where the ground "
+            "is higher or lower"
+        )
+    axis_up = float(fit.cam_from_local.rotation[2, 2])
+    if axis_up > 0.5 and fit.cam_from_local.center[2] < float(points[:, 2].min()):
+        raise RegistrationError(
+            f"picks of {picks.image}: the camera would look at the scan from below; are easting and "
+            "northing, or pixel x and y, swapped?"
+        )
+    if present is None:
+        return
+    cosine = fit.cam_from_local.rotation[:, 2] @ present.rotation[:, 2]
+    tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
     if tilt > options.max_pick_tilt_deg:
         raise RegistrationError(
             f"picks of {picks.image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
             "are easting and northing, or pixel x and y, swapped?"
         )
-    inner = found.inliers
-    covariance = _pick_covariance(picks.pixels[inner], points[inner], camera, found.cam_from_local, options)
-    uncertainty = pose_uncertainty(
-        picks.pixels[inner],
-        points[inner],
-        np.broadcast_to(options.pick_sigma_m**2 * np.eye(3), (found.count, 3, 3)),
-        found,
-        settings,
-    )
-    # The residuals of six picks may be small by luck: a person's precision is the least that is believed.
-    covariance = np.maximum(1.0, np.trace(uncertainty.covariance) / np.trace(covariance)) * covariance
-    prior = _prior(found.cam_from_local, covariance, options)
-    if prior.sigma_horizontal_m > options.max_pick_sigma_m or max(
-        prior.sigma_tilt_deg, prior.sigma_heading_deg
-    ) > (options.max_pick_sigma_deg):
-        raise RegistrationError(
-            f"picks of {picks.image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
-            f"{max(prior.sigma_tilt_deg, prior.sigma_heading_deg):.0f} degrees; spread them over the photo"
-        )
-    to_left = np.kron(np.eye(2), -found.cam_from_local.rotation)
-    return PickedPose(
-        prior=prior,
-        covariance=to_left @ covariance @ to_left.T,
-        residuals_px=reprojection_errors(picks.pixels, points, camera, found.cam_from_local),
-        inliers=inner,
-    )
-
-
-def _pick_covariance(
-    pixels: FloatArray, points: FloatArray, camera: Camera, pose: Rigid3, options: StartOptions
-) -> FloatArray:
-    """(6, 6) of rotation about the local axes and centre, from a person's precision alone."""
-    by_point, by_pose = pixel_jacobians(camera, pose, points)
-    sigma_px = options.pick_sigma_px_rel * max(camera.width, camera.height)
-    noise = sigma_px**2 * np.eye(2) + options.pick_sigma_m**2 * by_point @ by_point.transpose(0, 2, 1)
-    information = np.einsum("nij,nik,nkl->jl", by_pose, np.linalg.inv(noise), by_pose)
-    return np.asarray(np.linalg.pinv(information, hermitian=True), dtype=np.float64)
 
 
 def _prior(pose: Rigid3, covariance: FloatArray, options: StartOptions) -> FramePrior:

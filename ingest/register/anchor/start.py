@@ -12,6 +12,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame_registration import FramePrior
 
@@ -29,13 +30,9 @@ class StartOptions:
             the height; a few times the spacing of sparse airborne scans.
         min_shift_points: fewer give no height.
         max_shift_points: more only take longer.
-        min_picks: P3P takes three and a fourth to choose its solution; two more make an outlier visible.
         pick_sigma_px_rel: how well a person marks a point, as a share of the image's longer side: 3 pixels
             in 4000.
         pick_sigma_m: how well a person reads a coordinate off a scan.
-        pick_tolerance_rel: a pick that misses by more is an outlier: 50 pixels in 4000. From 50 m the 0.2 m
-            of a coordinate are 13 of them.
-        min_pick_share: with fewer picks that agree, nobody knows which ones are right.
         max_pick_sigma_m, max_pick_sigma_deg: picks on a line or close together leave the pose open.
         max_pick_tilt_deg: between the vertical by the picks and by the map: reconstructions placed by GPS
             know it to degrees, and swapped columns turn the ground upside down.
@@ -47,11 +44,8 @@ class StartOptions:
     shift_reach_m: float = 3.0
     min_shift_points: int = 30
     max_shift_points: int = 5000
-    min_picks: int = 6
     pick_sigma_px_rel: float = 0.00075
     pick_sigma_m: float = 0.2
-    pick_tolerance_rel: float = 0.0125
-    min_pick_share: float = 0.6
     max_pick_sigma_m: float = 20.0
     max_pick_sigma_deg: float = 10.0
     max_pick_tilt_deg: float = 45.0
@@ -208,7 +202,7 @@ def look_at_angles(utm: FloatArray, target_utm: FloatArray) -> tuple[float, floa
     )
 
 
-def image_named(feature_map: FeatureMap, name: str) -> MapImage:
+def image_named(feature_map: AnyMap, name: str) -> MapImage:
     """The image of a map by its name, or by the last part of it where only one image has that.
 
     Raises:
