@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from featuredb.store import Database
     from ingest.anchoring import Anchoring, AnchorRequest
 
 _EPILOG = """\
@@ -55,6 +56,14 @@ def register(subparsers: Any) -> None:
     helping.add_argument("--pose", type=Path, default=None, metavar="FILE", help="a rough pose, JSON")
     helping.add_argument("--picks", type=Path, default=None, metavar="FILE", help="picked points, CSV")
     helping.add_argument("--image", default=None, metavar="NAME", help="photo of --pose or --picks")
+    page = anchor.add_argument_group("picking in a page")
+    page.add_argument(
+        "--page",
+        action="store_true",
+        help="open a page on this machine: click the same spots in photo and scan",
+    )
+    page.add_argument("--port", type=int, default=0, help="of the page; default: a free one")
+    page.add_argument("--no-browser", action="store_true", help="print the address only")
     anchor.add_argument("--quiet", action="store_true", help="no progress bars")
     anchor.set_defaults(run=run_anchor)
 
@@ -67,16 +76,41 @@ def run_anchor(args: argparse.Namespace) -> int:
 
     request = _request(args)
     database = open_database(args)
+    if args.page:
+        return _page(database, request, args)
     with progress_bars(args.quiet) as progress:
         done = anchor(database, request, progress)
     sys.stdout.write(summary(done, args))
     return 0 if done.placed or done.proposed else 1
 
 
+def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespace) -> int:
+    """Serve the page of picks until it is stopped; 0."""
+    from ingest.anchoring import the_map
+    from ingest.register.picks_page.server import create_app, new_token
+    from ingest.register.picks_page.session import PickSession
+    from reloc.viewer.command import require_extra
+    from reloc.viewer.serve import serve
+
+    require_extra()
+    snapshot = database.snapshot()
+    loaded = snapshot.load_any(the_map(snapshot, request.map_id).map_id)
+    token = new_token()
+    serve(
+        create_app(PickSession(database, request, loaded), token),
+        args.port,
+        browser=not args.no_browser,
+        path=f"{token}/",
+    )
+    return 0
+
+
 def _request(args: argparse.Namespace) -> "AnchorRequest":
     from featuredb.errors import InvalidValueError
     from ingest.anchoring import AnchorRequest
 
+    if args.page and (args.auto or args.confirm or args.pose or args.picks):
+        raise InvalidValueError("--page asks a person for everything; expected it alone")
     if args.auto and args.confirm:
         raise InvalidValueError("expected --auto or --confirm, found both")
     if args.image and not (args.pose or args.picks):

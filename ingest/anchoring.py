@@ -227,7 +227,7 @@ def _confirm_command(database: Database, job: _Job) -> str:
 
 def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:
     snapshot = database.snapshot()
-    summary = _the_map(snapshot, request.map_id)
+    summary = the_map(snapshot, request.map_id)
     loaded = snapshot.load_any(summary.map_id)
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
@@ -264,7 +264,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     )
 
 
-def _the_map(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
+def the_map(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
     """The live map of that id, or of an id that begins so."""
     maps: list[MapSummary | UnplacedSummary] = [*snapshot.maps(), *snapshot.unplaced_maps()]
     exact = [m for m in maps if m.map_id == map_id]

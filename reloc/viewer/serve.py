@@ -10,11 +10,11 @@ from fastapi import FastAPI
 from reloc.viewer.server import HOST, listen, uvicorn_server
 
 
-def serve(app: FastAPI, port: int, *, browser: bool) -> None:
+def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
     """Serve until SIGINT or SIGTERM, after printing the address; call from the main thread.
 
     Args:
-        browser: also open the page.
+        browser: also open the page. path: of the page, below the address.
 
     Raises:
         ViewerStartError: cannot listen.
@@ -23,7 +23,7 @@ def serve(app: FastAPI, port: int, *, browser: bool) -> None:
     before = {number: signal.signal(number, _stopped) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         with listen(port) as bound:
-            url = f"http://{HOST}:{bound.getsockname()[1]}/"
+            url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
             sys.stdout.write(f"{url}; stop with Ctrl-C\n")
             sys.stdout.flush()
             # Connections wait in the socket until the server runs.

@@ -68,8 +68,8 @@ def test_the_covariance_of_picked_poses_is_honest() -> None:
     truth = looking_down()
     sigma_px = OPTIONS.pick_sigma_px_rel * CAMERA.width
     squared = []
-    for seed in range(60):
-        picks, points = picks_at(truth, count=12, noise_px=sigma_px, seed=seed)
+    for seed in range(30):
+        picks, points = picks_at(truth, count=8, noise_px=sigma_px, seed=seed)
         rng = np.random.default_rng(1000 + seed)
         found = pose_from_picks(
             picks, points + rng.normal(0, OPTIONS.pick_sigma_m, points.shape), CAMERA, truth, OPTIONS
@@ -83,8 +83,8 @@ def test_the_covariance_of_picked_poses_is_honest() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda p: (p.pixels[:5], p.utm[:5]), "expected at least 6, found 5"),
-        (lambda p: (p.pixels[::-1], p.utm), "agree with one pose"),
+        (lambda p: (p.pixels[:3], p.utm[:3]), "expected at least 4, found 3"),
+        (lambda p: (p.pixels[::-1], p.utm), "contradict each other"),
         (
             lambda p: (p.pixels, np.column_stack([p.utm[:, 1], p.utm[:, 0], p.utm[:, 2]])),
             "are easting and northing",

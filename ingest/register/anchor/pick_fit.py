@@ -19,7 +19,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from reloc.jacobians import pixel_jacobians
 
-_STARTS = 150  # triples that P3P is asked for
+_STARTS = 60  # triples that P3P is asked for
 _REFINED = 6  # of their poses, best first, that are refined
 _ROUNDS = 15
 

@@ -137,8 +137,8 @@ def _check(
         far = "" if fit is None else f"; they miss one pose by up to {fit.distances_px.max():.0f} px"
         raise RegistrationError(
             f"picks of {picks.image}: they contradict each other{far}; check the order of the columns "
-            "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add picks: "
-            "of eight, two wrong ones are found"
+            "(pixel x, pixel y, easting, northing, height), the zone, the heights and the photo, or add "
+            "picks: of eight, two wrong ones are found"
         )
     if fit.doubtful:
         raise RegistrationError(

@@ -1,0 +1,110 @@
+"""The page of picks over HTTP, to this machine only, behind a token in its address.
+
+The socket is bound to 127.0.0.1, names other than that are refused by the Host header, and everything lies
+below a random token that other web pages cannot know: none can read or post here.
+"""
+
+import asyncio
+import secrets
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from importlib import resources
+from typing import Any
+
+from fastapi import APIRouter, FastAPI, HTTPException, Request, Response
+from fastapi.responses import JSONResponse
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+
+from featuredb.errors import FeatureDbError
+from ingest.register.picks_page.session import PickSession, Spot
+from reloc.viewer.server import HOST
+
+_MEDIA_TYPES = {"js": "text/javascript", "css": "text/css"}
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class _Pick(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    x: FiniteFloat
+    y: FiniteFloat
+    ground_x: FiniteFloat
+    ground_y: FiniteFloat
+
+
+class _Picks(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    image: int
+    picks: list[_Pick] = Field(max_length=40)
+
+    def spots(self) -> list[Spot]:
+        return [Spot(**pick.model_dump()) for pick in self.picks]
+
+
+def new_token() -> str:
+    """Part of the address that nobody can guess."""
+    return secrets.token_urlsafe(24)
+
+
+def create_app(session: PickSession, token: str) -> FastAPI:
+    """The application; everything lies below /TOKEN/."""
+    app = FastAPI(title="featuredb picks", docs_url=None, redoc_url=None, openapi_url=None)
+    threads = ThreadPoolExecutor(3, thread_name_prefix="picks")
+    root = resources.files("ingest.register.picks_page") / "assets"
+    files = {file.name: file.read_bytes() for file in root.iterdir() if file.is_file()}
+    below = APIRouter(prefix=f"/{token}")
+
+    async def in_thread(work: Callable[[], Any]) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(threads, work)
+
+    @below.get("/")
+    async def index() -> Response:
+        headers = {"Content-Security-Policy": _POLICY, "Referrer-Policy": "no-referrer"}
+        return Response(files["index.html"], media_type="text/html", headers=headers)
+
+    @below.get("/assets/{name}")
+    async def asset(name: str) -> Response:
+        kind = _MEDIA_TYPES.get(name.rsplit(".", 1)[-1])
+        if name not in files or kind is None:
+            raise HTTPException(404, f"no file {name[:100]!r}")
+        return Response(files[name], media_type=kind)
+
+    @below.get("/api/state")
+    async def state() -> Response:
+        return JSONResponse(session.state())
+
+    @below.get("/api/ground.png")
+    async def ground() -> Response:
+        return Response(await in_thread(session.ground_png), media_type="image/png")
+
+    @below.get("/api/photo/{image}")
+    async def photo(image: int) -> Response:
+        return Response(await in_thread(partial(session.photo_jpeg, image)), media_type="image/jpeg")
+
+    @below.get("/api/overlay/{image}")
+    async def overlay(image: int) -> Response:
+        return Response(await in_thread(partial(session.overlay_png, image)), media_type="image/png")
+
+    @below.post("/api/solve")
+    async def solve(picks: _Picks) -> Response:
+        return JSONResponse(await in_thread(partial(session.solve, picks.image, picks.spots())))
+
+    @below.post("/api/refine")
+    async def refine(picks: _Picks) -> Response:
+        return JSONResponse(await in_thread(partial(session.refine, picks.image, picks.spots())))
+
+    @below.post("/api/confirm")
+    async def confirm(picks: _Picks) -> Response:
+        return JSONResponse(await in_thread(partial(session.confirm, picks.image)))
+
+    @app.exception_handler(FeatureDbError)
+    async def refused(request: Request, error: FeatureDbError) -> Response:
+        return JSONResponse({"message": str(error)}, 400)
+
+    app.include_router(below)
+    app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
+    return app

@@ -1,0 +1,271 @@
+"""What the page of picks works on: one map, its photos, a scan; picks to a pose, a verdict, a place."""
+
+import csv
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import cv2
+import numpy as np
+
+from featuredb.errors import FeatureDbError, InvalidValueError
+from featuredb.features.decode import INGEST_LIMITS, decode_rgb
+from featuredb.geometry.arrays import FloatArray
+from featuredb.lidar.load import load_cloud, scan_frame
+from featuredb.maps.feature_map import MapImage
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
+from featuredb.render.cloud import PointCloud
+from featuredb.store import Database
+from ingest.anchoring import Anchoring, AnchorRequest, anchor
+from ingest.register.anchor.first_place import chosen_scans
+from ingest.register.anchor.photo_files import PhotoFiles, find_photos
+from ingest.register.anchor.pick_fit import PickFit, PickFitOptions, fit_picks
+from ingest.register.anchor.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
+from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
+from ingest.register.anchor.start import StartOptions
+from ingest.register.picks_page.ground import Ground, ground_of
+
+_LOG = logging.getLogger(__name__)
+_PHOTO_PX = 4096
+PICKS_FILE = "picks.csv"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spot:
+    """One pick: full-size pixel of the photo, and a place in the picture of the ground."""
+
+    x: float
+    y: float
+    ground_x: float
+    ground_y: float
+
+
+class PickSession:
+    """One map on one scan. Methods may be called from several threads."""
+
+    def __init__(self, database: Database, request: AnchorRequest, loaded: AnyMap) -> None:
+        self.database, self.request, self.map = database, request, loaded
+        self.files: PhotoFiles = find_photos(loaded, request.photos)
+        scans = chosen_scans(database, request.scan_ids)
+        self.scan_ids = tuple(scan.scan_id for scan in scans)
+        self.epsg = scans[0].epsg
+        self.cloud: PointCloud = load_cloud(database, scan_frame(scans[0]), scan_ids=self.scan_ids)
+        self.ground: Ground = ground_of(self.cloud, min(scan.spacing_m for scan in scans))
+        self.out = request.out or Path(f"anchor-{loaded.map_id}")
+        self._work, self._fits = Lock(), dict[int, PickFit]()
+        self._proposed: Anchoring | None = None
+
+    def state(self) -> dict[str, Any]:
+        """What the page shows first."""
+        height, width = self.ground.height.shape
+        counts = np.bincount(
+            self.map.observations.image_id, minlength=max(i.image_id for i in self.map.images) + 1
+        )
+        return {
+            "map": {
+                "id": self.map.map_id,
+                "name": self.map.name,
+                "placed": not isinstance(self.map, UnplacedMap),
+                "reason": self.map.no_place.reason if isinstance(self.map, UnplacedMap) else "",
+            },
+            "ground": {"width": width, "height": height, "pixel_m": self.ground.pixel_m},
+            "photos": [
+                {
+                    "id": image.image_id,
+                    "name": image.name,
+                    "width": self._camera(image).width,
+                    "height": self._camera(image).height,
+                    "points": int(counts[image.image_id]),
+                    "least": least_picks(focal_sigma_rel(self.map, image)),
+                }
+                for image in self.map.images
+                if image.image_id in self.files.paths
+            ],
+        }
+
+    def image(self, image_id: int) -> MapImage:
+        """A photo of the map that is there.
+
+        Raises:
+            InvalidValueError: there is none of that id.
+        """
+        for image in self.map.images:
+            if image.image_id == image_id and image_id in self.files.paths:
+                return image
+        raise InvalidValueError(f"the map has no photo {image_id} in {self.files.folder}")
+
+    def photo_jpeg(self, image_id: int) -> bytes:
+        rgb = decode_rgb(self.files.path(self.image(image_id)), INGEST_LIMITS)
+        shrink = _PHOTO_PX / max(rgb.shape)
+        if shrink < 1:
+            rgb = np.asarray(
+                cv2.resize(rgb, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8
+            )
+        return jpeg(rgb)
+
+    def ground_png(self) -> bytes:
+        return png(self.ground.rgb)
+
+    def spots(self, spots: Sequence[Spot]) -> tuple[FloatArray, FloatArray]:
+        """Pixels (n, 2), and points (n, 3) in the cloud's frame.
+
+        Raises:
+            InvalidValueError: a spot has no scan.
+        """
+        pixels = np.array([[s.x, s.y] for s in spots]).reshape(-1, 2)
+        return pixels, np.array([self.ground.spot(s.ground_x, s.ground_y) for s in spots]).reshape(-1, 3)
+
+    def solve(self, image_id: int, spots: Sequence[Spot]) -> dict[str, Any]:
+        """The pose by the picks so far, the residual of each, and what is missing or wrong."""
+        image = self.image(image_id)
+        camera, focal_rel = self._camera(image), focal_sigma_rel(self.map, image)
+        pixels, points = self.spots(spots)
+        self._fits.pop(image_id, None)
+        least = least_picks(focal_rel)
+        if len(spots) < least:
+            return {
+                "ready": False,
+                "pose": False,
+                "message": f"{len(spots)} of at least {least} picks",
+                "picks": [],
+            }
+        options = StartOptions()
+        sigma_px = options.pick_sigma_px_rel * max(camera.width, camera.height)
+        fit = fit_picks(
+            pixels, points, camera, focal_rel, PickFitOptions(sigma_px=sigma_px, sigma_m=options.pick_sigma_m)
+        )
+        if fit is None:
+            return {"ready": False, "pose": False, "message": "no pose explains these picks", "picks": []}
+        self._fits[image_id] = fit
+        found: dict[str, Any] = {
+            "pose": True,
+            "picks": [
+                {
+                    "residual_px": float(fit.distances_px[i]),
+                    "at": (pixels[i] - fit.residuals_px[i]).tolist(),
+                    "sigmas": float(fit.normalised[i]),
+                    "wrong": i in fit.wrong,
+                    "doubtful": i in fit.doubtful,
+                }
+                for i in range(len(spots))
+            ],
+            "rms_px": float(np.sqrt((fit.distances_px[fit.believed] ** 2).mean())),
+            "chi_square": fit.chi_square,
+            "redundancy": fit.redundancy,
+            "focal_px": fit.camera.focal_px,
+        }
+        try:
+            utm = self.cloud.frame.utm_from_enu(points, self.epsg)
+            by = pose_from_picks(
+                Picks(image=image.name, pixels=pixels, utm=utm),
+                points,
+                camera,
+                self._upright(image),
+                options,
+                focal_rel,
+            )
+        except FeatureDbError as error:
+            return found | {"ready": False, "message": str(error)}
+        east, north, up = self.cloud.frame.utm_from_enu(by.prior.cam_from_local.center, self.epsg)
+        wrong = (
+            ""
+            if not fit.wrong
+            else f"pick {', '.join(str(i + 1) for i in fit.wrong)} contradicts the others. "
+        )
+        return found | {
+            "ready": True,
+            "message": f"{wrong}Camera at {east:.1f} E, {north:.1f} N, {up:.1f} m (EPSG:{self.epsg}), to "
+            f"{by.prior.sigma_horizontal_m:.1f} m and {by.prior.sigma_tilt_deg:.1f} degrees",
+        }
+
+    def overlay_png(self, image_id: int) -> bytes:
+        """The scan's edges as the photo's camera sees them by the picks, transparent elsewhere.
+
+        Raises:
+            InvalidValueError: the picks have not given a pose.
+        """
+        fit = self._fits.get(image_id)
+        if fit is None:
+            raise InvalidValueError("the picks give no pose yet")
+        return png(edge_layer(scan_view(self.cloud, fit.camera, fit.cam_from_local)))
+
+    def refine(self, image_id: int, spots: Sequence[Spot]) -> dict[str, Any]:
+        """Register the photo to the scan from its picks, and others from where the map then has them."""
+        image = self.image(image_id)
+        with self._work:
+            self._write_picks(image, spots)
+            self._proposed = anchor(self.database, self._request(image))
+            tried = self._proposed.report.tried.tried
+            return {
+                "proposed": list(self._proposed.proposed),
+                "frames": [
+                    {
+                        "name": f.image.name,
+                        "accepted": f.registration.accepted,
+                        "message": f.registration.message or "registered",
+                        "reason": f.registration.reason or "",
+                    }
+                    for f in tried
+                ],
+            }
+
+    def confirm(self, image_id: int) -> dict[str, Any]:
+        """Place the whole map by the frames that were registered, and commit it."""
+        image = self.image(image_id)
+        with self._work:
+            if self._proposed is None or image.name not in self._proposed.proposed:
+                raise InvalidValueError(f"{image.name} has not been registered to the scan; refine it first")
+            done = anchor(self.database, self._request(image, self._proposed.proposed))
+            result = done.report.result
+            assert result is not None
+            after = None if result.after is None else result.after.median_m
+            return {
+                "placed": done.placed,
+                "message": result.message,
+                "reason": result.reason or "",
+                "median_m": after,
+                "version": done.version,
+                "undo": f"featuredb rollback {self.database.url} {done.version_before}"
+                if done.placed
+                else "",
+                "report": str(done.report_page),
+            }
+
+    def _request(self, image: MapImage, confirm: tuple[str, ...] = ()) -> AnchorRequest:
+        placed_before = confirm and not isinstance(self.map, UnplacedMap)
+        return AnchorRequest(
+            map_id=self.map.map_id,
+            photos=self.request.photos,
+            scan_ids=self.scan_ids,
+            out=self.out,
+            confirm=confirm,
+            picks_file=None if placed_before else self.out / PICKS_FILE,
+            image=None if placed_before else image.name,
+            storage_options=self.request.storage_options,
+        )
+
+    def _write_picks(self, image: MapImage, spots: Sequence[Spot]) -> None:
+        pixels, points = self.spots(spots)
+        utm = self.cloud.frame.utm_from_enu(points, self.epsg)
+        self.out.mkdir(parents=True, exist_ok=True)
+        with (self.out / PICKS_FILE).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["x", "y", "easting", "northing", "height", "image"])
+            writer.writerows(
+                [*(round(float(v), 3) for v in (*pixel, *place)), image.name]
+                for pixel, place in zip(pixels, utm, strict=True)
+            )
+
+    def _camera(self, image: MapImage) -> Any:
+        return self.map.cameras[image.camera_id]
+
+    def _upright(self, image: MapImage) -> Any:
+        known = self.map.frame.upright if isinstance(self.map, UnplacedMap) else True
+        if not known:
+            return None
+        if isinstance(self.map, UnplacedMap):
+            return image.cam_from_local
+        return image.cam_from_local @ self.map.frame.enu_from(self.cloud.frame)
