@@ -53,6 +53,10 @@ class UnplacedMapError(StoreError):
     """What was asked for needs a place on Earth, and the map has none; the message says what gives it one."""
 
 
+class UnplacedBesideOthersError(FeatureDbError):
+    """A query names a map without a place beside other maps; its answers are in a frame of its own."""
+
+
 class SnapshotNotFoundError(StoreError):
     """The database has no snapshot with that number or before that time."""
 

@@ -247,8 +247,11 @@ def _answer_all(
             reply = ask(data, lenses.get(path), False)
             sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
             sys.stdout.flush()
-            if reply.status != "localised":
+            if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
+            elif reply.in_map is not None:
+                if args.overlay is not None:
+                    sys.stderr.write(f"featuredb: {path}: no overlay of a map without a place\n")
             elif args.overlay is not None:
                 from reloc.overlay import write_overlay
 

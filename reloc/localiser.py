@@ -1,9 +1,11 @@
 """The active maps of one snapshot, indexed and ready to answer."""
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+import threading
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +13,16 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
+from featuredb.errors import IncompatibleExtractorError, MapNotFoundError, UnplacedBesideOthersError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import load_or_build
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import Lineage
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
 from reloc.candidates import IndexedArea
+from reloc.in_map import at_stand_in, in_own_frame
 from reloc.localise import localise
 from reloc.options import LocaliseOptions
 from reloc.result import LocaliseRequest, LocaliseResult
@@ -38,7 +42,7 @@ class _Loaded:
 
 
 class Localiser:
-    """Answers queries from one snapshot. Never changes; threads may share it."""
+    """Answers queries from one snapshot, which never changes; threads may share it."""
 
     def __init__(
         self,
@@ -46,12 +50,16 @@ class Localiser:
         options: LocaliseOptions,
         snapshot: int,
         lineages: Mapping[str, Lineage],
+        unplaced: Mapping[str, Callable[[], UnplacedMap]] | None = None,
     ) -> None:
         self._loaded = tuple(loaded)
         self._options = options
         self._snapshot = snapshot
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
         self._lineages = dict(lineages)
+        self._unplaced = dict(unplaced or {})
+        self._own: tuple[UnplacedMap, IndexedArea] | None = None
+        self._own_lock = threading.Lock()
 
     @classmethod
     def open(
@@ -91,7 +99,12 @@ class Localiser:
             loaded.append(
                 known[key] if key in known and not tried else _load(snapshot, group, key, cache, trial)
             )
-        return cls(loaded, options, snapshot.version, snapshot.lineages())
+        unplaced = {
+            m.map_id: partial(snapshot.load_unplaced, m.map_id)
+            for m in snapshot.unplaced_maps()
+            if m.descriptors
+        }
+        return cls(loaded, options, snapshot.version, snapshot.lineages(), unplaced)
 
     @property
     def snapshot(self) -> int:
@@ -121,9 +134,13 @@ class Localiser:
 
         Raises:
             MapNotFoundError: the request names maps that the snapshot does not serve.
+            UnplacedBesideOthersError: it names a map without a place beside others.
             IncompatibleExtractorError: all maps are of another extractor.
             ImageError: not a usable image.
         """
+        unplaced = self._named_unplaced(request.map_ids)
+        if unplaced is not None:
+            return self._in_own_frame(gray, request, unplaced)
         areas = self._chosen(request.map_ids)
         fingerprint = self._options.extractor.fingerprint
         matching = [a for a in areas if a.area.extractor_fingerprint == fingerprint]
@@ -134,6 +151,37 @@ class Localiser:
                 "cannot be compared; start the server with the extractor options of the ingest"
             )
         return self.with_lineage(localise(gray, request, matching, self._options, self._snapshot))
+
+    def _named_unplaced(self, map_ids: tuple[str, ...] | None) -> str | None:
+        """The map without a place that the request names, if it does.
+
+        Raises:
+            UnplacedBesideOthersError: it names others beside it.
+        """
+        named = [m for m in map_ids or () if m in self._unplaced]
+        if not named:
+            return None
+        if len(set(map_ids or ())) > 1:
+            raise UnplacedBesideOthersError(
+                f"map {named[0]} has no place: expected it to be named alone, since its answers are in a "
+                f"frame of its own, found {', '.join(map_ids or ())}"
+            )
+        return named[0]
+
+    def _in_own_frame(self, gray: NDArray[np.uint8], request: LocaliseRequest, map_id: str) -> LocaliseResult:
+        """The pose in the own frame of a map without a place, or the reason why there is none.
+
+        The map is read when it is first asked, and the one that was asked last is kept.
+        """
+        with self._own_lock:
+            if self._own is None or self._own[0].map_id != map_id:
+                unplaced = self._unplaced[map_id]()
+                area = build_area([at_stand_in(unplaced)])
+                index = load_or_build(area.descriptors, area.digest, None)
+                self._own = (unplaced, IndexedArea(area=area, index=index))
+            unplaced, indexed = self._own
+        told = replace(request, prior=None, beyond=None, map_ids=None)
+        return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
 
     def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""

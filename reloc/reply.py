@@ -6,11 +6,14 @@ import numpy as np
 
 from featuredb.geo.geopose import GeoPose
 from featuredb.geometry.arrays import FloatArray
-from reloc.result import Inliers, LocalisedPose, LocaliseResult
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import quaternion_from_matrix
+from reloc.result import Inliers, LocalisedPose, LocaliseResult, PoseInMap
 from reloc.wire import (
     Accuracy,
     CameraUsed,
     InlierPoints,
+    InMapPose,
     Lineage,
     LocaliseReply,
     Position,
@@ -26,6 +29,8 @@ def reply_from_result(
     """Word a result as the wire does; `timings_ms` replaces the result's own."""
     runner_up = result.runner_up
     fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
+    if result.in_map is not None:
+        fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
     return LocaliseReply(
         status=result.status,
         reason=result.reason,
@@ -115,13 +120,7 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
             vertical_68_m=pose.vertical_68_m,
             orientation_68_deg=pose.orientation_68_deg,
         ),
-        "camera": CameraUsed(
-            model=pose.camera.model,
-            width=pose.camera.width,
-            height=pose.camera.height,
-            params=pose.camera.params,
-            source=pose.camera_source,
-        ),
+        "camera": _camera_used(pose.camera, pose.camera_source),
         "residual_rms_px": pose.residual_rms_px,
         "maps": pose.map_ids,
         "lineage": tuple(
@@ -139,6 +138,30 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
         ),
         "inlier_points": None if pose.inliers is None else _inlier_points(pose.inliers),
     }
+
+
+def _in_map(pose: PoseInMap) -> InMapPose:
+    return InMapPose(
+        map_id=pose.map_id,
+        metric=pose.frame.metric,
+        upright=pose.frame.upright,
+        cam_from_map_xyzw=_floats(quaternion_from_matrix(pose.cam_from_map.rotation)),
+        cam_from_map_translation=_floats(pose.cam_from_map.translation),
+        center=_floats(pose.cam_from_map.center),
+        covariance=tuple(_floats(row) for row in pose.covariance),
+        camera=_camera_used(pose.camera, pose.camera_source),
+        residual_rms_px=pose.residual_rms_px,
+    )
+
+
+def _floats(values: FloatArray) -> Any:
+    return tuple(float(v) for v in values)
+
+
+def _camera_used(camera: Camera, source: Literal["request", "map", "exif", "estimated"]) -> CameraUsed:
+    return CameraUsed(
+        model=camera.model, width=camera.width, height=camera.height, params=camera.params, source=source
+    )
 
 
 def _inlier_points(inliers: Inliers) -> InlierPoints:

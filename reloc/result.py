@@ -13,6 +13,7 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
+from featuredb.maps.unplaced_map import OwnFrame
 from reloc.lens_prior import LensPrior
 
 Reason = Literal[
@@ -46,7 +47,8 @@ class LocaliseRequest:
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
         prior: where the photo may have been taken; None: anywhere in the database.
         beyond: a prior that was tried in vain; what it reaches is not tried again.
-        map_ids: only these maps; None: all active ones.
+        map_ids: only these maps; None: all active ones. A map without a place is named alone; it answers in
+            its own frame, and a prior does not count.
         want_inliers: the answer carries pixels and UTM points of its inliers.
     """
 
@@ -123,6 +125,47 @@ class LocalisedPose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class InliersInMap:
+    """The matches that agree with a pose in a map without a place.
+
+    Attributes:
+        pixels: (k, 2) float64, keypoints of the query in full-size pixels.
+        points_xyz: (k, 3) float64, the map points in the map's own frame.
+    """
+
+    pixels: FloatArray
+    points_xyz: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseInMap:
+    """A pose in the own frame of a map without a place; it says nothing of where on Earth that is.
+
+    Attributes:
+        map_id: of the map.
+        frame: whether its unit is a metre, and whether its z is up.
+        cam_from_map: pose, own frame to camera axes (x right, y down, z forward), units of the frame.
+        covariance: (6, 6), axes of the own frame: small rotation of the camera about them (rad) before
+            displacement of the camera centre (units of the frame).
+        camera, camera_source, residual_rms_px: as in LocalisedPose.
+        inliers: on request.
+    """
+
+    map_id: str
+    frame: OwnFrame
+    cam_from_map: Rigid3
+    covariance: FloatArray
+    camera: Camera
+    camera_source: Literal["request", "map", "exif", "estimated"]
+    residual_rms_px: float
+    inliers: InliersInMap | None = None
+
+    def __post_init__(self) -> None:
+        covariance = frozen_array("PoseInMap.covariance", self.covariance, (6, 6))
+        object.__setattr__(self, "covariance", covariance)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunnerUp:
     """The best pose elsewhere, which did not win.
 
@@ -166,9 +209,10 @@ class LocaliseResult:
     """The answer to one query: a pose, or a reason why there is none. Never a fallback pose.
 
     Attributes:
-        reason: None exactly when there is a pose.
+        reason: None exactly when there is a pose, on Earth or in a map.
         detail: one sentence for people.
-        pose: the accepted pose, or None.
+        pose: the accepted pose on Earth, or None.
+        in_map: the accepted pose in the own frame of a map without a place, which the request named, or None.
         confidence: probability that the pose is right, in [0, 1]; 0 when not localised.
         features, matches, inliers: counts: keypoints of the query, 2D-3D matches of the best cluster,
             matches that agree with the best pose (also of a rejected one: evidence).
@@ -189,11 +233,13 @@ class LocaliseResult:
     snapshot: int
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+    in_map: PoseInMap | None = None
 
     def __post_init__(self) -> None:
-        if (self.reason is None) != (self.pose is not None):
+        said = [value is not None for value in (self.reason, self.pose, self.in_map)]
+        if sum(said) != 1:
             raise InvalidValueError(
-                "LocaliseResult: expected either a pose or a reason, found both or neither"
+                "LocaliseResult: expected a reason, a pose on Earth or one in a map, found none or several"
             )
         if self.reason is not None and self.reason not in REASONS:
             raise InvalidValueError(
@@ -203,5 +249,7 @@ class LocaliseResult:
             raise InvalidValueError(f"LocaliseResult.confidence: expected 0..1, found {self.confidence}")
 
     @property
-    def status(self) -> Literal["localised", "not_localised"]:
+    def status(self) -> Literal["localised", "localised_in_map", "not_localised"]:
+        if self.in_map is not None:
+            return "localised_in_map"
         return "not_localised" if self.pose is None else "localised"

@@ -213,6 +213,26 @@ class InlierPoints(Answer):
     map_rows: tuple[Count, ...]
 
 
+class InMapPose(Answer):
+    """A pose in the own frame of a map without a place: nothing in it is a place on Earth.
+
+    `cam_from_map_xyzw` and `cam_from_map_translation` lead from the map's frame to camera axes (x right, y
+    down, z forward), `center` is the camera's centre in the map's frame; lengths are metres only where
+    `metric`, z is up only where `upright`. `covariance`: rotation (rad) before displacement of the centre,
+    axes and units of the frame.
+    """
+
+    map_id: str
+    metric: bool
+    upright: bool
+    cam_from_map_xyzw: Quaternion4
+    cam_from_map_translation: Triple
+    center: Triple
+    covariance: Covariance6
+    camera: CameraUsed
+    residual_rms_px: NotNegative
+
+
 ContributionReason = Literal["QUEUE_FULL", "OWNER_LIMIT", "INBOX_FULL", "STORE_FAILED"]
 
 
@@ -236,9 +256,13 @@ ReasonText = Literal[
 
 
 class LocaliseReply(Answer):
-    """The answer to a localise query; the pose's fields are null when it is not localised."""
+    """The answer to a localise query; the pose's fields are null when it is not localised on Earth.
 
-    status: Literal["localised", "not_localised"]
+    A map without a place that the request named answers `localised_in_map`: then `in_map` has the pose in the
+    map's own frame, and whatever would say where on Earth that is stays null.
+    """
+
+    status: Literal["localised", "localised_in_map", "not_localised"]
     reason: ReasonText | None
     detail: str
     position: Position | None
@@ -262,6 +286,7 @@ class LocaliseReply(Answer):
     timings_ms: dict[str, NotNegative]
     request_id: str
     contribution: ContributionReply | None = None
+    in_map: InMapPose | None = None
 
     @model_validator(mode="after")
     def _pose_or_reason(self) -> "LocaliseReply":
@@ -270,6 +295,11 @@ class LocaliseReply(Answer):
             raise ValueError("a localised reply needs every field of the pose and no reason")
         if self.status == "not_localised" and (self.reason is None or any(p is not None for p in pose)):
             raise ValueError("a reply that is not localised needs a reason and no pose")
+        if (self.status == "localised_in_map") != (self.in_map is not None):
+            raise ValueError("a pose in a map needs the status localised_in_map, and the other way round")
+        earth = (*pose, self.height_datum, self.runner_up, self.inlier_points)
+        if self.in_map is not None and (self.reason is not None or any(p is not None for p in earth)):
+            raise ValueError("a pose in a map needs no reason and nothing of a place on Earth")
         return self
 
 

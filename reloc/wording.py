@@ -1,7 +1,7 @@
 """Answers in words for people."""
 
 from featuredb.maps.lineage import lineage_text
-from reloc.wire import LocaliseReply
+from reloc.wire import InMapPose, LocaliseReply
 
 # What a person can do about each reason.
 ADVICE = {
@@ -20,6 +20,8 @@ ADVICE = {
 def describe(name: str, reply: LocaliseReply) -> str:
     """A few lines about one answer."""
     total = reply.timings_ms.get("total", 0.0)
+    if reply.in_map is not None:
+        return _in_map(name, reply, reply.in_map)
     if reply.utm is None or reply.position is None or reply.accuracy is None or reply.camera is None:
         advice = ADVICE.get(reply.reason or "", "")
         return (
@@ -42,6 +44,22 @@ def describe(name: str, reply: LocaliseReply) -> str:
         f"{_lineage(reply)}"
         f"{_contribution(reply)}"
         f"  time      {total:.0f} ms, snapshot {reply.snapshot}\n"
+    )
+
+
+def _in_map(name: str, reply: LocaliseReply, pose: InMapPose) -> str:
+    """A pose in a map's own frame, worded so that nobody takes it for a place."""
+    x, y, z = pose.center
+    unit = "m" if pose.metric else "units of the map, not metres"
+    return (
+        f"{name}: found in map {pose.map_id}, which has NO PLACE ON EARTH, "
+        f"confidence {reply.confidence:.3f}\n"
+        f"  in map    x {x:.3f}  y {y:.3f}  z {z:.3f} {unit}; "
+        f"z is {'up' if pose.upright else 'not known to be up'}\n"
+        f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
+        f"{pose.residual_rms_px:.2f} px, camera from {pose.camera.source}\n"
+        f"  to place the map: featuredb maps says how\n"
+        f"  time      {reply.timings_ms.get('total', 0.0):.0f} ms, snapshot {reply.snapshot}\n"
     )
 
 

@@ -119,8 +119,9 @@ class PlacedMap:
 
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
-    """All maps of a snapshot that are not retired, by id."""
-    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["status"] != "retired"}
+    """All maps with a place of a snapshot that are not retired, by id."""
+    placed = {m.map_id for m in snapshot.maps()}
+    return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
 
 
 def _placed(row: Row) -> PlacedMap:

@@ -46,7 +46,10 @@ class NotLocalisedError(GatewayError):
     """The photo's place is not known: `reply` says why."""
 
     def __init__(self, reply: LocaliseReply, geopose_id: str) -> None:
-        super().__init__(NOT_LOCALISED, f"{reply.reason}: {reply.detail}", reply.request_id)
+        why = f"{reply.reason}: {reply.detail}"
+        if reply.in_map is not None:
+            why = f"found in map {reply.in_map.map_id}, which has no place on Earth"
+        super().__init__(NOT_LOCALISED, why, reply.request_id)
         self.reply = reply
         self.geopose_id = geopose_id
 

@@ -14,6 +14,7 @@ from featuredb.errors import (
     IncompatibleExtractorError,
     InvalidValueError,
     MapNotFoundError,
+    UnplacedBesideOthersError,
 )
 from featuredb.features.decode import DecodeLimits, decode_gray
 from featuredb.features.exif import read_exif
@@ -99,7 +100,7 @@ def answer_query(
         result = localiser.localise(gray, request)
     except IncompatibleExtractorError as error:
         raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
-    except MapNotFoundError as error:
+    except (MapNotFoundError, UnplacedBesideOthersError) as error:
         raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
     except ImageError as error:
         raise RequestError(ErrorCode.BAD_IMAGE, f"image: {error}") from error
