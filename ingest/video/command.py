@@ -74,7 +74,7 @@ def run_video(args: argparse.Namespace) -> int:
         telemetry_late_s=args.telemetry_late,
         film_start_s=_film_start(telemetry, args),
         positions=args.gcp is None,
-        keyframes=KeyframeOptions(most=args.keyframes),
+        keyframes=KeyframeOptions(most=args.keyframes, least=min(KeyframeOptions().least, args.keyframes)),
     )
     if telemetry is not None:
         _check(telemetry, args)

@@ -20,16 +20,23 @@ class KeyframeOptions:
             each point in three photos, and light enough that matching stays quick.
         most: keyframes at most; a longer film has longer steps, up to `max_step`, and more keyframes beyond.
         max_step: neighbours must overlap.
+        least: a film that has fewer keyframes has shorter steps, down to `min_step`: so many are matched all
+            with all anyway, and a film of a few seconds gives too few photos otherwise (seven of
+            12 s of a flight straight ahead, of which no map came; of 25 one came).
+        min_step: below it neighbours are the same photo.
         window: frames before and after the one that is due among which the sharpest is taken.
     """
 
     step: float = 0.12
     most: int = 60
     max_step: float = 0.3
+    least: int = 24
+    min_step: float = 0.02
     window: int = 4
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.step <= self.max_step < 1.0 and self.most >= 2 and self.window >= 0):
+        steps = 0.0 < self.min_step <= self.step <= self.max_step < 1.0
+        if not (steps and self.most >= 2 and 0 <= self.least <= self.most and self.window >= 0):
             raise InvalidValueError(f"KeyframeOptions: value out of range in {self}")
 
 
@@ -56,6 +63,9 @@ def choose_keyframes(motion: Motion, options: KeyframeOptions | None = None) -> 
     rows = _rows(motion, step, options.window)
     while len(rows) > options.most and step < options.max_step:
         step = min(options.max_step, step * max(1.05, 0.98 * len(rows) / options.most))
+        rows = _rows(motion, step, options.window)
+    while len(rows) < options.least and step > options.min_step:
+        step = max(options.min_step, step * min(0.95, max(0.5, len(rows) / options.least)))
         rows = _rows(motion, step, options.window)
     segment = np.cumsum(motion.broken) - 1
     return KeyframeChoice(

@@ -84,7 +84,7 @@ def test_a_film_becomes_a_map_where_its_telemetry_says(
 
 def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Path) -> None:
     telemetry = read_telemetry(film.with_suffix(".srt"))
-    options = StillsOptions(keyframes=KeyframeOptions(step=0.2, window=0))
+    options = StillsOptions(keyframes=KeyframeOptions(step=0.2, window=0, least=0))
     stills = make_stills(film, telemetry, tmp_path, options)
     files = sorted(stills.folder.iterdir())
     assert len(files) == stills.photos == stills.positions

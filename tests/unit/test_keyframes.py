@@ -26,7 +26,7 @@ def _motion(
     )
 
 
-_EXACT = KeyframeOptions(window=0)
+_EXACT = KeyframeOptions(window=0, least=0)
 
 
 def test_keyframes_are_a_step_apart() -> None:
@@ -52,18 +52,18 @@ def test_where_the_film_stands_still_there_is_nothing_to_choose() -> None:
 
 def test_the_sharpest_frame_around_is_taken() -> None:
     motion = _motion([0.03] * 21, sharp={1: 2.0, 7: 3.0, 13: 2.0, 18: 2.0})
-    rows = [k - 5 for k in choose_keyframes(motion, KeyframeOptions(window=2)).index]
+    rows = [k - 5 for k in choose_keyframes(motion, KeyframeOptions(window=2, least=0)).index]
     assert rows[:2] == [1, 7]
     assert rows == sorted(set(rows))
 
 
 def test_a_long_film_has_longer_steps_up_to_a_limit() -> None:
     motion = _motion([0.03] * 401)
-    few = choose_keyframes(motion, KeyframeOptions(most=50, window=0))
+    few = choose_keyframes(motion, KeyframeOptions(most=50, window=0, least=0))
     assert 40 <= len(few.index) <= 50
     assert 0.2 < few.step <= 0.3
     # Neighbours must overlap: the limit of the step goes before that of the number.
-    many = choose_keyframes(motion, KeyframeOptions(most=10, window=0))
+    many = choose_keyframes(motion, KeyframeOptions(most=10, window=0, least=0))
     assert many.step == 0.3
     assert len(many.index) > 10
 
@@ -78,7 +78,7 @@ def test_the_work_grows_with_the_film_and_not_with_its_square(monkeypatch: pytes
         return real(*args, **more)  # type: ignore[call-overload]
 
     monkeypatch.setattr("ingest.video.keyframes.np.vstack", counted)
-    choose_keyframes(_motion([0.03] * 400), KeyframeOptions(window=0, most=200))
+    choose_keyframes(_motion([0.03] * 400), KeyframeOptions(window=0, most=200, least=0))
     assert len(seen) <= 2 * 400
 
 
@@ -139,3 +139,12 @@ def test_blur_is_less_sharp() -> None:
     sharp = picture(0, 320, 240)
     motion = measure_motion(_frames([sharp, cv2.GaussianBlur(sharp, (9, 9), 2.0)]))
     assert motion.sharpness[1] < 0.5 * motion.sharpness[0]
+
+
+def test_a_short_film_has_shorter_steps_but_none_below_the_shortest() -> None:
+    choice = choose_keyframes(_motion([0.01] * 100), KeyframeOptions(window=0))
+    assert 24 <= len(choice.index) <= 30
+    assert 0.02 <= choice.step < 0.12
+    still = choose_keyframes(_motion([0.001] * 100), KeyframeOptions(window=0))
+    assert still.step == 0.02
+    assert len(still.index) <= 6
