@@ -7,7 +7,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from featuredb.cli.main import run_command
+from featuredb.cli.main import main, run_command
 from featuredb.store import Database
 from ingest.cli import register
 from tests.conftest import REPOSITORY
@@ -39,7 +39,7 @@ def test_a_map_is_made_and_told_of(photos: Path, tmp_path: Path, capsys: pytest.
     code = _run(database, photos, *arguments, "--report", report)
     assert code == 0
     out = capsys.readouterr().out
-    assert "3 of 5 files registered, 0 not, 2 skipped" in out
+    assert "3 of 5 files registered, 0 in maps without a place, 0 not, 2 skipped" in out
     assert "photo_03.jpg: excluded" in out
     snapshot = Database.open(database).snapshot()
     (summary,) = snapshot.maps()
@@ -56,7 +56,13 @@ def test_a_map_is_made_and_told_of(photos: Path, tmp_path: Path, capsys: pytest.
     document = json.loads((report / "report.json").read_text())
     schema = json.loads((REPOSITORY / "schemas" / "ingest" / "report.json").read_text())
     jsonschema.validate(document, schema)
-    assert document["files"] == {"all": 5, "registered": 3, "not_registered": 0, "skipped": 2}
+    assert document["files"] == {
+        "all": 5,
+        "registered": 3,
+        "unplaced": 0,
+        "not_registered": 0,
+        "skipped": 2,
+    }
     assert (report / "report.html").stat().st_size > 1000
     # Once more: nothing new, and still a success.
     assert _run(database, photos, *arguments) == 0
@@ -64,12 +70,16 @@ def test_a_map_is_made_and_told_of(photos: Path, tmp_path: Path, capsys: pytest.
     assert len(Database.open(database).snapshot().maps()) == 1
 
 
-def test_photos_that_cannot_be_placed_give_exit_code_1(
+def test_photos_that_cannot_be_placed_are_kept_and_it_says_how_to_place_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_hill_photos(tmp_path / "photos", columns=2, rows=2, with_gps=False)
-    assert _run(tmp_path / "db", tmp_path / "photos", "--max-features", "800") == 1
-    assert "TOO_FEW" in capsys.readouterr().out
+    assert _run(tmp_path / "db", tmp_path / "photos", "--max-features", "800") == 0
+    out = capsys.readouterr().out
+    assert "without a place, 4 photos" in out
+    assert "TOO_FEW" in out
+    assert main(["maps", str(tmp_path / "db")]) == 0
+    assert "--page" in capsys.readouterr().out
 
 
 def test_a_folder_without_photos_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
