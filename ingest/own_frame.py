@@ -25,7 +25,8 @@ def own_frame_of(model: Model) -> tuple[Sim3, OwnFrame]:
     """
     centers = model.centers()
     distances = np.linalg.norm(model.xyz[model.point_of] - centers[model.photo_of], axis=1)
-    scale = NOMINAL_DISTANCE / float(np.median(distances))
+    median = float(np.median(distances))
+    scale = NOMINAL_DISTANCE / median if median > 0 else 1.0
     up = vertical_of(model.cam_from_sfm)
     rotation = np.eye(3) if up is None else _z_to(up)
     middle = np.median(model.xyz, axis=0)

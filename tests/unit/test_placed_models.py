@@ -4,6 +4,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from ingest.clusters.reconstruct import Reconstruction
 from ingest.colmap_bridge import Model
 from ingest.extract import FeatureFiles
@@ -20,6 +22,12 @@ class _Made(Reconstruction):
 
     def models(self) -> Iterator[Model]:
         yield self.model
+
+
+@pytest.fixture(autouse=True)
+def _no_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The models here are ties without geometry, of which no map can be built."""
+    monkeypatch.setattr("ingest.placed_models.build_unplaced_map", lambda *_: None)
 
 
 def _identity(number: int) -> MapIdentity:
