@@ -40,9 +40,8 @@ _ELSEWHERE = (
 
 
 _WAYS = (
-    "a scan and a person's hand: featuredb anchor DB MAP --page",
-    "ground control points: featuredb register DB MAP --gcp FILE",
-    "maps with a place that show the same: featuredb grow DB",
+    "a scan and a person's hand: featuredb lidar add DB SCAN, then "
+    "featuredb anchor DB MAP --photos FOLDER --page",
 )
 
 
