@@ -24,6 +24,7 @@ _SERVING: dict[tuple[str, ...], int | str | None] = {
     ("featuredb", "gateway"): 8080,
     ("featuredb", "view"): "http://127.0.0.1:",
     ("featuredb", "grow", "--watch"): None,
+    ("featuredb", "anchor", "--page"): "http://127.0.0.1:",
     ("dask", "scheduler"): 8786,
     ("dask", "worker"): "Registered to:",
 }
