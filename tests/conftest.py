@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+_STUDIES = "evaluation"
 REPOSITORY = Path(__file__).resolve().parents[1]
 
 
@@ -14,3 +15,15 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the real photo sets are not there: {folder}")
     return folder
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--evaluations", action="store_true", help="run the long studies, and nothing else")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Studies are rows of the scoreboard; a run of the tests counts them as deselected."""
+    wanted = bool(config.getoption("--evaluations"))
+    others = [item for item in items if (item.get_closest_marker(_STUDIES) is not None) != wanted]
+    config.hook.pytest_deselected(items=others)
+    items[:] = [item for item in items if item not in others]

@@ -24,8 +24,9 @@ def main() -> int:
     python = sys.executable
     # Two at a time, a file on one worker each, since modules share what they have made; in the order of
     # their folders, which leaves the short ones to the end, when one worker may have to wait for the other.
+    # Studies (marked as evaluations) are rows of the scoreboard.
     tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    tests += ["--durations", "100"]
+    tests += ["--durations", "250"]
     tests += ["-m", "not slow"] if fast else []
     with tempfile.TemporaryDirectory() as folder:
         steps = [

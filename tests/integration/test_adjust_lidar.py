@@ -113,6 +113,7 @@ def test_the_fixture_is_as_treacherous_as_it_says(wrong_lens: ScannedMap) -> Non
 
 
 @pytest.mark.parametrize("frames", [(4,), (0, 4, 8)])
+@pytest.mark.evaluation
 def test_the_scan_mends_the_lens(wrong_lens: ScannedMap, frames: tuple[int, ...]) -> None:
     structure, adjustment = _adjusted(wrong_lens, frames)
     assert adjustment.accepted, adjustment.message

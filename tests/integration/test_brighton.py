@@ -63,6 +63,7 @@ def test_the_same_ingest_again_changes_nothing(part: Ingest, photos: Path, work:
     assert [s.reused == s.total for s in again.stages if s.total] == [True] * 4
 
 
+@pytest.mark.evaluation
 def test_held_out_photos_lie_where_a_map_of_all_photos_has_them(
     part: Ingest, photos: Path, work: Path, tmp_path: Path
 ) -> None:

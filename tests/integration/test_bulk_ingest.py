@@ -99,6 +99,7 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
             assert np.linalg.norm(cam_from_frame.center - poses[image.name].center) < 0.2
 
 
+@pytest.mark.evaluation
 def test_the_pool_gives_the_same_map(
     hills: tuple[Path, list[HillPhoto]], in_process: tuple[FeatureMap, IngestReport], tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ def _run(*arguments: str | Path) -> int:
 
 @pytest.mark.real_data
 @pytest.mark.slow
+@pytest.mark.evaluation
 def test_copr_registers_by_its_control_points(
     shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -99,10 +99,10 @@ def _wait_for_workers(group: int) -> None:
 @pytest.mark.parametrize(
     "pattern",
     [
-        "_work/scan/*.json",
-        "_work/features/*/*.npz",
-        "_work/matches/*/*/*.npz",
-        "_work/models/*/.tmp-*",
+        pytest.param("_work/scan/*.json", marks=pytest.mark.evaluation),
+        pytest.param("_work/features/*/*.npz", marks=pytest.mark.evaluation),
+        pytest.param("_work/matches/*/*/*.npz", marks=pytest.mark.evaluation),
+        pytest.param("_work/models/*/.tmp-*", marks=pytest.mark.evaluation),
         "_work/models/*/*",
         "points/**/*.parquet",
         "maps/_delta_log/*1.json",
@@ -124,7 +124,7 @@ def test_killed_at_a_stage(pattern: str, photos: Path, undisturbed: FeatureMap, 
     assert verify(Database.open(database)).ok
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.evaluation)])
 def test_killed_again_and_again_at_random(
     seed: int, photos: Path, undisturbed: FeatureMap, tmp_path: Path
 ) -> None:
@@ -142,6 +142,7 @@ def test_killed_again_and_again_at_random(
     assert verify(Database.open(database)).ok
 
 
+@pytest.mark.evaluation
 def test_stopped_after_each_stage(photos: Path, undisturbed: FeatureMap, tmp_path: Path) -> None:
     database = tmp_path / "db"
     for stage in ("scan", "extract", "match", "reconstruct", "build"):

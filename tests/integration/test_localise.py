@@ -182,6 +182,7 @@ def test_what_is_no_photo_of_the_field_is_refused(
 
 
 @pytest.mark.parametrize("request_", [KNOWN, LocaliseRequest()], ids=["known", "unknown"])
+@pytest.mark.evaluation
 def test_giving_up_early_changes_no_answer(
     area: IndexedArea,
     photo: NDArray[np.uint8],

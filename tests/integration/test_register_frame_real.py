@@ -15,6 +15,7 @@ LENS = "SIMPLE_RADIAL:2916.2,2011.0,1153.6,0.02"
 
 
 @pytest.mark.real_data
+@pytest.mark.evaluation
 def test_two_priors_end_at_one_pose(shared_data: Path) -> None:
     folder = shared_data / "brighton"
     cloud = read_cloud(folder / "model.laz", 32615)

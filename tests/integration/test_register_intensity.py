@@ -4,6 +4,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -119,6 +120,7 @@ def test_another_place_is_not_confirmed() -> None:
     assert not found.accepted
 
 
+@pytest.mark.evaluation
 def test_the_photo_agrees_with_other_places_where_the_pattern_repeats_itself() -> None:
     """Copies lie 23 m apart, the places that are searched 21 m beside the pose."""
     found = []

@@ -82,6 +82,7 @@ def test_truth_reads_back_as_it_was_written(world: World) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.evaluation
 def test_the_same_options_give_the_same_bytes_from_any_number_of_processes(
     world: World, tmp_path: Path
 ) -> None:

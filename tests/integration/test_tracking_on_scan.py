@@ -95,6 +95,7 @@ def on_scan(cloud: PointCloud, film: list[np.ndarray]) -> list[TrackedFrame]:
     return tracked(ScanFinder(cloud, "hills", EPSG, coarse(pose_at(0))), film)
 
 
+@pytest.mark.evaluation
 def test_a_scan_alone_gives_right_poses_and_nothing_of_elsewhere(on_scan: list[TrackedFrame]) -> None:
     states = [frame.state for frame in on_scan]
     assert states[:7] == ["lost"] * 6 + ["relocalised"]
@@ -105,6 +106,7 @@ def test_a_scan_alone_gives_right_poses_and_nothing_of_elsewhere(on_scan: list[T
     check(on_scan, Rigid3.identity(), 0.3, 0.4)
 
 
+@pytest.mark.evaluation
 def test_poses_on_a_scan_have_its_zone_and_their_errors_are_claimed(on_scan: list[TrackedFrame]) -> None:
     normalised = []
     for frame in on_scan:

@@ -121,6 +121,7 @@ def test_wrong_coordinates_are_named(world: SurveyedBlock) -> None:
     assert "p3 is 2.5" in wrong.remark
 
 
+@pytest.mark.evaluation
 def test_covariance_covers_the_errors() -> None:
     """Normalised squared errors of the seven parameters average about seven, and points lie where it says."""
     scores, inside = [], []

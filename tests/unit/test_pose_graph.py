@@ -104,6 +104,7 @@ def test_general_similarities_are_recovered() -> None:
         np.testing.assert_allclose(found.corrections[m].matrix(), truth[m].matrix(), atol=1e-6)
 
 
+@pytest.mark.evaluation
 def test_covariance_is_that_of_many_trials() -> None:
     """Spread of solutions under sampled edge errors, with maps far from the origin and a loop."""
     rng = np.random.default_rng(0)

@@ -4,6 +4,7 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -49,6 +50,7 @@ def drawn(rng: np.random.Generator, count: int = MAPS) -> FloatArray:
     return np.array([rng.multivariate_normal(np.zeros(7), OWN) + shared(k) @ turn for k in range(count)])
 
 
+@pytest.mark.evaluation
 def test_the_end_of_a_chain_is_off_as_far_as_is_said() -> None:
     """Mean squared normalised error of the last map's place: 3 in theory; twice that if nothing is shared."""
     rng = np.random.default_rng(0)

@@ -151,6 +151,7 @@ def test_a_flat_scene_keeps_the_prior_and_finds_the_valley_from_anywhere() -> No
 
 
 @pytest.mark.parametrize("scene", [flat_scene, deep_scene])
+@pytest.mark.evaluation
 def test_the_covariance_holds_over_lenses_from_the_priors(scene: object) -> None:
     """Chi-square of the six pose parameters over lenses, pixel noise and scenes: mean 6."""
     options = PoseOptions()

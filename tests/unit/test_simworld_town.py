@@ -83,6 +83,7 @@ def test_buildings_of_several_pieces_stand_where_they_stood_and_only_identical_o
     assert fronts[2] - fronts[0] == pytest.approx(FACADE_LENGTH_M)
 
 
+@pytest.mark.evaluation
 def test_walls_in_pieces_have_one_design_and_no_piece_twice() -> None:
     (one,), (three,) = (
         [t for name, t in town_textures(5, pieces).items() if name == "facade_brick"] for pieces in (1, 3)
@@ -297,6 +298,7 @@ def test_flight_options_are_checked() -> None:
         FlightOptions(forward_overlap=1.0)
 
 
+@pytest.mark.evaluation
 def test_the_land_around_a_town_of_pieces_does_not_repeat_every_256_m() -> None:
     plain, varied = (town_textures(3, pieces)["fields"] for pieces in (1, 2))
     side = plain.levels[0].shape[0]

@@ -348,6 +348,17 @@ _SIMULATED = (
     ),
 )
 
+_STUDIES = Row(
+    name="studies",
+    group="simulated",
+    form="full",
+    claim="the studies among the tests: rates of covariances, kills at each stage, real control points",
+    commands=(("tools.evaluations", *_OUT),),
+    figures=_same("tests", "failed", "skipped"),
+    text="{failed} of {tests} failed, {skipped} skipped",
+    limits=(Limit(figure="failed", most=0), Limit(figure="tests", least=20)),
+    minutes=15,
+)
 _SPEED = (
     Row(
         name="query-time",
@@ -382,4 +393,4 @@ _SPEED = (
     ),
 )
 
-ROWS: tuple[Row, ...] = (*_REAL, *_SIMULATED, *_SPEED)
+ROWS: tuple[Row, ...] = (*_REAL, *_SIMULATED, _STUDIES, *_SPEED)
