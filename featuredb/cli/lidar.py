@@ -176,7 +176,7 @@ def _register_add(commands: Any) -> None:
         commands,
         "add",
         run_add,
-        "add the scan that LAS, LAZ or COPC files make",
+        "add the scan that LAS, LAZ or COPC files, or rasters of heights (DSM), make",
         epilog="example: featuredb lidar add DB tile1.laz tile2.laz --height-datum navd88 --picture plan.png",
     )
     parser.add_argument("files", metavar="FILE", nargs="+", type=Path)

@@ -15,6 +15,7 @@ from featuredb.errors import GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
+from featuredb.lidar.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.intensity import stretch_of
 from featuredb.lidar.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.levels import finest_level
@@ -77,7 +78,9 @@ def add_scan(
     work: Path | None = None,
     on_progress: OnProgress = lambda progress: None,
 ) -> AddResult:
-    """Add the scan that one or several LAS, LAZ or COPC files make; makes the database where there is none.
+    """Add the scan that one or several LAS, LAZ or COPC files, or rasters of heights, make.
+
+    The database is made where there is none.
 
     The same files with the same options are the same scan: adding it twice changes nothing.
 
@@ -150,10 +153,11 @@ def _ortho_identity(ortho: OrthoChoice | None) -> list[str]:
 
 def _open_all(files: Sequence[Path]) -> list[ScanFile]:
     if not files:
-        raise ScanError("expected at least one LAS, LAZ or COPC file, found none")
+        raise ScanError("expected at least one LAS, LAZ or COPC file or raster of heights, found none")
     opened: dict[str, ScanFile] = {}
     for path in files:
-        file = open_scan_file(Path(path))
+        path = Path(path)
+        file = open_dsm(path) if is_raster(path) else open_scan_file(path)
         if file.sha256 in opened:
             logger.warning("%s is the same file as %s and counts once", path, opened[file.sha256].path)
         opened.setdefault(file.sha256, file)
@@ -193,7 +197,7 @@ def _read_all(
     for number, item in enumerate(inputs):
         spill.add_file(
             number,
-            read_points(item.file.path, options.chunk_points),
+            (read_dsm if is_raster(item.file.path) else read_points)(item.file.path, options.chunk_points),
             item.to_utm.apply,
             lambda read: on_progress(Progress(step="read", done=read, total=total)),
         )

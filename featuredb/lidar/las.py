@@ -22,12 +22,12 @@ from featuredb.geo.geotiff_keys import GeoKeys
 from featuredb.geometry.arrays import FloatArray
 
 NOISE_CLASSES = (7, 18)  # ASPRS: low noise, high noise
-_UNCLASSIFIED = 1
+UNCLASSIFIED = 1
 _WKT_RECORD, _KEYS_RECORD = 2112, 34735
 _SHORTEST_HEADER, _HEADER_1_4 = 227, 375
 _RECORD_HEADER, _EXTENDED_RECORD_HEADER = 54, 60  # bytes of a VLR and an EVLR without their data
 # The longest coordinate that any CRS in metres or feet has, generously; beyond it scale or offset are broken.
-_LONGEST_COORDINATE = 1e9
+LONGEST_COORDINATE = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,7 +39,7 @@ class ScanFile:
         sha256: of its bytes.
         size_bytes: of the file.
         version: of LAS, "1.2" to "1.4".
-        compression: "none", "LAZ" or "COPC".
+        compression: "none", "LAZ" or "COPC"; "GeoTIFF" of a raster of heights.
         point_format: 0 to 10.
         points: number of points by the header.
         low, high: (3,) box in file coordinates, by the header or, where that is wrong, by the points.
@@ -146,7 +146,7 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
         expected = int(reader.header.point_count)
         for chunk in reader.chunk_iterator(chunk_points):
             points = _raw_points(chunk)
-            if len(points) and not (np.abs(points.xyz) < _LONGEST_COORDINATE).all():
+            if len(points) and not (np.abs(points.xyz) < LONGEST_COORDINATE).all():
                 raise ScanFileError(
                     f"{path}: expected coordinates below 1e9, found others after point {found}; "
                     "the file is broken"
@@ -285,7 +285,7 @@ def _key_values(keys: list[Any], doubles: tuple[float, ...], text: str) -> GeoKe
 def _raw_points(points: Any) -> RawPoints:
     names = set(points.point_format.dimension_names)
     classification = np.array(points["classification"], dtype=np.uint8)
-    classification[classification == 0] = _UNCLASSIFIED
+    classification[classification == 0] = UNCLASSIFIED
     rgb = None
     if {"red", "green", "blue"} <= names:
         rgb = np.stack([np.asarray(points[name], np.uint16) for name in ("red", "green", "blue")], axis=1)

@@ -58,7 +58,7 @@ def open_ortho(path: Path, crs: str | None = None) -> OrthoImage:
         ScanFileError: not an image that can be read, or without a place on Earth.
         MissingExtraError: the packages of the extra `lidar` are not installed.
     """
-    rasterio = _rasterio()
+    rasterio = import_rasterio()
     try:
         with rasterio.open(path) as file:
             if crs is None and not file.crs:
@@ -93,7 +93,7 @@ def sample_ortho(
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Colours (n, 3) at pixel coordinates (n, 2), averaged over `shrink` pixels, and where there are any."""
     rgb, valid = np.zeros((len(pixel), 3), np.uint8), np.zeros(len(pixel), dtype=bool)
-    rasterio = _rasterio()
+    rasterio = import_rasterio()
     parts = [np.arange(len(pixel))] if len(pixel) else []
     try:
         with rasterio.open(ortho.path) as file:
@@ -170,12 +170,17 @@ def _bilinear(image: NDArray[np.uint8], at: NDArray[np.float32]) -> NDArray[np.u
     return np.asarray(found[:, 0], dtype=np.uint8)
 
 
-def _rasterio() -> ModuleType:
+def import_rasterio() -> ModuleType:
+    """The package rasterio.
+
+    Raises:
+        MissingExtraError: it is not installed.
+    """
     try:
         import rasterio
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"Ortho images need the package {error.name}, which is not installed: "
+            f"Ortho images and rasters of heights need the package {error.name}, which is not installed: "
             "pip install 'featuredb[lidar]'"
         ) from error
     module: ModuleType = rasterio

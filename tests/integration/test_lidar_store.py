@@ -11,6 +11,7 @@ import laspy
 import numpy as np
 import pytest
 from deltalake import DeltaTable
+from numpy.testing import assert_allclose
 from scipy.spatial import cKDTree
 
 from featuredb.cli.main import main
@@ -25,6 +26,7 @@ from featuredb.errors import (
 )
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.add import Progress, add_scan
+from featuredb.lidar.geotiff import write_geotiff
 from featuredb.lidar.load import LoadOptions, load_cloud, scan_frame
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.work import work_folder
@@ -577,3 +579,30 @@ def test_a_missing_package_is_named(
     with pytest.raises(MissingExtraError, match=rf"{package}.*featuredb\[lidar\]"):
         add_scan(database, [path])
     assert not Path(database.url).exists()
+
+
+def test_a_raster_of_heights_is_a_scan_of_its_cells(database: Database, tmp_path: Path) -> None:
+    heights = np.add.outer(np.arange(30.0), np.arange(40.0))[:, :, None].astype(np.float32)
+    heights[3:6, 7:9] = -9999.0
+    place = {"epsg": 32632, "west": WEST, "north": SOUTH + 30.0, "pixel_m": 1.0}
+    write_geotiff(tmp_path / "dsm.tif", heights, **place, nodata=-9999.0)
+    grey = np.full((30, 40, 1), 90, np.uint8)
+    write_geotiff(tmp_path / "ortho.tif", grey, **place)
+
+    options = AddOptions(height_datum="ellipsoidal")
+    ortho = OrthoChoice(path=tmp_path / "ortho.tif")
+    scan = add_scan(database, [tmp_path / "dsm.tif"], options, ortho=ortho).scan
+
+    rows, columns = np.nonzero(heights[:, :, 0] != -9999.0)
+    expected = np.stack([WEST + columns + 0.5, SOUTH + 29.5 - rows, rows + columns], axis=1)
+    found = stored(database)
+    utm = np.stack([found[name] for name in ("easting", "northing", "height")], axis=1)
+    assert_allclose(sorted_rows(utm), sorted_rows(expected), atol=1e-6)
+    assert (scan.points, scan.colour, scan.has_intensity) == (len(expected), "ortho", False)
+
+
+def test_a_picture_is_no_raster_of_heights(database: Database, tmp_path: Path) -> None:
+    picture = np.zeros((9, 9, 3), np.uint8)
+    write_geotiff(tmp_path / "ortho.tif", picture, epsg=32632, west=WEST, north=SOUTH, pixel_m=1.0)
+    with pytest.raises(ScanFileError, match=r"one band of heights.*--ortho ortho\.tif"):
+        add_scan(database, [tmp_path / "ortho.tif"])
