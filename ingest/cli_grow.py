@@ -26,9 +26,9 @@ def _register_grow(subparsers: Any) -> None:
 
     grow = subparsers.add_parser(
         "grow",
-        help="let contributed photos become maps",
-        description="Place the photos that wait by the maps there are. New maps stay in quarantine until "
-        "photos of someone else confirm them; see docs/growth.md.",
+        help="let contributed photos become maps, and maps without a place find theirs",
+        description="Place the photos that wait, and the maps without a place, by the maps there are. New "
+        "maps stay in quarantine until photos of someone else confirm them; see docs/growth.md.",
     )
     add_database_argument(grow)
     when = grow.add_mutually_exclusive_group()

@@ -42,6 +42,7 @@ _ELSEWHERE = (
 _WAYS = (
     "a scan and a person's hand: featuredb lidar add DB SCAN, then "
     "featuredb anchor DB MAP --photos FOLDER --page",
+    "maps with a place that show the same: featuredb grow DB",
 )
 
 

@@ -25,6 +25,7 @@ from ingest.growth.growth_report import GrowthReport
 from ingest.growth.localised import LocaliseEachOptions, localise_photos
 from ingest.growth.map_graph import placed_maps
 from ingest.growth.not_found import NotFound, NotFoundRows
+from ingest.growth.place_unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.promotion import PromotionOptions, promote_confirmed
 from ingest.growth.replacing import ReplaceOptions, replace_descendants
 from ingest.growth.run_record import (
@@ -96,7 +97,7 @@ def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOpt
 def grow(
     database: Database, new: GrowthPhotos, work: Path, options: GrowthOptions | None = None
 ) -> GrowthReport:
-    """Let a database grow by new photos, in rounds, as far as they carry.
+    """Let a database grow by new photos and maps without a place, in rounds, as far as they carry.
 
     Args:
         work: the database's work folder, for what is measured once.
@@ -114,6 +115,7 @@ def grow(
         if replaced is not None:
             run.replacements.append(replaced)
         localiser = Localiser.open(database, previous=localiser)
+        _place_unplaced(database, localiser.areas, run, options, work)
         localised = _round(database, new, localiser, run, options)
         if not _promote(database, new, localiser, localised, run, options, work):
             break
@@ -124,7 +126,7 @@ def grow(
         rounds=run.rounds,
         version=database.poll_version(),
         photos=fates_of(new, run, database.snapshot()),
-        maps=(*run.entries.values(), *run.refused),
+        maps=(*run.entries.values(), *run.refused, *run.unplaced),
         promotions=tuple(run.promotions.values()),
         replacements=tuple(run.replacements),
         notes=tuple(run.notes),
@@ -156,6 +158,23 @@ def _round(
         note_refusal(refused, new, run)
     run.why.update({row: split_reason(reason) for row, reason in grown.waiting.items()})
     return localised
+
+
+def _place_unplaced(
+    database: Database, areas: Sequence[IndexedArea], run: Run, options: GrowthOptions, work: Path
+) -> None:
+    """Maps without a place that the active ones show; what is placed is examined with the new maps."""
+    steps = PlaceUnplacedOptions(
+        drift_budget_m=options.drift_budget_m,
+        localise=options.localise,
+        grow=options.grow.grow,
+        scan=options.scan,
+        confirmation=options.promotion.confirmation,
+    )
+    done = place_unplaced_maps(database, areas, work, steps)
+    run.entries.update({entry.map_id: entry for entry in done.placed})
+    run.unplaced = done.unplaced
+    run.notes += [note for note in done.notes if note not in run.notes]
 
 
 def _localise(

@@ -40,10 +40,11 @@ class PhotoFate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GrownEntry:
-    """A map that this run has made.
+    """A map that this run has made, or a map without a place that it has tried to place.
 
     Attributes:
-        status: active or quarantined; "refused" where it was never committed.
+        status: active or quarantined; "refused" where it was never committed, "unplaced" where it has no
+            place still.
         reason_code, reason: why it is not active, or who confirmed it.
         drift_m, budget_m: 95 % bound on its drift against its anchors, and what is allowed.
         photos: names. gates: every gate with its figure.
@@ -157,6 +158,8 @@ def _entry_json(entry: GrownEntry) -> dict[str, Any]:
 
 
 def _entry_line(entry: GrownEntry) -> str:
+    if entry.status == "unplaced":
+        return f"map {entry.map_id}: has no place still: {entry.reason_code}: {entry.reason}"
     drift = ""
     if entry.drift_m is not None and entry.budget_m is not None:
         drift = f", {entry.drift_m:.2f} of {entry.budget_m:.2f} m"

@@ -54,6 +54,7 @@ class Run:
     why: dict[int, tuple[str, str]] = field(default_factory=dict)
     entries: dict[str, GrownEntry] = field(default_factory=dict)
     refused: list[GrownEntry] = field(default_factory=list)
+    unplaced: tuple[GrownEntry, ...] = ()
     promotions: dict[str, Promotion] = field(default_factory=dict)
     replacements: list[Replacement] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
