@@ -1,12 +1,12 @@
-"""How many of the photos that COLMAP reconstructs together stay together in one reconstruction of ours.
+"""How many of the photos that COLMAP reconstructs together stay together in one map of ours.
 
     python -m tools.colmap_baseline FOLDER [--no-positions] --work DIR [--json FILE]
 
 COLMAP is pycolmap with its defaults: SIFT, exhaustive matching, incremental mapping of every picture in the
-folder. Ours is an ingest of the same folder up to its components, whatever becomes of their place; with
-`--no-positions` what the photos say of where they were taken is forgotten. Prints the photos of COLMAP's
-largest model, how many of these are in our largest component, and the time of both; exit code 1 below
-`--least-share`. COLMAP's result stays in the work folder and is made once.
+folder. Ours is `featuredb ingest photos` into a new database, and what is read back from it: maps, placed or
+not; with `--no-positions` of copies without any position (JPEG). Prints the photos of COLMAP's largest model,
+how many of these are in our largest map, and the time of both; exit code 1 below `--least-share`. COLMAP's
+result stays in the work folder and is made once.
 """
 
 import argparse
@@ -15,18 +15,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import pycolmap
 
-from ingest.executor import PoolExecutor
-from ingest.map_builder import MapIdentity
-from ingest.photo import Photo
-from ingest.placed_models import place_models
-from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.scan import require_usable, scan_folder
-from ingest.workspace import Workspace
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import all_maps, copied, make
 
 _PICTURES = {".jpg", ".jpeg", ".png"}
 
@@ -53,7 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     args.work.mkdir(parents=True, exist_ok=True)
     theirs = colmap_groups(args.folder, args.work)
-    mine = our_groups(args.folder, args.work, positions=not args.no_positions, workers=args.workers)
+    mine, placed = our_groups(args.folder, args.work, positions=not args.no_positions)
     both = len(theirs.largest & mine.largest)
     figures = {
         "photos": len(pictures(args.folder)),
@@ -64,8 +59,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         "share": both / max(1, len(theirs.largest)),
         "colmap_groups": [len(g) for g in theirs.groups],
         "our_groups": [len(g) for g in mine.groups],
+        "placed": placed,
         "colmap_s": theirs.wall_s,
         "ours_s": mine.wall_s,
+        "times": mine.wall_s / theirs.wall_s,
     }
     sys.stdout.write(
         f"{args.folder}: COLMAP {len(theirs.largest)} of {figures['photos']} photos in one model, "
@@ -75,8 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     missing = sorted(theirs.largest - mine.largest)
     if missing:
         sys.stdout.write(f"of COLMAP's not in ours: {', '.join(missing)}\n")
-    if args.json is not None:
-        args.json.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+    write_figures(args.json, figures)
     return 0 if figures["share"] >= args.least_share else 1
 
 
@@ -108,30 +104,17 @@ def colmap_groups(folder: Path, work: Path) -> Grouped:
     return found
 
 
-def our_groups(folder: Path, work: Path, *, positions: bool, workers: int) -> Grouped:
-    """The components of an ingest from a cold start, placed or not; what is in none is left out."""
-    started = time.perf_counter()
-    options = MapMakingOptions()
-    photos = require_usable(scan_folder(folder), folder, least=options.sfm.min_model_photos)
-    if not positions:
-        photos = tuple(_without_position(photo) for photo in photos)
-    with tempfile.TemporaryDirectory(dir=work) as scratch, PoolExecutor(workers) as executor:
-        workspace = Workspace(root=Path(scratch), job_id="colmap-baseline")
-        done = reconstruct_photos(photos, workspace, options, executor)
-        components = list(place_models(done, options, identity=_identity))
-    names = [tuple(p.name for p in c.photos) for c in components]
-    return Grouped(
-        groups=tuple(sorted(names, key=lambda g: (-len(g), g))), wall_s=time.perf_counter() - started
-    )
-
-
-def _without_position(photo: Photo) -> Photo:
-    return replace(photo, gps=None, relative_altitude_m=None)
-
-
-def _identity(number: int) -> MapIdentity:
-    name = f"component-{number}"
-    return MapIdentity(map_id=name, name=name, source="", licence="", provenance={})
+def our_groups(folder: Path, work: Path, *, positions: bool) -> tuple[Grouped, int]:
+    """Photos of the maps in a new database after one ingest, and how many of the maps have a place."""
+    with tempfile.TemporaryDirectory(dir=work) as scratch:
+        photos, names = folder, pictures(folder)
+        if not positions:
+            photos = copied(folder, names, Path(scratch) / "photos", strip=True)
+        made = make(Path(scratch) / "db", "photos", photos, len(names))
+        maps = all_maps(Path(scratch) / "db")
+    groups = [tuple(sorted(image.name for image in one.images)) for one in maps]
+    groups.sort(key=lambda g: (-len(g), g))
+    return Grouped(groups=tuple(groups), wall_s=made.seconds), made.placed
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
@@ -140,8 +123,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--no-positions", action="store_true")
     parser.add_argument("--work", type=Path, required=True, help="where COLMAP's result is kept")
     parser.add_argument("--least-share", type=float, default=0.9, help="of COLMAP's largest model in ours")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, default=None)
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

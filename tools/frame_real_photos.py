@@ -1,7 +1,7 @@
 """Real photos registered to a real scan, one by one, from their EXIF alone and from priors that are wrong.
 
-    uv run python tools/frame_real_photos.py SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
-        [--photos NAME ...] [--refine]
+    python -m tools.frame_real_photos SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
+        [--photos NAME ...] [--refine] [--json FILE]
 
 Two registrations of each photo:
 
@@ -35,6 +35,7 @@ from featuredb.render.levels import build_cloud
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
+from tools.figures import add_json_option, write_figures
 
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 
@@ -44,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cloud = read_cloud(args.scan, args.epsg)
     options = FrameOptions(threads=2, refine=args.refine)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
-    passed = True
+    passed, accepted, apart, seconds = True, 0, [], []
     for number, name in enumerate(names):
         data = (args.folder / name).read_bytes()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -58,10 +59,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             continue
         wrong = wrong_prior(first.cam_from_local, np.random.default_rng(number))
         second, cpu_s = _timed(name, "wrong", image, camera, wrong, cloud, options, first.cam_from_local)
+        seconds.append(cpu_s)
+        accepted += first.accepted and second.accepted
         passed &= second.cam_from_local is not None and cpu_s <= 2.0 * args.max_s
         if second.cam_from_local is not None:
-            off_m, off_deg = _apart(second.cam_from_local, first.cam_from_local)
-            passed &= off_m <= 0.3 and off_deg <= 0.25
+            apart.append(_apart(second.cam_from_local, first.cam_from_local))
+            passed &= apart[-1][0] <= 0.3 and apart[-1][1] <= 0.25
+    figures: dict[str, float] = {"photos": len(names), "accepted": accepted}
+    for at, name in enumerate(("apart_m", "apart_deg")):
+        figures[f"largest_{name}"] = max((one[at] for one in apart), default=float("nan"))
+    write_figures(args.json, figures | {"cpu_s": float(np.median(seconds or [np.nan]))})
     return 0 if passed else 1
 
 
@@ -161,6 +168,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
     parser.add_argument("--refine", action="store_true", help="with intensity refinement")
     parser.add_argument("--max-s", type=float, default=10.0, help="seconds on two cores")
+    add_json_option(parser)
     return parser.parse_args(argv)
 
 

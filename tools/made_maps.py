@@ -1,11 +1,12 @@
 """What becomes of a folder of photos, or a film, whose positions nobody knows: maps, and photos in them.
 
-    python -m tools.made_maps --photos FOLDER [--names A.JPG ...] [--strip]
+    python -m tools.made_maps --photos FOLDER [--names A.JPG ...] [--strip] [--gcp FILE]
     python -m tools.made_maps --film FILM.mp4
 
 The folder (with --strip: copies of it without any position) or the film is ingested into a new database.
-Prints how many photos or keyframes are in the largest map, in any map, and in how many, placed or not. Exit
-code 0 if there is a map.
+Prints how many photos or keyframes are in the largest map, in any map, and in how many, placed or not, and
+what the placement of the first leaves between positions and the map (of --gcp: ground control points, of
+which no other position is known). Exit code 0 if there is a map.
 """
 
 import argparse
@@ -20,6 +21,7 @@ from pathlib import Path
 
 from PIL import Image
 
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
@@ -37,6 +39,7 @@ class Made:
     Attributes:
         photos: given; 0 for a film. largest, mapped: photos in the largest map, and in any.
         maps: with a place and without. seconds: of the command.
+        residual_m: root mean square of the first placed map's; NaN without one.
     """
 
     photos: int
@@ -45,6 +48,7 @@ class Made:
     maps: int
     placed: int
     seconds: float
+    residual_m: float = float("nan")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,20 +62,22 @@ def main(argv: Sequence[str] | None = None) -> int:
             folder = args.photos
             if args.strip or args.names:
                 folder = copied(args.photos, names, work / "photos", strip=args.strip)
-            made = make(work / "db", "photos", folder, len(names))
+            control = () if args.gcp is None else ("--gcp", str(args.gcp))
+            made = make(work / "db", "photos", folder, len(names), control)
     sys.stdout.write(f"{made}\n")
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
 
 
-def make(database: Path, kind: str, source: Path, photos: int) -> Made:
-    """Ingest photos or a film and count what is in maps."""
+def make(database: Path, kind: str, source: Path, photos: int, more: Sequence[str] = ()) -> Made:
+    """Ingest photos or a film, with more arguments, and count what is in maps."""
     start = time.monotonic()
-    featuredb("ingest", kind, str(database), str(source), "--quiet", may_refuse=True)
+    featuredb("ingest", kind, str(database), str(source), "--quiet", *more, may_refuse=True)
     seconds = time.monotonic() - start
     snapshot = Database.open(database).snapshot()
-    placed = [m.images for m in snapshot.maps()]
-    sizes = [*placed, *(m.images for m in snapshot.unplaced_maps())]
+    placed = snapshot.maps()
+    sizes = [*(m.images for m in placed), *(m.images for m in snapshot.unplaced_maps())]
+    residual_m = [snapshot.load_map(m.map_id).placement.residual_rms_m for m in placed[:1]]
     return Made(
         photos=photos,
         largest=max(sizes, default=0),
@@ -79,7 +85,15 @@ def make(database: Path, kind: str, source: Path, photos: int) -> Made:
         maps=len(sizes),
         placed=len(placed),
         seconds=seconds,
+        residual_m=residual_m[0] if residual_m else float("nan"),
     )
+
+
+def all_maps(database: Path) -> list[AnyMap]:
+    """The maps of a database, with a place and without."""
+    snapshot = Database.open(database).snapshot()
+    ids = [m.map_id for m in snapshot.maps()] + [m.map_id for m in snapshot.unplaced_maps()]
+    return [snapshot.load_any(one) for one in ids]
 
 
 def photo_names(folder: Path) -> list[str]:
@@ -141,6 +155,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     source.add_argument("--film", type=Path, metavar="FILE")
     parser.add_argument("--names", nargs="+", default=[], metavar="NAME", help="default: all of the folder")
     parser.add_argument("--strip", action="store_true", help="of JPEGs: without EXIF's GPS and XMP")
+    parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")
     parser.add_argument("--work", type=Path, default=None, help="keep database and copies there")
     add_json_option(parser)
     return parser.parse_args(argv)

@@ -87,7 +87,7 @@ def test_rows_have_names_of_their_own_and_real_sets_are_not_outnumbered() -> Non
     assert len(set(names)) == len(names)
     groups = [r.group for r in ROWS]
     assert groups.count("real") >= groups.count("simulated")
-    assert sum(r.minutes for r in ROWS if r.form == "quick") <= 30
+    assert sum(r.minutes for r in ROWS if r.form == "quick") <= 20
     assert 0 < sum(r.readme for r in ROWS) <= MOST_IN_README
 
 

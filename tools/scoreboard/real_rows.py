@@ -1,0 +1,290 @@
+"""Rows of real photos, films and scans."""
+
+from typing import Any
+
+from tools.scoreboard.row import Form, Limit, Row
+from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, OUT, SCAN, same
+
+
+def _portions(photos: str, cut: str, minutes: float) -> Row:
+    return Row(
+        name=f"{photos.split('/')[0]}-portions-{cut}",
+        group="real",
+        form="full",
+        claim=f"`{photos.split('/')[0]}` in three portions ({cut}), grown and adjusted, against all at once",
+        commands=(
+            (
+                *("tools.growth_portions", "--photos", f"{{data}}/{photos}", "--cut", cut, "--adjust"),
+                *("--work", "{work}/cache", *OUT),
+            ),
+        ),
+        figures=same("photos", "joint", "grown", "missing", "median_m", "largest_m"),
+        text="{grown} of {joint}, median {median_m:.3f} m, largest {largest_m:.3f} m",
+        limits=(Limit(figure="missing", most=0), Limit(figure="median_m", most=0.3)),
+        needs=(photos,),
+        minutes=minutes,
+    )
+
+
+def _sequence(photos: str, median_m: float, minutes: float) -> Row:
+    name = photos.split("/")[0]
+    return Row(
+        name=f"{name}-as-film",
+        group="real",
+        form="full",
+        claim=f"`{name}`: every second photo is a map, all are played as a film and tracked",
+        commands=(("tools.real_sequence", "--photos", f"{{data}}/{photos}", "--work", "{work}/maps", *OUT),),
+        figures=same("frames", "lost", "median_m", "largest_m", "unknown"),
+        text="{lost} of {frames} lost, median {median_m:.3f} m, largest {largest_m:.3f} m",
+        limits=(Limit(figure="median_m", most=median_m), Limit(figure="largest_m", most=1.0)),
+        needs=(photos,),
+        minutes=minutes,
+    )
+
+
+def _made(name: str, claim: str, words: tuple[str, ...], need: str, least: int, **more: Any) -> Row:
+    return Row(
+        name=name,
+        group="real",
+        form="full",
+        claim=claim,
+        commands=(("tools.made_maps", *words, "--work", "{work}/maps", *OUT),),
+        figures=same("photos", "largest", "mapped", "maps", "placed"),
+        text="{largest} in the largest of {maps} maps, {mapped} in all",
+        limits=(Limit(figure="largest", least=least),),
+        needs=(need,),
+        **more,
+    )
+
+
+def _laser(name: str, photos: int, form: Form) -> Row:
+    return Row(
+        name=f"strecha-{name}",
+        group="real",
+        form=form,
+        claim=f"`strecha/{name}`: {photos} photos without positions become a map; against a laser scan's "
+        "cameras, after the best similarity",
+        commands=(("tools.laser_truth", f"{{data}}/strecha/{name}", *OUT),),
+        figures=same(
+            *("photos", "maps", "largest", "median_mm", "largest_mm", "median_deg", "largest_deg", "set_m")
+        ),
+        text="{largest} of {photos}; median {median_mm:.0f} mm and {median_deg:.2f} degrees, largest "
+        "{largest_mm:.0f} mm, of {set_m:.1f} m",
+        limits=(
+            Limit(figure="maps", least=1, most=1),
+            Limit(figure="largest", least=photos),
+            Limit(figure="median_mm", most=20),
+            Limit(figure="median_deg", most=0.15),
+        ),
+        needs=(f"strecha/{name}",),
+        minutes=1,
+    )
+
+
+REAL: tuple[Row, ...] = (
+    Row(
+        name="brighton-held-out",
+        group="real",
+        form="quick",
+        claim="`brighton`: 14 of 18 photos become a map from a cold start; the 4 others over Zenoh, "
+        "against a map of all 18",
+        commands=(("tools.real_photos", "--photos", BRIGHTON, "--held-out", *HELD_OUT, *OUT),),
+        figures=ERRORS | same("usable", "registered", "ingest_s"),
+        text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
+        limits=(
+            Limit(figure="registered", least=14),
+            Limit(figure="answered", least=4),
+            Limit(figure="largest_m", most=1.0),
+            Limit(figure="largest_deg", most=0.5),
+        ),
+        needs=("brighton/images",),
+        readme=True,
+        minutes=3,
+    ),
+    Row(
+        name="brighton-on-scan",
+        group="real",
+        form="quick",
+        claim="`brighton` anchored on its scan without a person; the 4 others over Zenoh, against poses that "
+        "the scan alone gives",
+        commands=(
+            (
+                *("tools.anchor_brighton", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--poses", "{cache}/brighton-poses.json", "--held-out", *HELD_OUT, *OUT),
+            ),
+        ),
+        figures=ERRORS | same("before_median_m"),
+        text=ANSWERS + " (by GPS {before_median_m:.1f} m)",
+        limits=(
+            Limit(figure="answered", least=4),
+            Limit(figure="median_m", most=0.30),
+            Limit(figure="median_deg", most=0.25),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        readme=True,
+        minutes=4,
+    ),
+    Row(
+        name="lewis-held-out",
+        group="real",
+        form="full",
+        claim="`lewis`: every fifth of 55 oblique photos is held out, against a map of all",
+        commands=(("tools.real_photos", "--photos", "{data}/lewis/images", *OUT),),
+        figures=ERRORS | same("usable", "registered", "ingest_s"),
+        text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
+        limits=(Limit(figure="registered", least=40), Limit(figure="median_m", most=1.0)),
+        needs=("lewis/images",),
+        minutes=12,
+    ),
+    _sequence("brighton/images", 0.3, 3),
+    _sequence("lewis/images", 0.4, 15),
+    Row(
+        name="autzen-windows",
+        group="real",
+        form="full",
+        claim="`autzen`: windows of a real ortho image registered to airborne intensity, priors off by 20 m "
+        "and 5 degrees",
+        commands=(
+            (
+                *("tools.autzen_windows", "{data}/autzen/stadium.laz", "{data}/autzen/stadium_ortho.tif"),
+                *("--photos", BRIGHTON, "{data}/lewis/images", "--seed", "7", *OUT),
+            ),
+        ),
+        figures=same("structured", "close", "rate", "largest_m", "wrong", "foreign", "foreign_accepted"),
+        text="{close} of {structured} within 1.5 m, largest of an accepted one {largest_m:.1f} m; "
+        "{foreign_accepted} of {foreign} of other places accepted",
+        limits=(
+            Limit(figure="rate", least=0.75),
+            Limit(figure="wrong", most=0),
+            Limit(figure="foreign_accepted", most=0),
+        ),
+        needs=("autzen", "brighton/images", "lewis/images"),
+        readme=True,
+        minutes=40,
+    ),
+    Row(
+        name="brighton-by-picks",
+        group="real",
+        form="full",
+        claim="`brighton` without GPS: a map of 14 photos, placed on the scan by six picks (3 px) in one; "
+        "20 draws, the 4 others asked of each",
+        commands=(
+            (
+                *("tools.unplaced_brighton", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--poses", "{cache}/brighton-poses.json", *OUT),
+            ),
+        ),
+        figures=same(
+            *("maps", "largest", "draws", "placed", "refused", "wrong"),
+            *("median_m", "worst_m", "median_deg", "worst_deg"),
+        ),
+        text="{placed} of {draws} placed, {wrong} wrong; median {median_m:.2f} m and "
+        "{median_deg:.2f} degrees, worst draw {worst_m:.2f} m",
+        limits=(
+            Limit(figure="maps", least=1, most=1),
+            Limit(figure="largest", least=14),
+            Limit(figure="refused", most=2),
+            Limit(figure="wrong", most=0),
+            Limit(figure="median_m", most=0.25),
+            Limit(figure="median_deg", most=0.25),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        readme=True,
+        minutes=40,
+    ),
+    _made(
+        *("karma-map", "`karma.mp4`, 12 s by a drone, becomes a map"),
+        *(("--film", "{data}/video/karma.mp4"), "video/karma.mp4", 6),
+        minutes=3,
+    ),
+    Row(
+        name="reichstag-map",
+        group="real",
+        form="full",
+        claim="`reichstag`: 74 photos of one landmark by many people; of those in COLMAP's largest model "
+        "(exhaustive, incremental), how many are in our largest map",
+        commands=(
+            (
+                *("tools.colmap_baseline", "{data}/reichstag/images", "--no-positions"),
+                *("--work", "{cache}/reichstag", *OUT),
+            ),
+        ),
+        figures=same(
+            *(
+                "photos",
+                "colmap_largest",
+                "ours_largest",
+                "ours_of_colmap_largest",
+                "share",
+                "placed",
+                "times",
+            ),
+        ),
+        text="{ours_of_colmap_largest} of {colmap_largest} ({share:.0%}), in {times:.1f} times COLMAP's time",
+        limits=(Limit(figure="share", least=0.9), Limit(figure="placed", most=0)),
+        needs=("reichstag/images",),
+        readme=True,
+        minutes=15,
+    ),
+    _made(
+        *("sacre_coeur-map", "`sacre_coeur`: 10 photos by strangers, no EXIF, become a map"),
+        *(("--photos", "{data}/sacre_coeur/mapping"), "sacre_coeur/mapping", 9),
+        minutes=3,
+    ),
+    _laser("fountain-P11", 11, "quick"),
+    _laser("entry-P10", 10, "full"),
+    Row(
+        name="copr-control-points",
+        group="real",
+        form="full",
+        claim="`copr`: 41 kite photos without GPS, placed by ten ground control points, good to 0.8 m",
+        commands=(
+            (
+                *("tools.made_maps", "--photos", "{data}/copr/images", "--gcp", "{data}/copr/gcp_list.txt"),
+                *("--work", "{work}/maps", *OUT),
+            ),
+        ),
+        figures=same("photos", "largest", "placed", "residual_m"),
+        text="{largest} of {photos} in a map, {placed} placed, residual {residual_m:.2f} m",
+        limits=(
+            Limit(figure="largest", least=38),
+            Limit(figure="placed", least=1),
+            Limit(figure="residual_m", most=1.5),
+        ),
+        needs=("copr/images", "copr/gcp_list.txt"),
+        minutes=5,
+    ),
+    Row(
+        name="brighton-frames-on-scan",
+        group="real",
+        form="quick",
+        claim="`brighton`: single photos registered to the scan, without a map, by GPS with unknown heading "
+        "and again from 15 m and 10 degrees off",
+        commands=(
+            (
+                *("tools.frame_real_photos", SCAN, BRIGHTON, "--lens", BRIGHTON_LENS),
+                *("--photos", *HELD_OUT, *OUT),
+            ),
+        ),
+        figures=same("photos", "accepted", "largest_apart_m", "largest_apart_deg", "cpu_s"),
+        text="{accepted} of {photos}, both at one pose to {largest_apart_m:.2f} m and "
+        "{largest_apart_deg:.2f} degrees",
+        limits=(
+            Limit(figure="accepted", least=4),
+            Limit(figure="largest_apart_m", most=0.3),
+            Limit(figure="largest_apart_deg", most=0.25),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        minutes=2,
+    ),
+    _made(
+        *("seneca-map", "`seneca`: 60 photos of a flying wing over bare fields become a map"),
+        *(("--photos", "{data}/seneca/images"), "seneca/images", 54),
+        minutes=5,
+    ),
+    _portions("brighton/images", "interleaved", 4),
+    _portions("brighton/images", "consecutive", 4),
+    _portions("lewis/images", "consecutive", 20),
+    _portions("copr/images", "consecutive", 15),
+    _portions("sacre_coeur/mapping", "interleaved", 4),
+)

@@ -1,0 +1,205 @@
+"""Rows of the simulated town."""
+
+from tools.scoreboard.row import Limit, Row
+from tools.scoreboard.words import OUT, same
+
+_TRACKED = ("frames", "lost", "invented", "mean_m", "largest_m", "first_m", "last_m", "rate_hz")
+
+
+def _track(film: str, on: str, size: str, frames: int, mean_m: float, minutes: float) -> Row:
+    return Row(
+        name=f"track-{film}-{on}-{size}-{frames}",
+        group="simulated",
+        form="full",
+        claim=f"a {film} film of {frames} frames over the town ({size}), tracked on "
+        + {"map": "its map", "scan": "its scan alone", "both": "map and scan"}[on],
+        commands=(
+            (
+                *("tools.track_evaluation", "--out", "{work}", "--inputs", "{cache}", "--size", size),
+                *("--frames", str(frames), "--films", film, "--on", on),
+            ),
+        ),
+        json="{work}/track.json",
+        figures={name: f"figures.{film}.{name}" for name in _TRACKED},
+        text="{lost} of {frames} lost, {invented} invented, mean {mean_m:.3f} m, largest {largest_m:.2f} m; "
+        "{rate_hz:.0f} frames/s",
+        limits=(
+            Limit(figure="mean_m", most=mean_m),
+            Limit(figure="largest_m", most=1.0),
+            Limit(figure="invented", most=0),
+        ),
+        minutes=minutes,
+    )
+
+
+def _growth(name: str, claim: str, words: tuple[str, ...], document: str, minutes: float) -> Row:
+    return Row(
+        name=name,
+        group="simulated",
+        form="full",
+        claim=claim,
+        commands=((*words, "--out", "{work}"),),
+        json=f"{{work}}/{document}.json",
+        figures=same("failed", "summary"),
+        text="{summary}",
+        limits=(Limit(figure="failed", most=0),),
+        minutes=minutes,
+    )
+
+
+SIMULATED: tuple[Row, ...] = (
+    Row(
+        name="town-on-scan",
+        group="simulated",
+        form="quick",
+        claim="24 photos with a drone's GPS, placed by an airborne scan with intensity only; another town's "
+        "scan is refused",
+        commands=(("tools.anchor_simworld", "--work", "{work}/town", *OUT),),
+        figures=same(
+            *("placed", "other_placed", "gps_cameras_m", "scan_cameras_m", "scan_cameras_deg"),
+            *("scan_queries", "scan_answered", "scan_queries_m", "scan_queries_largest_m"),
+        ),
+        text="cameras {gps_cameras_m:.1f} m off by GPS, {scan_cameras_m:.3f} m by the scan (medians); "
+        "{scan_answered} of {scan_queries} queries, median {scan_queries_m:.3f} m, "
+        "largest {scan_queries_largest_m:.2f} m",
+        limits=(
+            Limit(figure="placed", least=1),
+            Limit(figure="other_placed", most=0),
+            Limit(figure="scan_cameras_m", most=0.10),
+            Limit(figure="scan_queries_largest_m", most=0.5),
+        ),
+        readme=True,
+        minutes=4,
+    ),
+    Row(
+        name="town-held-out",
+        group="simulated",
+        form="full",
+        claim="60 held-out drone photos of the town, survey-grade tags; photos that show no mapped place",
+        commands=(("tools.simulated_evaluation", "--out", "{work}/town", "--seed", "3", *OUT),),
+        figures=same(
+            *("asked", "answered", "within", "median_m", "median_deg", "wrong", "negatives"),
+            *("negatives_answered", "street", "street_answered"),
+        )
+        | {
+            "inside_horizontal": "coverage.survey receiver.horizontal",
+            "inside_orientation": "coverage.survey receiver.orientation",
+        },
+        text="{answered} of {asked}, {within:.1%} within 0.25 m and 0.3 degrees, median {median_m:.3f} m; "
+        "{negatives_answered} of {negatives} others answered, {street_answered} of {street} from the street",
+        limits=(
+            Limit(figure="within", least=0.95),
+            Limit(figure="wrong", most=0),
+            Limit(figure="negatives_answered", most=0),
+        ),
+        readme=True,
+        minutes=25,
+    ),
+    Row(
+        name="track-short",
+        group="simulated",
+        form="quick",
+        claim="films of 150 frames over the town, smooth and with a cut to another town, tracked on its map",
+        commands=(
+            (
+                *("tools.track_evaluation", "--out", "{work}", "--inputs", "{cache}", "--size", "short"),
+                *("--frames", "150", "--films", "smooth", "cut", "--on", "map"),
+            ),
+        ),
+        json="{work}/track.json",
+        figures={
+            f"{film}_{name}": f"figures.{film}.{name}"
+            for film in ("smooth", "cut")
+            for name in ("frames", "lost", "invented", "mean_m", "largest_m", "rate_hz", "found_s")
+        },
+        text="smooth: {smooth_lost} lost, mean {smooth_mean_m:.3f} m, {smooth_rate_hz:.0f} frames/s; "
+        "cut: {cut_lost} lost, mean {cut_mean_m:.3f} m, {cut_invented} invented",
+        limits=(
+            Limit(figure="smooth_lost", most=0),
+            Limit(figure="smooth_mean_m", most=0.10),
+            Limit(figure="cut_mean_m", most=0.10),
+            Limit(figure="cut_largest_m", most=1.0),
+            Limit(figure="cut_invented", most=0),
+        ),
+        minutes=4,
+    ),
+    _track("smooth", "map", "short", 1200, 0.10, 15),
+    _track("jerky", "map", "short", 1200, 0.25, 15),
+    _track("smooth", "scan", "short", 1200, 0.20, 15),
+    Row(
+        name="film-map",
+        group="simulated",
+        form="full",
+        claim="a film of 1,200 frames with telemetry becomes a map that is placed on the scan",
+        commands=(("tools.video_map", "--out", "{work}"),),
+        json="{work}/video_map.json",
+        figures={
+            name: f"figures.{name}"
+            for name in ("keyframes", "keyframes_m", "keyframes_largest_m", "placed", "made_s", "anchored_s")
+        },
+        text="{keyframes} keyframes, median {keyframes_m:.3f} m, largest {keyframes_largest_m:.3f} m; "
+        "{made_s:.0f} s, and {anchored_s:.0f} s for placing",
+        limits=(Limit(figure="placed", least=1), Limit(figure="keyframes_largest_m", most=0.10)),
+        minutes=20,
+    ),
+    Row(
+        name="paper-film",
+        group="simulated",
+        form="full",
+        claim="a film of 1,200 frames without telemetry and an intensity-only scan: placed by six picks in "
+        "one frame, tracked from end to end",
+        commands=(("tools.paper", "--out", "{work}", "--inputs", "{cache}", "--only", "film"),),
+        json="{work}/paper.json",
+        figures=same(
+            *("placed", "lost", "mean_m", "first_m", "last_m", "largest_m", "last_over_first"),
+            *("adjusted_m", "rate_hz", "made_s", "frame_s", "projection_s"),
+        ),
+        text="mean {mean_m:.3f} m (first quarter {first_m:.3f}, last {last_m:.3f}), {lost} lost, "
+        "{rate_hz:.0f} frames/s",
+        limits=(
+            Limit(figure="placed", least=1),
+            Limit(figure="mean_m", most=0.10),
+            Limit(figure="last_over_first", most=1.3),
+            Limit(figure="lost", most=12),
+        ),
+        readme=True,
+        minutes=25,
+    ),
+    Row(
+        name="paper-figure-4",
+        group="simulated",
+        form="full",
+        claim="upright SIFT between renders of airborne intensity and pictures, ratio 0.9: share of right "
+        "matches (paper: 3 to 7 %), on the town and on `autzen`",
+        commands=(("tools.paper", "--out", "{work}", "--data", "{data}", "--only", "descriptors"),),
+        json="{work}/paper.json",
+        figures=same("least_share", "largest_share", "sources"),
+        text="{least_share:.1%} to {largest_share:.1%} in {sources} sources",
+        limits=(Limit(figure="sources", least=2), Limit(figure="least_share", least=0.03)),
+        needs=("autzen",),
+        minutes=5,
+    ),
+    _growth(
+        *("growth-community", "300 photos of the town by twelve people: growth finds their places"),
+        *(("tools.growth_community", "--size", "full"), "community", 240),
+    ),
+    _growth(
+        *("growth-poison", "210 photos of look-alikes, liars and forgers: nothing wrong is promoted"),
+        *(("tools.growth_poison", "--size", "full", "--poison", "all together"), "poison", 180),
+    ),
+    _growth(
+        *("growth-walk", "a walk of 25 steps from one anchor by contributed photos alone: the bound is true"),
+        *(("tools.growth_walk", "--size", "full", "--budget", "2.0"), "walk", 180),
+    ),
+    Row(
+        name="studies",
+        group="simulated",
+        form="full",
+        claim="the studies among the tests: rates of covariances, kills at each stage, real control points",
+        commands=(("tools.evaluations", *OUT),),
+        figures=same("tests", "failed", "skipped"),
+        text="{failed} of {tests} failed, {skipped} skipped",
+        limits=(Limit(figure="failed", most=0), Limit(figure="tests", least=20)),
+        minutes=15,
+    ),
+)
