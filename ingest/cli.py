@@ -3,6 +3,8 @@
 import argparse
 import sys
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +12,7 @@ if TYPE_CHECKING:
     from ingest.pipeline import IngestOptions
     from ingest.register.control.model import Survey
     from ingest.report import IngestReport, MapOutcome
+    from ingest.report_films import FilmOutcome
 
 _LISTED = 40  # photos that are named on the terminal
 _STAGES = ("scan", "extract", "match", "reconstruct", "build")
@@ -67,12 +70,12 @@ def _register_video(kinds: Any) -> None:
 
     video = kinds.add_parser(
         "video",
-        help="a film, with the telemetry in it or beside it",
-        description="Choose keyframes by the picture's motion, reconstruct them as one camera's photos, "
-        "place them by the telemetry and commit the maps. Goes on where it was when it was killed.",
+        help="films and folders of them, with or without telemetry",
+        description="Split films into shots, choose keyframes by the picture's motion, reconstruct those of "
+        "all films together, place them by the telemetry where there is some, and commit the maps. Goes on "
+        "where it was when it was killed.",
     )
     add_database_argument(video)
-    video.add_argument("folder", metavar="FILE", type=Path, help="mp4, mov, mkv, webm, avi or ts")
     add_video_arguments(video)
     _add_selection(video)
     _add_making(video)
@@ -195,16 +198,25 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
 
 def run_photos(args: argparse.Namespace) -> int:
     """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made."""
+    return ingest_folder(args, args.folder)
+
+
+def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmOutcome"] = ()) -> int:
+    """As `run_photos`.
+
+    Args:
+        films: whose keyframes the folder holds, a folder for each.
+    """
     from featuredb.cli.common import storage_options
     from featuredb.store import Database
     from ingest.pipeline import ingest_photos
     from ingest.progress_bars import progress_bars
     from ingest.report import write_report
 
-    options = _options(args)
+    options = _options(args, films=bool(films))
     database = Database.create(args.db, storage_options=storage_options(args))
     with progress_bars(args.quiet) as progress:
-        report = ingest_photos(database, args.folder, options, progress)
+        report = replace(ingest_photos(database, folder, options, progress), films=tuple(films))
     if args.report is not None:
         write_report(args.report, report)
     sys.stdout.write(summary(report))
@@ -215,6 +227,7 @@ def run_photos(args: argparse.Namespace) -> int:
 def summary(report: "IngestReport") -> str:
     """A few lines for the terminal; the report has the rest."""
     from ingest.register.control.evidence import residual_table
+    from ingest.report_films import films_text
 
     lines = [
         f"{report.count('registered')} of {len(report.photos)} files registered, "
@@ -235,6 +248,7 @@ def summary(report: "IngestReport") -> str:
         if outcome.control is not None and outcome.control.control.marks:
             lines.extend(f"note: {text}" for text in outcome.control.file.notes)
             lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
+    lines += films_text(report.films, report.photos)
     left_out = [photo for photo in report.photos if photo.status in ("not_registered", "skipped")]
     lines.extend(f"  {p.name}: {p.reason_code}: {p.reason}" for p in left_out[:_LISTED])
     if len(left_out) > _LISTED:
@@ -254,7 +268,7 @@ def _unplaced_lines(outcome: "MapOutcome") -> list[str]:
     ]
 
 
-def _options(args: argparse.Namespace) -> "IngestOptions":
+def _options(args: argparse.Namespace, *, films: bool) -> "IngestOptions":
     """The pipeline's options; what the command line leaves open keeps its default."""
     from featuredb.features.extractor import ExtractorOptions
     from featuredb.index.vocabulary import read_vocabulary
@@ -275,6 +289,7 @@ def _options(args: argparse.Namespace) -> "IngestOptions":
         owner=args.owner,
         licence=args.licence,
         trust_geotags=args.trust_geotags,
+        films=films,
     )
     return IngestOptions(
         scan=scan,

@@ -169,6 +169,8 @@ def _agree(a: Photo, b: Photo, options: DuplicateOptions) -> bool:
     """Whether nothing that both photos say of themselves speaks against their being copies."""
     if abs(a.width * b.height / (a.height * b.width) - 1.0) > options.max_aspect:
         return False
+    if a.film and a.film == b.film:
+        return False  # keyframes are chosen to differ, by little where the camera comes slowly nearer
     if a.gps_is_hint or b.gps_is_hint:
         return True  # what photo sites say of a picture that was uploaded again is of the upload
     for mine, other in ((a.make, b.make), (a.model, b.model)):

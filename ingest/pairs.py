@@ -9,6 +9,7 @@ import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,10 +37,13 @@ class PairOptions:
             positions' difference; oblique photos still overlap there.
         precise_sigma_m: photos whose position is worse have their neighbours within that distance chosen by
             look, since the nearest by position are as good as any.
-        time_neighbours: following photos of the same owner and camera by capture time, each photo.
+        time_neighbours: following photos of the same owner and camera by capture time, each photo; of
+            keyframes those that follow in the film.
         look_neighbours: photos most similar by aggregated descriptor, each photo with a precise position:
             positions can be wrong. Most of them are GPS neighbours anyway.
         retrieval_neighbours: the same for photos without a precise position.
+        other_shots: most similar keyframes of other shots and films, each keyframe: those of its own shot
+            look most like it, and would be all that it is matched with.
         features_per_photo: strongest features that the aggregated descriptor is made of.
         pairs_per_photo: at most so many, best proposals first: a photo that everybody finds similar, a
             blank one for example, is matched with no more.
@@ -53,6 +57,7 @@ class PairOptions:
     time_neighbours: int = 2
     look_neighbours: int = 4
     retrieval_neighbours: int = 12
+    other_shots: int = 8
     features_per_photo: int = 3000
     pairs_per_photo: int = 60
     more_neighbours: int = 6
@@ -77,7 +82,7 @@ def choose_pairs(
         return list(itertools.combinations(range(len(photos)), 2))
     proposals = [*_time_pairs(photos, options), *_gps_pairs(photos, vectors, options)]
     if vectors is not None:
-        proposals += _look_pairs(photos, vectors, options)
+        proposals += [*_look_pairs(photos, vectors, options), *_shot_pairs(photos, vectors, options)]
     return _bounded(proposals, options.pairs_per_photo, ())
 
 
@@ -188,12 +193,12 @@ def _nearest(tree: cKDTree, points: FloatArray, k: int) -> tuple[FloatArray, NDA
 
 
 def _time_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterator[_Ranked]:
-    """Each photo with those that its owner's camera took next."""
+    """Each photo with those that its owner's camera took next; keyframes are named in their order."""
     # Times with and without offset do not compare; the camera's own clock is what orders photos.
     timed = sorted(
-        (p.owner, p.camera_key, p.capture_time.replace(tzinfo=None), p.name, i)
+        (p.owner, p.film or p.camera_key, time.replace(tzinfo=None), p.name, i)
         for i, p in enumerate(photos)
-        if p.capture_time is not None
+        if (time := datetime.min if p.film else p.capture_time) is not None
     )
     for place, (owner, camera, *_, i) in enumerate(timed):
         for rank, (other, its, *_, j) in enumerate(timed[place + 1 : place + 1 + options.time_neighbours]):
@@ -212,6 +217,22 @@ def _look_pairs(
             for rank, j in enumerate(near):
                 if j >= 0:
                     yield rank, i, j
+
+
+def _shot_pairs(
+    photos: Sequence[Photo], vectors: NDArray[np.float16], options: PairOptions
+) -> Iterator[_Ranked]:
+    """Each keyframe with those of other shots whose aggregated descriptor is nearest."""
+    keyframes = np.array([i for i, p in enumerate(photos) if p.film], dtype=np.int64)
+    shots: dict[tuple[str, str], list[int]] = {}
+    for i in keyframes.tolist():
+        shots.setdefault((photos[i].film, photos[i].camera_key), []).append(i)
+    for mine in shots.values():
+        others = np.setdiff1d(keyframes, mine)
+        cosines = vectors[mine].astype(np.float32) @ vectors[others].astype(np.float32).T
+        for i, row in zip(mine, cosines, strict=True):
+            best = others[np.argsort(-row, kind="stable")[: options.other_shots]]
+            yield from ((rank, i, j) for rank, j in enumerate(best.tolist()))
 
 
 def _is_precise(photo: Photo, options: PairOptions) -> bool:

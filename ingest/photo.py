@@ -36,6 +36,7 @@ class Photo:
         relative_altitude_m: height above take-off by a drone's barometer, or None.
         owner, licence: attribution from a table, EXIF (Artist, Copyright) or the ingest's options.
         title: from a table.
+        film: name of the film that this is a keyframe of, "" for other photos.
         duplicate_of: name of the photo that was kept instead, "" where this is no duplicate.
         warnings: what was wrong in the photo's metadata without making it unusable.
     """
@@ -61,5 +62,6 @@ class Photo:
     owner: str = ""
     licence: str = ""
     title: str = ""
+    film: str = ""
     duplicate_of: str = ""
     warnings: tuple[str, ...] = ()

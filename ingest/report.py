@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.model import ControlledPlacement
+from ingest.report_films import FilmOutcome, films_json
 from ingest.workspace import atomic_file, write_json
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
@@ -195,6 +196,7 @@ class IngestReport:
         stages: in order.
         photos: every file of the folder, sorted by name.
         maps: largest first.
+        films: whose keyframes the photos are.
         warnings: about the ingest as a whole.
     """
 
@@ -209,6 +211,7 @@ class IngestReport:
     stages: tuple[StageTiming, ...] = ()
     photos: tuple[PhotoOutcome, ...] = ()
     maps: tuple[MapOutcome, ...] = ()
+    films: tuple[FilmOutcome, ...] = ()
     warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -265,6 +268,7 @@ def report_json(report: IngestReport) -> dict[str, Any]:
                 for s in report.stages
             ],
             "maps": [_map_json(outcome) for outcome in report.maps],
+            "films": films_json(report.films),
             "photos": [_photo_json(photo) for photo in report.photos],
         }
     )

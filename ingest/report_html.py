@@ -6,6 +6,7 @@ from html import escape
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.register.control.report import control_html
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome, report_json
+from ingest.report_films import films_html
 from ingest.report_plots import histograms_png, plan_png
 
 _FILE_PILLS = {
@@ -33,6 +34,7 @@ def report_page(report: IngestReport) -> str:
         _cards(report),
         *(note(warning) for warning in report.warnings),
         *(_map(outcome) for outcome in report.maps),
+        films_html(report.films, report.photos),
         _stages(report),
         _files(report),
         _options(report),

@@ -47,6 +47,7 @@ class ScanOptions:
         geotag_sigma_m: standard deviation of a table's position that does not say its own. Geotags of
             photo sites are tens of metres off, where they are not wrong altogether.
         trust_geotags: positions of a table place maps as those of a folder do.
+        films: the photos are keyframes, those of each film in a folder of its own.
     """
 
     limits: DecodeLimits = INGEST_LIMITS
@@ -58,6 +59,7 @@ class ScanOptions:
     licence: str = ""
     geotag_sigma_m: float = 30.0
     trust_geotags: bool = False
+    films: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,6 +277,7 @@ def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) 
         relative_altitude_m=exif.relative_altitude_m,
         owner=exif.artist or options.owner,
         licence=exif.copyright or options.licence,
+        film=file.name.rpartition("/")[0] if options.films else "",
         warnings=exif.warnings,
     )
 

@@ -121,7 +121,7 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
     if not unplaced:
         return [_refused("no map came of the film")], {"placed": 0}
     biggest = max(unplaced, key=lambda one: one.images)
-    stills = next((default_root(Database.open(database).url) / "films").glob("*/film"))
+    stills = next((default_root(Database.open(database).url) / "films").iterdir())
     placed = placed_by_picks(database, biggest.map_id, stills, truth, world.scan, work, args.seed)
     if not placed:
         return [_refused("the map was not placed by the picks of one frame")], {"placed": 0}

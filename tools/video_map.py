@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     featuredb("ingest", "video", str(database), str(folder / FILM_FILE), "--quiet")
     ingested = time.monotonic()
     (made,) = Database.open(database).snapshot().maps()
-    (stills,) = (default_root(Database.open(database).url) / "films").glob("*/film")
+    (stills,) = (default_root(Database.open(database).url) / "films").iterdir()
     out = args.out / "film-anchor"
     words = ("anchor", str(database), made.map_id, "--photos", str(stills), "--out", str(out), "--auto")
     placed = featuredb(*words, "--quiet", may_refuse=True) == 0

@@ -1,33 +1,43 @@
-"""`featuredb ingest video DB FILE`: keyframes of a film, ingested as photos."""
+"""`featuredb ingest video DB FILM ...`: keyframes of films, ingested as photos in one job."""
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from featuredb.video.telemetry.values import Telemetry
-    from ingest.video.stills import Stills
+    from ingest.video.films import Films
 
 
 # Keyframes show each point many times over. Of a film of 1,200 frames (53 keyframes, 1280x720), matching and
 # reconstruction take 130 s of a core with these, and had not ended after ten minutes with photos' 12,000.
 _FEATURES = 5000
+# What only one film can have.
+_OF_ONE = ("telemetry", "telemetry_late", "film_start")
 
 
 def add_video_arguments(parser: argparse.ArgumentParser) -> None:
-    """What a film needs beside what photos do."""
-    group = parser.add_argument_group("the film")
+    """What films need beside what photos do."""
+    parser.add_argument(
+        "films",
+        metavar="FILM",
+        nargs="+",
+        type=Path,
+        help="mp4, mov, mkv, webm, avi or ts, or a folder of them, searched through",
+    )
+    group = parser.add_argument_group("the films")
     group.add_argument(
         "--telemetry",
         type=Path,
         default=None,
         metavar="FILE",
-        help="a drone's .srt, or a log (GPX, CSV); default: what is in the film (GoPro, DJI) or beside it "
-        "under its name",
+        help="of one film: a drone's .srt, or a log (GPX, CSV); default: what is in the film (GoPro, DJI) or "
+        "beside it under its name",
     )
     group.add_argument(
-        "--no-telemetry", action="store_true", help="take no notice of telemetry in the film or beside it"
+        "--no-telemetry", action="store_true", help="take no notice of telemetry in films or beside them"
     )
     group.add_argument(
         "--film-start",
@@ -45,91 +55,104 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
         "speeds of both; of a log with a clock of its own: beside --film-start only",
     )
     group.add_argument(
-        "--keyframes", type=int, default=60, metavar="N", help="about so many at most; default: 60"
+        "--keyframes", type=int, default=60, metavar="N", help="of each film, about so many; default: 60"
     )
-    group.add_argument("--start", type=float, default=None, metavar="S", help="default: the film's beginning")
-    group.add_argument("--end", type=float, default=None, metavar="S", help="default: the film's end")
+    group.add_argument(
+        "--start", type=float, default=None, metavar="S", help="default: each film's beginning"
+    )
+    group.add_argument("--end", type=float, default=None, metavar="S", help="default: each film's end")
 
 
 def run_video(args: argparse.Namespace) -> int:
     """Choose keyframes, write them, ingest them; as `ingest.cli.run_photos`.
 
     Raises:
-        VideoError: the film cannot be read, or shows too little motion.
+        VideoError: no film can be read, or they show too little motion.
         TelemetryError, IngestError, StoreError, InvalidValueError
     """
     from featuredb.cli.common import storage_options
     from featuredb.geo.datum import HEIGHT_DATUMS
     from featuredb.store import Database
-    from ingest.cli import run_photos
+    from ingest.cli import ingest_folder
     from ingest.progress_bars import progress_bars
+    from ingest.video.films import find_films, make_films
     from ingest.video.keyframes import KeyframeOptions
-    from ingest.video.stills import StillsOptions, make_stills
+    from ingest.video.stills import StillsOptions
     from ingest.workspace import default_root
 
-    telemetry = _telemetry(args)
+    files = find_films(args.films)
+    _check_options(args, len(files.paths))
     options = StillsOptions(
         start_s=args.start,
         end_s=args.end,
         telemetry_late_s=args.telemetry_late,
-        film_start_s=_film_start(telemetry, args),
+        film_start_s=_film_start(args, files.paths[0]),
         positions=args.gcp is None,
         keyframes=KeyframeOptions(most=args.keyframes, least=min(KeyframeOptions().least, args.keyframes)),
     )
-    if telemetry is not None:
-        _check(telemetry, args)
-    # Made by `run_photos`: a film that is refused leaves no database behind.
+    # The database is made when there are photos: films that are refused leave none behind.
     database = Database(str(args.db), storage_options(args))
     root = args.work or default_root(database.url)
     with progress_bars(args.quiet) as progress:
-        stills = make_stills(args.folder, telemetry, root, options, progress)
-    sys.stdout.write(_text(args.folder, stills, telemetry))
-    if args.height_datum == "unknown" and stills.heights in HEIGHT_DATUMS:
-        args.height_datum = stills.heights
-    args.folder, args.name = stills.folder, args.name or args.folder.stem
+        films = make_films(files.paths, partial(_telemetry, args), root, options, progress)
+    sys.stdout.write(_text(films, files.notes))
+    if args.height_datum == "unknown" and len(films.heights & set(HEIGHT_DATUMS)) == len(films.heights) == 1:
+        (args.height_datum,) = films.heights
+    args.name = args.name or _name(args.films, len(files.paths))
     if args.max_features is None:
         args.max_features = _FEATURES
-    return run_photos(args)
+    return ingest_folder(args, films.folder, films.outcomes)
 
 
-def _check(telemetry: "Telemetry", args: argparse.Namespace) -> None:
-    """Telemetry that cannot place the film is refused before anything is made."""
-    import numpy as np
-
+def _check_options(args: argparse.Namespace, films: int) -> None:
+    """What does not go together is refused before anything is made."""
     from featuredb.errors import InvalidValueError
 
-    if args.height_datum != "unknown" and not np.isfinite(telemetry.height_m).any():
+    told = [f"--{name.replace('_', '-')}" for name in _OF_ONE if getattr(args, name) is not None]
+    if told and args.no_telemetry:
+        raise InvalidValueError(f"--no-telemetry: expected no {told[0]} beside it")
+    if told and films > 1:
         raise InvalidValueError(
-            f"--height-datum {args.height_datum}: the telemetry has heights above the place of take-off only"
+            f"{told[0]}: expected one film, found {films}; logs beside films and under their names are found"
         )
 
 
-def _telemetry(args: argparse.Namespace) -> "Telemetry | None":
+def _telemetry(args: argparse.Namespace, film: Path) -> "Telemetry | None":
+    """A film's telemetry, checked against what was told of it.
+
+    Raises:
+        TelemetryError, InvalidValueError
+    """
+    import numpy as np
+
     from featuredb.errors import InvalidValueError
     from featuredb.video.telemetry.read import read_telemetry, telemetry_of_video
 
     if args.no_telemetry:
-        told = [
-            name for name in ("telemetry", "telemetry_late", "film_start") if getattr(args, name) is not None
-        ]
-        if told:
-            raise InvalidValueError(f"--no-telemetry: expected no --{told[0].replace('_', '-')} beside it")
         return None
-    if args.telemetry is not None:
-        return read_telemetry(args.telemetry)
-    return telemetry_of_video(args.folder)
+    telemetry = telemetry_of_video(film) if args.telemetry is None else read_telemetry(args.telemetry)
+    if telemetry is None:
+        return None
+    if args.height_datum != "unknown" and not np.isfinite(telemetry.height_m).any():
+        raise InvalidValueError(
+            f"--height-datum {args.height_datum}: the telemetry has heights above the place of take-off only"
+        )
+    return telemetry
 
 
-def _film_start(telemetry: "Telemetry | None", args: argparse.Namespace) -> float | None:
+def _film_start(args: argparse.Namespace, film: Path) -> float | None:
     """Where the film begins in a log with a clock of its own, as was told."""
     from featuredb.errors import InvalidValueError
     from ingest.video.film_time import film_start
 
+    if args.film_start is None and args.telemetry_late is None:
+        return None
+    telemetry = _telemetry(args, film)
     if args.film_start is not None:
         if telemetry is None:
             raise InvalidValueError("--film-start: there is no telemetry; give --telemetry FILE")
         return film_start(args.film_start, telemetry)
-    if args.telemetry_late is not None and telemetry is not None and not telemetry.in_video_time:
+    if telemetry is not None and not telemetry.in_video_time:
         raise InvalidValueError(
             f"--telemetry-late: {telemetry.origin or telemetry.source} has a clock of its own; give "
             "--film-start, and this beside it if the log is late against that"
@@ -137,17 +160,24 @@ def _film_start(telemetry: "Telemetry | None", args: argparse.Namespace) -> floa
     return None
 
 
-def _text(film: Path, stills: "Stills", telemetry: "Telemetry | None") -> str:
-    lines = [
-        f"{film.name}: {stills.photos} keyframes of {stills.frames} frames, a step is {stills.step:.0%} of "
-        f"the picture, {stills.breaks} breaks; in {stills.folder}"
-    ]
-    if telemetry is None:
-        lines.append("no telemetry: the map needs a scan, control points or other maps for its place")
-    else:
+def _name(named: list[Path], films: int) -> str:
+    """Of the map: the film's, or the folder's, or the first one's with the number of the others."""
+    first = named[0].absolute()
+    if len(named) == 1 and first.is_dir():
+        return first.name
+    return first.stem if films == 1 else f"{first.stem} and {films - 1} more"
+
+
+def _text(films: "Films", notes: tuple[str, ...]) -> str:
+    lines = [f"note: {text}" for text in notes]
+    for film in films.outcomes:
+        if film.status == "refused":
+            lines.append(f"{film.path}: not used: {film.reason}")
+            continue
         lines.append(
-            f"telemetry of {telemetry.origin or telemetry.source}: {stills.positions} keyframes have a "
-            f"position, heights {stills.heights}"
+            f"{film.path}: {film.keyframes} keyframes of {film.frames} frames in {len(film.shots)} shots; "
+            f"{film.telemetry or 'no telemetry'}"
         )
-    lines += [f"note: {text}" for text in stills.notes]
+        lines += [f"note: {film.name}: {text}" for text in film.notes]
+    lines.append(f"keyframes are in {films.folder}")
     return "\n".join(lines) + "\n"

@@ -1,34 +1,30 @@
-"""Keyframes of a film as photos: JPEG files with what film and telemetry know in their EXIF."""
+"""From a film to photos: keyframes of its shots, written below the work folder."""
 
-import hashlib
-import io
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
-from datetime import timedelta
+from collections import Counter
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image
 
-from featuredb.errors import TelemetryError, VideoError
-from featuredb.features.exif_write import gps_directory
+from featuredb.errors import VideoError
 from featuredb.file_digest import file_sha256
-from featuredb.geometry.arrays import FloatArray
-from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
+from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import open_video
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.video.clocks import ClockOptions, check_overlap, lay_on_film
+from ingest.report_films import ShotOutcome
+from ingest.video.clocks import ClockOptions, check_overlap
 from ingest.video.film_time import FilmTime
-from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes
-from ingest.video.lag import LagOptions, estimate_lag
-from ingest.video.motion import Motion, MotionOptions, measure_motion
-from ingest.workspace import atomic_file, write_json
+from ingest.video.keyframe_files import Encoding, keyframe_name, write_keyframes
+from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
+from ingest.video.lag import LagOptions
+from ingest.video.motion import FrameKind, Motion, MotionOptions, measure_motion
+from ingest.video.positions import digest_of_telemetry, lateness, positions_at
+from ingest.workspace import write_json
 
 _DONE = "film.json"
-RELATIVE_HEIGHTS = "above the place of take-off"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,9 +63,9 @@ class Stills:
     """What was made of a film.
 
     Attributes:
-        folder: of the photos. photos: number of them. frames: of the film that were looked at.
+        folder: of the photos.
+        shots: with the file names of their keyframes; a film of titles alone has none of them.
         breaks: where nothing connects a frame with the one before.
-        step: between keyframes, a share of the picture's longer side.
         positions: photos with a position. heights: what their heights count from, for people.
         late_s: the telemetry's time that belongs to the film's time 0: how late it is, or where in the log
             the film begins; None where that is not known, and no photo has a position.
@@ -77,14 +73,22 @@ class Stills:
     """
 
     folder: Path
-    photos: int
-    frames: int
+    shots: tuple[ShotOutcome, ...]
     breaks: int
-    step: float
     positions: int
     heights: str
     late_s: float | None
     notes: tuple[str, ...]
+
+    @property
+    def photos(self) -> int:
+        """Number of keyframes."""
+        return sum(len(shot.keyframes) for shot in self.shots)
+
+    @property
+    def frames(self) -> int:
+        """Of the film that were looked at."""
+        return sum(shot.frames for shot in self.shots)
 
 
 def make_stills(
@@ -97,20 +101,18 @@ def make_stills(
     """Choose keyframes and write them below `root`; what is there already is not made again.
 
     Raises:
-        VideoError: the film cannot be read, or shows too little motion for two keyframes.
+        VideoError: the film cannot be read, or shows no place.
         TelemetryError: the telemetry has a clock of its own, and where the film lies on it is not clear.
     """
     options = options or StillsOptions()
     content = _digest_of(film)
-    name = digest(content, film.stem, options_fingerprint(options), _digest_of_telemetry(telemetry))[:16]
-    folder = root / "films" / name / film.stem
-    done = folder.parent / _DONE
-    if done.is_file():
-        known = json.loads(done.read_text(encoding="utf-8"))
-        if len(list(folder.glob("*.jpg"))) == known["photos"]:
-            return Stills(**{**known, "folder": folder, "notes": tuple(known["notes"])})
-    small = _video_options(options, options.motion_side_px)
-    with open_video(film, small) as video:
+    folder = (
+        root / "stills" / digest(content, options_fingerprint(options), digest_of_telemetry(telemetry))[:16]
+    )
+    known = _known(folder)
+    if known is not None:
+        return known
+    with open_video(film, _video_options(options, options.motion_side_px)) as video:
         when = _film_time(video.info, options)
         if telemetry is not None and options.positions and not telemetry.in_video_time:
             check_overlap(when, telemetry, options.clock)
@@ -118,31 +120,91 @@ def make_stills(
         motion = measure_motion(video, options.motion)
         notes = list(video.report.complaints())
     choice = choose_keyframes(motion, options.keyframes)
-    if len(choice.index) < 2:
-        raise VideoError(
-            f"{film.name}: {len(choice.index)} keyframes in {len(motion)} frames, two are needed: the "
-            "picture hardly moves, or no two frames belong together"
-        )
+    shots = _shots(motion, choice)
+    if not choice.index:
+        raise VideoError(f"{film.name}: {len(motion)} frames, and none shows a place: {_dropped(shots)}")
     late_s: float | None = 0.0
     if telemetry is not None:
         notes += telemetry.warnings
-        late_s, said = _lateness(motion, telemetry, when, options)
+        late_s, said = lateness(
+            motion,
+            telemetry,
+            when,
+            options.telemetry_late_s,
+            (options.lag, options.clock),
+            needed=options.positions,
+        )
         notes += said
-    places, heights = _places(telemetry, choice, late_s)
-    _write(film, folder, choice, places, content, options, progress)
-    found = Stills(
+    places, heights = positions_at(telemetry, choice, late_s)
+    encoding = Encoding(
+        video=_video_options(options, options.max_side_px), quality=options.quality, unnamed=content[:16]
+    )
+    write_keyframes(film, folder, choice, places, encoding, progress)
+    made = Stills(
         folder=folder,
-        photos=len(choice.index),
-        frames=len(motion),
+        shots=shots,
         breaks=int(motion.broken[1:].sum()),
-        step=round(choice.step, 4),
         positions=sum(place is not None for place in places),
         heights=heights,
         late_s=late_s,
         notes=tuple(notes),
     )
-    write_json(done, {name: getattr(found, name) for name in Stills.__slots__ if name != "folder"})
-    return found
+    record = {name: getattr(made, name) for name in Stills.__slots__ if name != "folder"}
+    write_json(folder / _DONE, record | {"shots": [asdict(shot) for shot in shots]})
+    return made
+
+
+def _known(folder: Path) -> Stills | None:
+    """What an earlier run made, if all of it is there."""
+    done = folder / _DONE
+    if not done.is_file():
+        return None
+    record = json.loads(done.read_text(encoding="utf-8"))
+    shots = tuple(
+        ShotOutcome(**{**shot, "keyframes": tuple(shot["keyframes"])}) for shot in record.pop("shots")
+    )
+    names = [name for shot in shots for name in shot.keyframes]
+    if not all((folder / name).is_file() for name in names):
+        return None
+    return Stills(**{**record, "folder": folder, "shots": shots, "notes": tuple(record["notes"])})
+
+
+def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
+    """Every shot, with the names of its keyframes and what its other frames are."""
+    chosen = set(choice.index)
+    # A frame that neither the one before nor the one after hangs on.
+    alone = motion.broken & np.append(motion.broken[1:], True)
+    shots = []
+    for number, rows in enumerate(shots_of(motion)):
+        other: Counter[str] = Counter()
+        for row in rows.tolist():
+            if int(motion.index[row]) not in chosen:
+                kind = FrameKind(motion.kind[row])
+                looked = "break" if alone[row] else "between"
+                other[looked if kind == FrameKind.PICTURE else kind.name.lower()] += 1
+        names = [
+            keyframe_name(index)
+            for index, shot in zip(choice.index, choice.shot, strict=True)
+            if shot == number
+        ]
+        shots.append(
+            ShotOutcome(
+                start_s=round(float(motion.time_s[rows[0]]), 3),
+                end_s=round(float(motion.time_s[rows[-1]]), 3),
+                frames=len(rows),
+                keyframes=tuple(names),
+                step=round(choice.step[number], 4),
+                dropped=dict(other),
+            )
+        )
+    return tuple(shots)
+
+
+def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
+    total: Counter[str] = Counter()
+    for shot in shots:
+        total.update(shot.dropped)
+    return ", ".join(f"{count} {code}" for code, count in total.most_common()) or "there are none"
 
 
 def _film_time(info: VideoInfo, options: StillsOptions) -> FilmTime:
@@ -154,132 +216,12 @@ def _film_time(info: VideoInfo, options: StillsOptions) -> FilmTime:
     )
 
 
-def _lateness(
-    motion: Motion, telemetry: Telemetry, film: FilmTime, options: StillsOptions
-) -> tuple[float | None, tuple[str, ...]]:
-    """`Stills.late_s`, and what there is to say of it.
-
-    Raises:
-        TelemetryError: positions are wanted, and the film cannot be laid on the telemetry's clock.
-    """
-    told = options.telemetry_late_s
-    if telemetry.in_video_time:
-        if told is not None:
-            return told, ()
-        lag = estimate_lag(motion, telemetry, options.lag)
-        return lag.late_s or 0.0, (lag.message,)
-    if told is not None and film.told_s is not None:
-        return film.told_s + told, ()
-    laid = lay_on_film(motion, telemetry, film, options.clock)
-    if laid.late_s is None and options.positions:
-        raise TelemetryError(laid.message)
-    return laid.late_s, (laid.message,)
-
-
 def _digest_of(film: Path) -> str:
     try:
         return file_sha256(film)
     except OSError as error:
-        raise VideoError(
-            f"{film}: expected a film, {error.strerror or error}; folders of pictures go to "
-            "`featuredb ingest photos`"
-        ) from error
-
-
-def _digest_of_telemetry(telemetry: Telemetry | None) -> str:
-    """Of all that positions are made of."""
-    if telemetry is None:
-        return "none"
-    columns = (
-        telemetry.times_s,
-        telemetry.latitude_deg,
-        telemetry.longitude_deg,
-        telemetry.height_m,
-        telemetry.relative_height_m,
-        telemetry.clock_s,
-    )
-    parts = [hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest() for column in columns]
-    return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time), telemetry.clock)
+        raise VideoError(f"{film}: expected a film, {error.strerror or error}") from error
 
 
 def _video_options(options: StillsOptions, side_px: int | None) -> VideoOptions:
     return VideoOptions(max_side_px=side_px, start_s=options.start_s, end_s=options.end_s)
-
-
-def _places(
-    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float | None
-) -> tuple[list[tuple[float, float, float] | None], str]:
-    """Position of each keyframe, latitude, longitude, height; and what the heights are."""
-    if telemetry is None:
-        return [None] * len(choice.index), ""
-    if late_s is None:
-        return [None] * len(choice.index), "not known: where in the log the film begins is not clear"
-    at = telemetry.at(np.array(choice.time_s) + late_s)
-    height: FloatArray = at.height_m
-    heights: str = telemetry.height_datum
-    if not np.isfinite(height).any():
-        height, heights = at.relative_height_m, RELATIVE_HEIGHTS
-    known = at.has_position & np.isfinite(height)
-    if not at.has_position.any():
-        return [None] * len(choice.index), "not known: the telemetry has no positions at the keyframes' times"
-    if not known.any():
-        return [None] * len(choice.index), "not known: positions without heights are not used"
-    return [
-        (float(at.latitude_deg[k]), float(at.longitude_deg[k]), float(height[k])) if known[k] else None
-        for k in range(len(choice.index))
-    ], heights
-
-
-def _write(
-    film: Path,
-    folder: Path,
-    choice: KeyframeChoice,
-    places: Sequence[tuple[float, float, float] | None],
-    content: str,
-    options: StillsOptions,
-    progress: Progress,
-) -> None:
-    wanted = {index: k for k, index in enumerate(choice.index)}
-    with open_video(film, _video_options(options, options.max_side_px)) as video:
-        for frame in video:
-            k = wanted.get(frame.index)
-            if k is None:
-                continue
-            with atomic_file(folder / f"{frame.index:06d}.jpg") as file:
-                camera = (video.info.make or "film", video.info.model or content[:16])
-                file.write_bytes(_jpeg(frame, video.info, camera, places[k], options.quality))
-            progress("keyframes", k + 1, len(wanted))
-            if k + 1 == len(wanted):
-                return
-    raise VideoError(f"{film.name}: not all keyframes could be read again; was the film changed meanwhile?")
-
-
-def _jpeg(
-    frame: VideoFrame,
-    info: VideoInfo,
-    camera: tuple[str, str],
-    place: tuple[float, float, float] | None,
-    quality: int,
-) -> bytes:
-    """One keyframe.
-
-    Args:
-        camera: make and model. All keyframes of a film name one, and so share their lens; films that do not
-            say theirs name themselves, so that no other film takes that lens for its own.
-    """
-    exif = Image.Exif()
-    base = ExifTags.Base
-    exif[base.Make.value], exif[base.Model.value] = camera
-    exif[base.Software.value] = "featuredb"
-    if info.creation_time is not None:
-        when = info.creation_time + timedelta(seconds=frame.time_s)
-        offset = when.strftime("%z") or "+0000"
-        details = exif.get_ifd(ExifTags.IFD.Exif)
-        details[base.DateTimeOriginal.value] = when.strftime("%Y:%m:%d %H:%M:%S")
-        details[base.OffsetTimeOriginal.value] = f"{offset[:3]}:{offset[3:5]}"
-        details[base.SubsecTimeOriginal.value] = f"{when.microsecond // 1000:03d}"
-    if place is not None:
-        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(place))
-    out = io.BytesIO()
-    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif)
-    return out.getvalue()

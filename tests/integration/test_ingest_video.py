@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from featuredb.cli.main import main
-from featuredb.errors import TelemetryError, VideoError
+from featuredb.errors import TelemetryError
 from featuredb.features.exif import read_exif
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -86,7 +86,7 @@ def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Pa
     telemetry = read_telemetry(film.with_suffix(".srt"))
     options = StillsOptions(keyframes=KeyframeOptions(step=0.2, window=0, least=0))
     stills = make_stills(film, telemetry, tmp_path, options)
-    files = sorted(stills.folder.iterdir())
+    files = sorted(stills.folder.glob("*.jpg"))
     assert len(files) == stills.photos == stills.positions
     assert (stills.frames, stills.breaks) == (48, 0)
     told = [read_exif(f.read_bytes()) for f in files]
@@ -103,7 +103,7 @@ def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Pa
 def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> None:
     telemetry = read_telemetry(film.with_suffix(".srt"))
     late = make_stills(film, telemetry, tmp_path, StillsOptions(telemetry_late_s=0.2))
-    file = sorted(late.folder.iterdir())[0]
+    file = sorted(late.folder.glob("*.jpg"))[0]
     there = geopose_from_camera(_pose(int(file.stem) + 2), FRAME)
     assert read_exif(file.read_bytes()).longitude_deg == pytest.approx(there.longitude_deg, abs=2e-8)
 
@@ -122,7 +122,9 @@ def test_other_telemetry_and_other_names_are_made_anew(film: Path, tmp_path: Pat
     moved = tmp_path / film.with_suffix(".srt").name
     moved.write_text(film.with_suffix(".srt").read_text().replace("[latitude: 4", "[latitude: 3"))
     second = make_stills(film, read_telemetry(moved), tmp_path / "work")
-    latitudes = [read_exif(sorted(s.folder.iterdir())[0].read_bytes()).latitude_deg for s in (first, second)]
+    latitudes = [
+        read_exif(sorted(s.folder.glob("*.jpg"))[0].read_bytes()).latitude_deg for s in (first, second)
+    ]
     assert latitudes[0] is not None
     assert latitudes[1] is not None
     assert latitudes[0] - latitudes[1] == pytest.approx(10.0, abs=1e-3)
@@ -208,7 +210,7 @@ def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: P
     assert stills.late_s == 3.0
     assert stills.positions == stills.photos > 2
     assert any("as was told" in note for note in stills.notes)
-    for file in stills.folder.iterdir():
+    for file in stills.folder.glob("*.jpg"):
         # Between rows a second apart the drone flies straight, but for one corner of its way.
         place, told = geopose_from_camera(_pose(int(file.stem)), FRAME), read_exif(file.read_bytes())
         assert told.latitude_deg == pytest.approx(place.latitude_deg, abs=5.0 / 111_000)
@@ -240,14 +242,18 @@ def test_a_table_in_the_films_time_needs_no_clock(film: Path, tmp_path: Path) ->
     assert stills.positions == stills.photos
 
 
-def test_a_film_that_stands_still_is_refused(tmp_path: Path) -> None:
+def test_a_film_that_stands_still_is_one_photo_and_no_map(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     picture = _render(field_texture(1), _pose(0), 0)
     with VideoWriter(tmp_path / "still.mp4", width=CAMERA.width, height=CAMERA.height, fps=10.0) as writer:
         for _ in range(12):
             writer.write(picture)
-    with pytest.raises(VideoError, match="1 keyframes in 12 frames, two are needed"):
-        make_stills(tmp_path / "still.mp4", None, tmp_path / "work")
-    assert not (tmp_path / "work").exists()
+    assert main(["ingest", "video", str(tmp_path / "db"), str(tmp_path / "still.mp4"), "--quiet"]) == 2
+    assert "two keyframes are needed" in capsys.readouterr().err
+    assert len(list(tmp_path.rglob("*.jpg"))) == 1
+    (shot,) = make_stills(tmp_path / "still.mp4", None, tmp_path / "work").shots
+    assert shot.dropped == {"frozen": 11}
 
 
 @pytest.mark.parametrize(
@@ -269,6 +275,9 @@ def test_what_is_no_film_is_refused_and_leaves_nothing(
     assert not list(tmp_path.rglob("*.jpg"))
 
 
-def test_a_folder_is_not_a_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_without_films_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "photo.jpg").write_bytes(b"")
     assert main(["ingest", "video", str(tmp_path / "db"), str(tmp_path), "--quiet"]) not in (0, 1)
-    assert "featuredb ingest photos" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "1 files are no films by their names" in said
+    assert "featuredb ingest photos" in said

@@ -58,6 +58,8 @@ class _Flight:
             time_s=times,
             step=step,
             broken=np.arange(len(times)) == 0,
+            cut=np.arange(len(times)) == 0,
+            kind=np.zeros(len(times), dtype=np.int8),
             sharpness=np.ones(len(times)),
         )
 

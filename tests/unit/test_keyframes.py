@@ -11,7 +11,10 @@ from tests.support.films import picture
 
 
 def _motion(
-    shifts: list[float], broken: tuple[int, ...] = (), sharp: dict[int, float] | None = None
+    shifts: list[float],
+    broken: tuple[int, ...] = (),
+    sharp: dict[int, float] | None = None,
+    cuts: tuple[int, ...] = (),
 ) -> Motion:
     """A picture that moves right by shares of its side."""
     count = len(shifts)
@@ -22,6 +25,8 @@ def _motion(
         time_s=np.arange(count) / 25.0,
         step=step,
         broken=np.isin(np.arange(count), (0, *broken)),
+        cut=np.isin(np.arange(count), (0, *cuts)),
+        kind=np.zeros(count, dtype=np.int8),
         sharpness=np.array([(sharp or {}).get(k, 1.0) for k in range(count)]),
     )
 
@@ -32,9 +37,9 @@ _EXACT = KeyframeOptions(window=0, least=0)
 def test_keyframes_are_a_step_apart() -> None:
     choice = choose_keyframes(_motion([0.03] * 21), _EXACT)
     assert choice.index == tuple(5 + k for k in (0, 4, 8, 12, 16, 20))
-    assert choice.step == 0.12
+    assert choice.step == (0.12,)
     assert choice.time_s[1] == pytest.approx(4 / 25)
-    assert set(choice.segment) == {0}
+    assert set(choice.shot) == {0}
 
 
 def test_a_shaking_picture_is_not_a_moving_one() -> None:
@@ -61,10 +66,10 @@ def test_a_long_film_has_longer_steps_up_to_a_limit() -> None:
     motion = _motion([0.03] * 401)
     few = choose_keyframes(motion, KeyframeOptions(most=50, window=0, least=0))
     assert 40 <= len(few.index) <= 50
-    assert 0.2 < few.step <= 0.3
+    assert 0.2 < few.step[0] <= 0.3
     # Neighbours must overlap: the limit of the step goes before that of the number.
     many = choose_keyframes(motion, KeyframeOptions(most=10, window=0, least=0))
-    assert many.step == 0.3
+    assert many.step == (0.3,)
     assert len(many.index) > 10
 
 
@@ -83,11 +88,11 @@ def test_the_work_grows_with_the_film_and_not_with_its_square(monkeypatch: pytes
 
 
 def test_nothing_goes_across_a_break() -> None:
-    choice = choose_keyframes(_motion([0.03] * 30, broken=(10, 11, 20)), _EXACT)
+    choice = choose_keyframes(_motion([0.03] * 30, broken=(10, 11, 20), cuts=(11,)), _EXACT)
     rows = [k - 5 for k in choice.index]
-    # Frame 10 stands alone between two cuts.
+    # Frame 10 stands alone between two breaks; only the second is a cut.
     assert 10 not in rows
-    assert choice.segment == tuple(0 if r < 10 else 2 if r < 20 else 3 for r in rows)
+    assert choice.shot == tuple(0 if r < 10 else 1 for r in rows)
     assert {0, 11, 20} <= set(rows)
 
 
@@ -144,7 +149,7 @@ def test_blur_is_less_sharp() -> None:
 def test_a_short_film_has_shorter_steps_but_none_below_the_shortest() -> None:
     choice = choose_keyframes(_motion([0.01] * 100), KeyframeOptions(window=0))
     assert 24 <= len(choice.index) <= 30
-    assert 0.02 <= choice.step < 0.12
+    assert 0.02 <= choice.step[0] < 0.12
     still = choose_keyframes(_motion([0.001] * 100), KeyframeOptions(window=0))
-    assert still.step == 0.02
+    assert still.step == (0.02,)
     assert len(still.index) <= 6

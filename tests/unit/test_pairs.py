@@ -1,6 +1,7 @@
 """Choice of pairs: what must be there, what must not, and how many."""
 
 import itertools
+from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
 
@@ -193,3 +194,19 @@ def test_no_photo_is_paired_with_itself_and_none_twice() -> None:
     pairs = choose_pairs(photos, None, PairOptions())
     assert len(set(pairs)) == len(pairs)
     assert all(i < j for i, j in pairs)
+
+
+def test_keyframes_look_beyond_their_own_shot() -> None:
+    """Two films along one street: each keyframe is most like its neighbours in its own film."""
+    photos = [replace(_photo(k, timed=False), film=film, camera_key=film) for film in "ab" for k in range(20)]
+    street = _vectors(20, 1).astype(np.float64)
+    street += 0.9 * np.roll(street, 1, axis=0)
+    own = [street + 2.0 * _vectors(1, 1, seed) for seed in (1, 2)]
+    vectors = np.concatenate([v / np.linalg.norm(v, axis=1, keepdims=True) for v in own]).astype(np.float16)
+    options = PairOptions(retrieval_neighbours=2, other_shots=1, time_neighbours=1)
+    pairs = choose_pairs(photos, vectors, options)
+    assert {(k, k + 20) for k in range(20)} <= set(pairs)
+    assert {(k, k + 1) for k in range(19)} <= set(pairs)
+    assert not {(k, k + 20) for k in range(20)} & set(
+        choose_pairs(photos, vectors, replace(options, other_shots=0))
+    )

@@ -1,0 +1,100 @@
+"""Keyframes as JPEG files, with what film and telemetry know in their EXIF."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from pathlib import Path
+
+from PIL import ExifTags, Image
+
+from featuredb.errors import VideoError
+from featuredb.features.exif_write import gps_directory
+from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
+from featuredb.video.frames import open_video
+from ingest.executor import Progress
+from ingest.video.keyframes import KeyframeChoice
+from ingest.video.positions import Position
+from ingest.workspace import atomic_file
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Encoding:
+    """How keyframes are written.
+
+    Attributes:
+        video: how the film is read: the same stretch as when keyframes were chosen.
+        quality: of JPEG.
+        unnamed: the camera's model where the film does not say; no two films have the same.
+    """
+
+    video: VideoOptions
+    quality: int
+    unnamed: str
+
+
+def write_keyframes(
+    film: Path,
+    folder: Path,
+    choice: KeyframeChoice,
+    places: Sequence[Position | None],
+    encoding: Encoding,
+    progress: Progress,
+) -> None:
+    """Write the chosen frames as `folder`/NNNNNN.jpg, each named by its number in the film.
+
+    Raises:
+        VideoError: the film does not give the same frames again.
+    """
+    wanted = {index: k for k, index in enumerate(choice.index)}
+    left = len(wanted)
+    with open_video(film, encoding.video) as video:
+        for frame in video:
+            k = wanted.get(frame.index)
+            if k is None:
+                continue
+            camera = _camera(video.info, encoding.unnamed, choice.shot[k])
+            with atomic_file(folder / keyframe_name(frame.index)) as file:
+                file.write_bytes(_jpeg(frame, video.info, camera, places[k], encoding.quality))
+            left -= 1
+            progress("keyframes", len(wanted) - left, len(wanted))
+            if not left:
+                return
+    raise VideoError(f"{film.name}: not all keyframes could be read again; was the film changed meanwhile?")
+
+
+def keyframe_name(index: int) -> str:
+    """The file of a frame."""
+    return f"{index:06d}.jpg"
+
+
+def _camera(info: VideoInfo, unnamed: str, shot: int) -> tuple[str, str]:
+    """Make and model. All keyframes of a shot name one, and so share their lens.
+
+    Films that do not say theirs name themselves, so that no other film takes that lens for its own. Shots
+    after the first have a lens of their own: who cuts a film may have had several cameras.
+    """
+    model = info.model or unnamed
+    return info.make or "film", model if shot == 0 else f"{model} shot {shot + 1}"
+
+
+def _jpeg(
+    frame: VideoFrame, info: VideoInfo, camera: tuple[str, str], place: Position | None, quality: int
+) -> bytes:
+    """One keyframe, of a camera's make and model."""
+    exif = Image.Exif()
+    base = ExifTags.Base
+    exif[base.Make.value], exif[base.Model.value] = camera
+    exif[base.Software.value] = "featuredb"
+    if info.creation_time is not None:
+        when = info.creation_time + timedelta(seconds=frame.time_s)
+        offset = when.strftime("%z") or "+0000"
+        details = exif.get_ifd(ExifTags.IFD.Exif)
+        details[base.DateTimeOriginal.value] = when.strftime("%Y:%m:%d %H:%M:%S")
+        details[base.OffsetTimeOriginal.value] = f"{offset[:3]}:{offset[3:5]}"
+        details[base.SubsecTimeOriginal.value] = f"{when.microsecond // 1000:03d}"
+    if place is not None:
+        exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(place))
+    out = io.BytesIO()
+    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif)
+    return out.getvalue()
