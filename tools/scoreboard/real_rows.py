@@ -226,10 +226,24 @@ REAL: tuple[Row, ...] = (
         readme=True,
         minutes=15,
     ),
-    _made(
-        *("sacre_coeur-map", "`sacre_coeur`: 10 photos by strangers, no EXIF, become a map"),
-        *(("--photos", "{data}/sacre_coeur/mapping"), "sacre_coeur/mapping", 9),
-        minutes=3,
+    Row(
+        name="paper-shares",
+        group="real",
+        form="full",
+        claim="`karma.mp4` and `brighton` as a film without GPS become maps (paper: 98 of 115 films); photos "
+        "of collections in the largest map (paper: 7 % and 22 %)",
+        commands=(("tools.paper", "--out", "{work}", "--data", "{data}", "--only", "shares"),),
+        json="{work}/paper.json",
+        figures=same("films", "films_mapped", "reichstag", "sacre_coeur"),
+        text="{films_mapped} of {films} films; {reichstag} of 74 of `reichstag`, {sacre_coeur} of 10 of "
+        "`sacre_coeur`",
+        limits=(
+            Limit(figure="films_mapped", least=2),
+            Limit(figure="reichstag", least=60),
+            Limit(figure="sacre_coeur", least=9),
+        ),
+        needs=("video/karma.mp4", "brighton/images", "reichstag/images", "sacre_coeur/mapping"),
+        minutes=12,
     ),
     _laser("fountain-P11", 11, "quick"),
     _laser("entry-P10", 10, "full"),
