@@ -17,7 +17,7 @@ def test_quarters_of_a_film_and_its_lost_frames() -> None:
     assert figures["last_over_first"] == pytest.approx(3.0)
     more = {"adjusted_m": 0.05, "rate_hz": 40.0, "frame_s": 5.0, "projection_s": 0.4, "keyframes": 30}
     rows = {line.what: line for line in film_lines(figures | more | {"made_s": 100.0}, 40)}
-    assert rows["tracked centres over 40 frames"].ours.startswith("0.197 m mean, 0.30 m at most, 3 lost")
+    assert rows["tracked centres over 40 frames"].ours.startswith("0.200 m mean, 0.30 m at most, 3 lost")
     assert rows["the same, from a bundle adjustment"].paper == "0.4 m"
 
 
