@@ -1,4 +1,4 @@
-"""`featuredb register DB MAP --gcp FILE`: a map that is there gets a better place."""
+"""`featuredb register DB MAP --gcp FILE`: a map that is there gets a better place, or its first one."""
 
 import argparse
 import sys
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ingest.register.control.placement import GcpOptions
+    from ingest.register.control.registered_map import GcpRegistration
 
 
 def register(subparsers: Any) -> None:
@@ -16,9 +17,9 @@ def register(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "register",
         help="place a map by ground control points",
-        description="Place a map anew by ground control points: similarity, adjustment with the points as "
-        "control, residuals, wrong marks named. The new placement is a new commit; `featuredb rollback` and "
-        "--as-of reach the old one.",
+        description="Place a map by ground control points, one without a place, too: similarity, "
+        "adjustment with the points as control, residuals, wrong marks named. The new placement is a new "
+        "commit; `featuredb rollback` and --as-of reach the map as it was.",
     )
     add_database_argument(parser)
     parser.add_argument("map_id", metavar="MAP", help="id of the map, see `featuredb maps`")
@@ -76,42 +77,53 @@ def control_options(args: argparse.Namespace) -> "GcpOptions":
 def run_register(args: argparse.Namespace) -> int:
     """Place, print the residuals, commit; 0 if the map has its new place, 1 if it was refused."""
     from featuredb.cli.common import open_database
+    from featuredb.maps.unplaced_map import UnplacedMap
     from ingest.register.control.control_file import read_control_file
     from ingest.register.control.evidence import gcp_evidence, residual_table
-    from ingest.register.control.registered_map import register_by_gcp
+    from ingest.register.control.registered_map import place_unplaced_by_gcp, register_by_gcp
     from ingest.register.control.report import write_control_report
 
     file = read_control_file(args.gcp, args.gcp_crs)
     database = open_database(args)
     snapshot = database.snapshot()
-    feature_map = snapshot.load_map(args.map_id)
-    result = register_by_gcp(feature_map, file, control_options(args), args.height_datum)
+    before = snapshot.load_any(args.map_id)
+    options = control_options(args)
+    if isinstance(before, UnplacedMap):
+        result = place_unplaced_by_gcp(before, file, options, args.height_datum)
+    else:
+        result = register_by_gcp(before, file, options, args.height_datum)
     sys.stdout.write("".join(f"note: {note}\n" for note in file.notes))
     sys.stdout.write(residual_table(result.placement, result.control))
     if args.report is not None:
         write_control_report(
             args.report,
-            f"Control points of {feature_map.name}",
+            f"Control points of {before.name}",
             result.placement,
             result.control,
             gcp_evidence(result.placement, result.control),
         )
-    if result.feature_map is None or result.moved_m is None:
+    if result.feature_map is None:
         sys.stdout.write(f"refused: {result.placement.reason}: {result.placement.message}\n")
         return 1
-    east, north, up = result.moved_m
-    sys.stdout.write(f"the map moves by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up\n")
+    sys.stdout.write(_moved_words(result))
     if args.dry_run:
         sys.stdout.write("nothing was committed, as asked\n")
         return 0
     committed = database.commit_map(
-        result.feature_map, replaces=args.map_id, based_on=snapshot.get(args.map_id).write_id
+        result.feature_map, replaces=args.map_id, based_on=snapshot.get_any(args.map_id).write_id
     )
     word = "committed" if committed.created else "was placed so already"
     sys.stdout.write(f"map {args.map_id}: {word}, snapshot {committed.version}\n")
     for other in committed.flagged:
         sys.stdout.write(f"warning: map {other} was placed by this one and is quarantined now\n")
     return 0
+
+
+def _moved_words(result: "GcpRegistration") -> str:
+    if result.moved_m is None:
+        return "the map had no place before\n"
+    east, north, up = result.moved_m
+    return f"the map moves by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up\n"
 
 
 def _sigmas(text: str) -> tuple[float, float]:

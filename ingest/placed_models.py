@@ -42,6 +42,7 @@ _ELSEWHERE = (
 _WAYS = (
     "a scan and a person's hand: featuredb lidar add DB SCAN, then "
     "featuredb anchor DB MAP --photos FOLDER --page",
+    "ground control points, three or more, each marked in two photos: featuredb register DB MAP --gcp FILE",
     "maps with a place that show the same: featuredb grow DB",
 )
 

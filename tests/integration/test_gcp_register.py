@@ -1,6 +1,7 @@
 """`featuredb register --gcp` as typed: residuals, a new placement, the old one within reach, refusals."""
 
 import argparse
+import itertools
 import json
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from featuredb.store import Database
 from ingest.cli_register import register
 from ingest.register.block import block_of_map, map_of_block
 from tests.support.control import FRAME, SurveyedBlock, control_text, moved_mark, surveyed_block
+from tests.support.maps import without_place
 from tests.support.scenes import random_descriptors, scene_map
 
 _SHIFT = Sim3.exp([0.01, 0.005, -0.004, 0.02, 3.0, -4.0, 9.0])
@@ -80,6 +82,29 @@ def test_a_map_moves_to_its_control_points_and_back(
     np.testing.assert_array_equal(old.points.utm, before.points.utm)
     database.rollback(first.version)
     assert database.snapshot().load_map("hills").placement.method == "gps"
+
+
+def test_control_points_place_a_map_that_had_no_place(
+    world: SurveyedBlock, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database = Database.create(tmp_path / "db")
+    unplaced = without_place(_misplaced_map(world), world.local_from_block.inverse())
+    first = database.commit_map(unplaced)
+    survey = tmp_path / "gcp_list.txt"
+    survey.write_text(control_text(world.control_local[:2], dict(itertools.islice(world.marks.items(), 8))))
+    assert _run(tmp_path / "db", "hills", "--gcp", survey) == 1
+    assert "TOO_FEW" in capsys.readouterr().out
+    survey.write_text(control_text(world.control_local, world.marks))
+    assert _run(tmp_path / "db", "hills", "--gcp", survey) == 0
+    assert "had no place before" in capsys.readouterr().out
+    after = database.snapshot().load_map("hills")
+    assert (after.placement.method, after.status) == ("gcp", "active")
+    truth = world.local_from_block.act(world.block.xyz)
+    assert np.median(np.linalg.norm(after.points_local(FRAME) - truth, axis=1)) < 0.05
+    placed = after.placement.local_from_sfm.act(unplaced.points.xyz)
+    assert np.median(np.linalg.norm(placed - after.points_local(), axis=1)) < 0.2
+    database.rollback(first.version)
+    assert database.snapshot().load_unplaced("hills").no_place == unplaced.no_place
 
 
 def test_a_refused_file_changes_nothing(

@@ -1,5 +1,6 @@
 """Small random FeatureMaps, consistent in themselves, for tests of what lies above the value types."""
 
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 
 import numpy as np
@@ -165,14 +166,24 @@ def _covariance(rng: np.random.Generator, size: int) -> NDArray[np.float64]:
 def random_unplaced_map(seed: int = 0, *, map_id: str | None = None) -> UnplacedMap:
     """A map without a place, of the content of `random_map`."""
     placed = random_map(seed, map_id=map_id)
+    return replace(without_place(placed), source="random", licence="CC0-1.0", provenance={"seed": seed})
+
+
+def without_place(placed: FeatureMap, own_from_local: Sim3 | None = None) -> UnplacedMap:
+    """The map as it would be if nobody knew its place; covariances stay as they are."""
+    move = own_from_local or Sim3.identity()
     return UnplacedMap(
         map_id=placed.map_id,
         name=placed.name,
-        frame=OwnFrame(metric=False, upright=True),
+        frame=OwnFrame(metric=False, upright=own_from_local is None),
         cameras=placed.cameras,
         camera_keys=placed.camera_keys,
-        images=placed.images,
-        points=OwnPoints(xyz=placed.points_local(), **placed.points.columns(np.arange(len(placed.points)))),
+        images=tuple(
+            replace(image, cam_from_local=move.act_on_pose(image.cam_from_local)) for image in placed.images
+        ),
+        points=OwnPoints(
+            xyz=move.act(placed.points_local()), **placed.points.columns(np.arange(len(placed.points)))
+        ),
         observations=placed.observations,
         no_place=NoPlace(
             reason_code="TOO_FEW",
@@ -181,7 +192,7 @@ def random_unplaced_map(seed: int = 0, *, map_id: str | None = None) -> Unplaced
             evidence={"with_gps": 0},
         ),
         extractor_fingerprint=placed.extractor_fingerprint,
-        source="random",
-        licence="CC0-1.0",
-        provenance={"seed": seed},
+        source=placed.source,
+        licence=placed.licence,
+        provenance=placed.provenance,
     )

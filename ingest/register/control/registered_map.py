@@ -1,7 +1,7 @@
 """Control points place a map that is in the database already, or a reconstruction on its way there."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,12 +10,14 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.evidence import gcp_evidence
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
+from ingest.register.place_map import placed_map
 
 # A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
 _MAX_FRAME_DISTANCE_M = 2_000.0
@@ -30,7 +32,8 @@ class GcpRegistration:
         control: what met the map's photos, and what did not.
         frame: local frame of the placement.
         feature_map: to be committed in the old one's place, None where it was refused.
-        moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map.
+        moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map, and where
+            it had no place before.
     """
 
     placement: GcpPlacement
@@ -89,6 +92,27 @@ def register_by_gcp(
     return GcpRegistration(
         placement=placement, control=control, frame=frame, feature_map=placed, moved_m=moved
     )
+
+
+def place_unplaced_by_gcp(
+    unplaced: UnplacedMap,
+    file: ControlFile,
+    options: GcpOptions,
+    height_datum: str = "unknown",
+    other_photos: Mapping[str, str] | None = None,
+) -> GcpRegistration:
+    """Place a map that has no place by control points; arguments as in `register_by_gcp`.
+
+    The points say everything: its own frame only starts at them, and counts for nothing.
+    """
+    at_the_points = Placement(
+        method="gcp",
+        local_from_sfm=Sim3.identity(),
+        covariance=np.zeros((7, 7)),
+        residual_rms_m=0.0,
+    )
+    start = placed_map(unplaced, at_the_points, control_frame(file), "unknown")
+    return replace(register_by_gcp(start, file, options, height_datum, other_photos), moved_m=None)
 
 
 def datum_of(file: ControlFile, control: Control, before: str, said: str) -> str:
