@@ -9,6 +9,7 @@ Exit code 0 if every row that has a result of this commit holds.
 
 import argparse
 import os
+import signal
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from tools.scoreboard.run import Places, run
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
+    signal.signal(signal.SIGTERM, _stopped)
     if args.list:
         return _list(newest(read_results()))
     commit = code_commit()
@@ -36,6 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     failed = [row.name for row, result in mine if result.commit == commit and not row.holds(result.figures)]
     sys.stdout.write(f"do not hold: {', '.join(failed)}\n" if failed else "")
     return 1 if failed else 0
+
+
+def _stopped(signum: int, _: object) -> None:
+    """Leave as Ctrl-C does: the row's processes end with this one, and its result is not kept."""
+    raise SystemExit(128 + signum)
 
 
 def _chosen(names: Sequence[str], full: bool) -> list[Row]:

@@ -3,11 +3,14 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TextIO
 
 from tools.scoreboard.results import ROOT, Result, result_now
 from tools.scoreboard.row import Row
@@ -42,9 +45,7 @@ def run(row: Row, places: Places, commit: str) -> Result:
             command = [sys.executable, "-m", *(word.format(**names) for word in words)]
             log.write(f"$ {' '.join(command[1:])}\n")
             log.flush()
-            code = subprocess.run(
-                command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=os.environ, check=False
-            ).returncode
+            code = _call(command, log)
             if code not in (0, 1):  # 1: measured, and some line of the program's own does not hold
                 failure = f"exit code {code}"
                 break
@@ -57,3 +58,16 @@ def run(row: Row, places: Places, commit: str) -> Result:
         return result_now(row.name, commit, {}, seconds, f"{failure}: {tail[-300:]}")
     figures = row.read(json.loads(figures_file.read_text(encoding="utf-8")))
     return result_now(row.name, commit, figures | {"seconds": round(seconds, 1)}, seconds)
+
+
+def _call(command: Sequence[str], log: TextIO) -> int:
+    """The exit code of a command; whoever stops the scoreboard stops all processes that the command has."""
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=log, stderr=subprocess.STDOUT, env=os.environ, start_new_session=True
+    )
+    try:
+        return process.wait()
+    except BaseException:
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        raise
