@@ -17,6 +17,7 @@ from featuredb.cli.common import (
 )
 from featuredb.errors import ExportError
 from featuredb.maps.feature_map import MAP_STATUSES, MapStatus
+from featuredb.maps.unplaced_map import UNPLACED_STATUSES, UnplacedStatus
 
 if TYPE_CHECKING:
     from featuredb.export.job import Exported, ExportJob
@@ -109,19 +110,27 @@ FORMATS: dict[str, Format] = {
         write=_dataset,
         options=("with_lidar",),
     ),
-    "colmap": Format(text="a folder for each map: model, database, place", write=_colmap, options=("text",)),
+    "colmap": Format(
+        text="a folder for each map, placed or not: model, database, place",
+        write=_colmap,
+        options=("text",),
+    ),
     "las": Format(text="points, a LAS 1.4 file for each UTM zone and height datum", write=_las),
     "laz": Format(text="the same, compressed", write=_las),
-    "ply": Format(text="points, a binary PLY file for each UTM zone and height datum", write=_ply),
+    "ply": Format(
+        text="points, a binary PLY file for each UTM zone and datum, or map without a place",
+        write=_ply,
+    ),
     "geojson": Format(text="positions and angles of photos, one file", write=_geojson),
     "kml": Format(text="photos in space for Google Earth, one file", write=_kml),
     "geopose": Format(text="OGC GeoPose, a file for each photo", write=_geopose),
     "opensfm": Format(text="a folder for each map as OpenSfM and OpenDroneMap have it", write=_opensfm),
-    "kapture": Format(text="a folder for each map as kapture 1.1 has it, with its place", write=_kapture),
+    "kapture": Format(text="a folder for each map, placed or not, as kapture 1.1 has it", write=_kapture),
     "exif": Format(
         text="copies of the photos with their pose in EXIF and XMP", write=_exif, options=("photos",)
     ),
 }
+_STATUSES = tuple(dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES)))
 # Options that belong to some formats only, with what they are when they are not given.
 _OWN: dict[str, Any] = {"text": False, "photos": None, "with_lidar": False}
 
@@ -165,7 +174,7 @@ def add_selection_arguments(parser: argparse.ArgumentParser) -> None:
         type=_statuses,
         default=None,
         metavar="S[,S]",
-        help=f"of {', '.join(MAP_STATUSES)}; default: active",
+        help=f"of {', '.join(_STATUSES)}; default: active",
     )
     group.add_argument(
         "--bbox",
@@ -239,11 +248,11 @@ def _check_options(args: argparse.Namespace, chosen: Format) -> None:
             )
 
 
-def _statuses(text: str) -> tuple[MapStatus, ...]:
+def _statuses(text: str) -> tuple[MapStatus | UnplacedStatus, ...]:
     names = _names(text)
-    if not names or any(name not in MAP_STATUSES for name in names):
-        raise argparse.ArgumentTypeError(f"expected names of {', '.join(MAP_STATUSES)}, found {text!r}")
-    return cast("tuple[MapStatus, ...]", names)
+    if not names or any(name not in _STATUSES for name in names):
+        raise argparse.ArgumentTypeError(f"expected names of {', '.join(_STATUSES)}, found {text!r}")
+    return cast("tuple[MapStatus | UnplacedStatus, ...]", names)
 
 
 def _bbox(text: str) -> tuple[float, float, float, float]:

@@ -8,9 +8,9 @@ import numpy as np
 
 from featuredb.cli.common import add_database_argument, open_database
 from featuredb.errors import MapNotFoundError, StoreError
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.thin import ThinOptions, described_points_of_images, thin_map
-from featuredb.store import MapSummary, Snapshot
+from featuredb.maps.unplaced_map import AnyMap
+from featuredb.store import MapSummary, Snapshot, UnplacedSummary
 
 _DEFAULTS = ThinOptions()
 
@@ -20,7 +20,9 @@ def register(subparsers: Any) -> None:
     text = "keep only as many descriptors as answers need; the earlier state stays, see rollback"
     parser = subparsers.add_parser("thin", help=text, description=text)
     add_database_argument(parser)
-    parser.add_argument("map_id", metavar="MAP", help="id of an active map, or its first letters")
+    parser.add_argument(
+        "map_id", metavar="MAP", help="id of a map that is active or has no place, or its first letters"
+    )
     parser.add_argument(
         "--cover",
         type=int,
@@ -49,16 +51,22 @@ def run_thin(args: argparse.Namespace) -> int:
 
     Raises:
         MapNotFoundError: no live map of that id.
-        StoreError: the map is not active.
+        StoreError: the map is quarantined.
         InvalidValueError: options out of range.
         ConflictError: someone else changed the map meanwhile.
     """
     options = ThinOptions(cover=args.cover, max_views=args.max_views, keep_points=not args.drop_points)
     database = open_database(args)
     snapshot = database.snapshot()
-    summary = _active_map(snapshot, args.map_id)
-    before = snapshot.load_map(summary.map_id)
-    after = thin_map(before, options)
+    summary = _thinnable(snapshot, args.map_id)
+    before: AnyMap
+    after: AnyMap
+    if isinstance(summary, UnplacedSummary):
+        before = unplaced = snapshot.load_unplaced(summary.map_id)
+        after = thin_map(unplaced, options)
+    else:
+        before = placed = snapshot.load_map(summary.map_id)
+        after = thin_map(placed, options)
     sys.stdout.write(f"map {summary.map_id}: {_figures(before)} -> {_figures(after)}\n")
     if args.dry_run:
         return 0
@@ -73,19 +81,21 @@ def run_thin(args: argparse.Namespace) -> int:
     return 0
 
 
-def _active_map(snapshot: Snapshot, map_id: str) -> MapSummary:
-    maps = snapshot.maps()
+def _thinnable(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
+    maps: list[MapSummary | UnplacedSummary] = [*snapshot.maps(), *snapshot.unplaced_maps()]
     found = [m for m in maps if m.map_id == map_id] or [m for m in maps if m.map_id.startswith(map_id)]
     if len(found) != 1:
         raise MapNotFoundError(
             f"snapshot {snapshot.version} has {len(found)} live maps {map_id}; `featuredb maps` lists them"
         )
-    if found[0].status != "active":
-        raise StoreError(f"map {found[0].map_id} is {found[0].status}; only active maps are thinned")
+    if found[0].status not in ("active", "unplaced"):
+        raise StoreError(
+            f"map {found[0].map_id} is {found[0].status}; active maps are thinned, and those without a place"
+        )
     return found[0]
 
 
-def _figures(feature_map: FeatureMap) -> str:
+def _figures(feature_map: AnyMap) -> str:
     seen = feature_map.observations
     described = len(np.unique(seen.point_index[seen.has_descriptor]))
     cover = described_points_of_images(feature_map)

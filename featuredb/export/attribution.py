@@ -8,7 +8,7 @@ from typing import Any, TextIO
 from urllib.parse import quote
 
 from featuredb.export.selection import licence_of
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 
 ATTRIBUTION = "attribution.csv"
 _COLUMNS = ("map_id", "image", "sha256", "owner", "licence", "capture_time", "source")
@@ -27,7 +27,7 @@ class Attribution:
     source: str
 
 
-def attribution_of(feature_map: FeatureMap) -> list[Attribution]:
+def attribution_of(feature_map: AnyMap) -> list[Attribution]:
     """A row for every photo of the map, in the map's order."""
     return [
         Attribution(
@@ -57,7 +57,7 @@ class AttributionFile:
         self._file = path.open("w", encoding="utf-8", newline="")
         self._writer = _writer(self._file)
 
-    def add(self, feature_map: FeatureMap) -> None:
+    def add(self, feature_map: AnyMap) -> None:
         """The photos of a map."""
         self._writer.writerows(_values(row) for row in attribution_of(feature_map))
 

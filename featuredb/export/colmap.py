@@ -12,8 +12,8 @@ from featuredb.export.colmap_model import (
 )
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob
-from featuredb.export.tally import folder_for_each_map
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.export.tally import folder_for_any_map
+from featuredb.maps.unplaced_map import AnyMap
 
 MODEL_FOLDER = "sparse"
 DATABASE = "database.db"
@@ -28,10 +28,10 @@ def write_colmap(job: ExportJob, *, text: bool = False) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    return folder_for_each_map(job, partial(write_map, text=text))
+    return folder_for_any_map(job, partial(write_map, text=text))
 
 
-def write_map(folder: Path, feature_map: FeatureMap, *, text: bool = False) -> None:
+def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
     """One map to a new folder; see `write_colmap`."""
     model = folder / MODEL_FOLDER
     model.mkdir(parents=True)

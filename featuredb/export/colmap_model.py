@@ -1,7 +1,8 @@
 """A feature map as COLMAP holds it: a reconstruction, and the database of its keypoints and descriptors.
 
-The reconstruction's world is the map's local frame (east, north, up, metres). Ids are the map's plus one: of
-cameras, images, and points. Pixels agree as they are, the centre of the top-left pixel being (0.5, 0.5).
+The reconstruction's world is the map's local frame (east, north, up, metres), or the own frame of a map
+without a place. Ids are the map's plus one: of cameras, images, and points. Pixels agree as they are, the
+centre of the top-left pixel being (0.5, 0.5).
 """
 
 from collections import Counter
@@ -13,7 +14,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import MapImage
+from featuredb.maps.unplaced_map import AnyMap
 
 _DIAMETER_OVER_SCALE = 2.0  # OpenCV counts a keypoint's diameter, COLMAP its scale
 
@@ -35,7 +37,7 @@ class KeypointRows:
     point2d: NDArray[np.int64]
 
 
-def keypoint_rows(feature_map: FeatureMap) -> KeypointRows:
+def keypoint_rows(feature_map: AnyMap) -> KeypointRows:
     """The order of keypoints of every image."""
     seen = feature_map.observations
     index_of = {image.image_id: k for k, image in enumerate(feature_map.images)}
@@ -50,7 +52,7 @@ def keypoint_rows(feature_map: FeatureMap) -> KeypointRows:
     return KeypointRows(rows=rows, described=described, point2d=point2d)
 
 
-def image_names(feature_map: FeatureMap) -> list[str]:
+def image_names(feature_map: AnyMap) -> list[str]:
     """The images' names; COLMAP wants them unique, so what repeats goes into a folder of its image's id."""
     counts = Counter(image.name for image in feature_map.images)
     names = [
@@ -62,7 +64,7 @@ def image_names(feature_map: FeatureMap) -> list[str]:
     )
 
 
-def reconstruction_of(feature_map: FeatureMap, keypoints: KeypointRows, names: list[str]) -> Any:
+def reconstruction_of(feature_map: AnyMap, keypoints: KeypointRows, names: list[str]) -> Any:
     """The map as a pycolmap.Reconstruction: each camera a rig of its own, each image a frame.
 
     Points keep colour, track and stored reprojection error; an image that sees a point twice does so here.
@@ -84,7 +86,7 @@ def reconstruction_of(feature_map: FeatureMap, keypoints: KeypointRows, names: l
     return reconstruction
 
 
-def _add_points(reconstruction: Any, feature_map: FeatureMap, keypoints: KeypointRows) -> None:
+def _add_points(reconstruction: Any, feature_map: AnyMap, keypoints: KeypointRows) -> None:
     seen, points = feature_map.observations, feature_map.points
     order = np.lexsort((keypoints.point2d, seen.image_id, seen.point_index))
     images, rows = (seen.image_id[order] + 1).tolist(), keypoints.point2d[order].tolist()
@@ -99,9 +101,7 @@ def _add_points(reconstruction: Any, feature_map: FeatureMap, keypoints: Keypoin
         start = end
 
 
-def write_colmap_database(
-    path: Path, feature_map: FeatureMap, keypoints: KeypointRows, names: list[str]
-) -> None:
+def write_colmap_database(path: Path, feature_map: AnyMap, keypoints: KeypointRows, names: list[str]) -> None:
     """COLMAP's database of the map: cameras, rigs, images, frames, keypoints, descriptors; no matches.
 
     Keypoints have four columns: x, y, scale, orientation in radians.
@@ -123,7 +123,7 @@ def write_colmap_database(
 
 
 def _write_image(
-    database: Any, feature_map: FeatureMap, image: MapImage, rows: NDArray[np.int64], name: str
+    database: Any, feature_map: AnyMap, image: MapImage, rows: NDArray[np.int64], name: str
 ) -> None:
     image_id, seen = image.image_id + 1, feature_map.observations
     stored = pycolmap.Image(name=name, camera_id=image.camera_id + 1, image_id=image_id)
@@ -138,7 +138,7 @@ def _write_image(
     database.write_descriptors(image_id, descriptors)
 
 
-def colmap_keypoints(feature_map: FeatureMap, rows: NDArray[np.int64]) -> NDArray[np.float32]:
+def colmap_keypoints(feature_map: AnyMap, rows: NDArray[np.int64]) -> NDArray[np.float32]:
     """Of these observations (k, 4): x, y, scale, orientation in radians, as COLMAP counts them."""
     seen = feature_map.observations
     columns = (seen.xy[rows], seen.scale[rows] / _DIAMETER_OVER_SCALE, np.radians(seen.angle[rows]))

@@ -7,6 +7,7 @@ from featuredb.export.selection import licence_of
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import meridian_convergence_deg, point_scale, zone_of
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapImage
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 
 GEOREFERENCE = "georeference.json"
 FORMAT = "featuredb georeference 1"
@@ -59,33 +60,45 @@ def georeference(feature_map: FeatureMap, names: list[str]) -> dict[str, Any]:
             "pipeline": utm_pipeline(frame, epsg),
             "how": _HOW,
         },
-        "map": {
-            "id": feature_map.map_id,
-            "name": feature_map.name,
-            "status": feature_map.status,
-            "generation": feature_map.generation,
-            "parents": list(feature_map.parents),
-            "source": feature_map.source,
-            "licence": feature_map.licence,
-            "extractor_fingerprint": feature_map.extractor_fingerprint,
-            "camera_keys": list(feature_map.camera_keys),
-        },
+        "map": _map(feature_map) | {"generation": feature_map.generation},
         "placement": {
             "method": placement.method,
             "residual_rms_m": placement.residual_rms_m,
             "covariance": placement.covariance.tolist(),
             "covariance_of": "left perturbation (log scale, rotation rad, translation m) in the local frame",
         },
-        "images": [
-            _image(image, feature_map, name, seen)
-            for (image, seen), name in zip(_with_descriptors(feature_map), names, strict=True)
-        ],
+        "images": _images(feature_map, names),
     }
 
 
-def georeference_text(feature_map: FeatureMap, names: list[str]) -> str:
-    """`georeference` as the text of its file."""
-    return json.dumps(georeference(feature_map, names), indent=1, allow_nan=False) + "\n"
+def own_frame(unplaced: UnplacedMap, names: list[str]) -> dict[str, Any]:
+    """What says of a map without a place that it has none, and what `georeference` says of its photos."""
+    frame, why = unplaced.frame, unplaced.no_place
+    return {
+        "format": FORMAT,
+        "frame": {
+            "axes": "no place on Earth: "
+            + ("z up, x and y anywhere" if frame.upright else "axes in any direction")
+            + ("; metres" if frame.metric else "; units of any length"),
+            "metric": frame.metric,
+            "upright": frame.upright,
+            "origin": None,
+        },
+        "map": _map(unplaced),
+        "placement": None,
+        "no_place": {"reason_code": why.reason_code, "reason": why.reason, "ways": list(why.ways)},
+        "images": _images(unplaced, names),
+    }
+
+
+def georeference_text(feature_map: AnyMap, names: list[str]) -> str:
+    """`georeference`, or `own_frame`, as the text of its file."""
+    told = (
+        own_frame(feature_map, names)
+        if isinstance(feature_map, UnplacedMap)
+        else georeference(feature_map, names)
+    )
+    return json.dumps(told, indent=1, allow_nan=False) + "\n"
 
 
 def utm_pipeline(frame: LocalFrame, epsg: int) -> str:
@@ -99,7 +112,27 @@ def utm_pipeline(frame: LocalFrame, epsg: int) -> str:
     )
 
 
-def _with_descriptors(feature_map: FeatureMap) -> list[tuple[MapImage, int]]:
+def _map(feature_map: AnyMap) -> dict[str, Any]:
+    return {
+        "id": feature_map.map_id,
+        "name": feature_map.name,
+        "status": feature_map.status,
+        "parents": list(feature_map.parents),
+        "source": feature_map.source,
+        "licence": feature_map.licence,
+        "extractor_fingerprint": feature_map.extractor_fingerprint,
+        "camera_keys": list(feature_map.camera_keys),
+    }
+
+
+def _images(feature_map: AnyMap, names: list[str]) -> list[dict[str, Any]]:
+    return [
+        _image(image, feature_map, name, seen)
+        for (image, seen), name in zip(_with_descriptors(feature_map), names, strict=True)
+    ]
+
+
+def _with_descriptors(feature_map: AnyMap) -> list[tuple[MapImage, int]]:
     """Every image with how many of its keypoints carry a descriptor."""
     seen = feature_map.observations
     counts: dict[int, int] = {}
@@ -108,7 +141,7 @@ def _with_descriptors(feature_map: FeatureMap) -> list[tuple[MapImage, int]]:
     return [(image, counts.get(image.image_id, 0)) for image in feature_map.images]
 
 
-def _image(image: MapImage, feature_map: FeatureMap, name: str, descriptors: int) -> dict[str, Any]:
+def _image(image: MapImage, feature_map: AnyMap, name: str, descriptors: int) -> dict[str, Any]:
     return {
         "image_id": image.image_id + 1,
         "name": name,

@@ -7,13 +7,16 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
+from typing import TypeVar
 
 from featuredb.errors import ExportError
-from featuredb.export.selection import Selection, exported_maps, selected_maps
+from featuredb.export.selection import Selection, exported_any, exported_maps, selected_any, selected_maps
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.database import Database
-from featuredb.store.snapshot import MapSummary, Snapshot
+from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 
+_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 Told = Callable[[int, int], None]
 """Called with the number of maps written and their total."""
 
@@ -38,10 +41,25 @@ class ExportJob:
         """Of the selected maps, before licences; see `selected_maps`."""
         return selected_maps(self.database, self.snapshot, self.selection)
 
+    def any_summaries(self) -> list[MapSummary | UnplacedSummary]:
+        """The same for a format that keeps maps without a place, too; see `selected_any`."""
+        return selected_any(self.database, self.snapshot, self.selection)
+
     def maps(self) -> Iterator[FeatureMap]:
         """One in memory at a time, oldest first, telling progress; see `exported_maps`."""
-        total, done = len(self.summaries()), count(1)
-        for feature_map in exported_maps(self.database, self.snapshot, self.selection):
+        return self._telling(
+            exported_maps(self.database, self.snapshot, self.selection), len(self.summaries())
+        )
+
+    def any_maps(self) -> Iterator[AnyMap]:
+        """The same for a format that keeps maps without a place, too; see `exported_any`."""
+        return self._telling(
+            exported_any(self.database, self.snapshot, self.selection), len(self.any_summaries())
+        )
+
+    def _telling(self, maps: Iterator[_Kind], total: int) -> Iterator[_Kind]:
+        done = count(1)
+        for feature_map in maps:
             yield feature_map
             del feature_map  # or it would stay while the next one is loaded, as it would with `enumerate`
             self.told(next(done), total)

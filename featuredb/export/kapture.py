@@ -1,8 +1,8 @@
 """kapture 1.1: a folder for each map with sensors, poses, keypoints, descriptors, points and observations.
 
 Reference: naver/kapture, kapture_format.adoc. Its world is the map's local frame (east, north, up, metres),
-which `georeference.json` places on Earth. Poses are world to camera and pixels COLMAP's: nothing is shifted.
-Timestamps are the images' numbers, devices the map's cameras.
+which `georeference.json` places on Earth, or the own frame of a map without a place. Poses are world to
+camera and pixels COLMAP's: nothing is shifted. Timestamps are the images' numbers, devices the map's cameras.
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,10 +15,10 @@ from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attributi
 from featuredb.export.colmap_model import KeypointRows, colmap_keypoints, image_names, keypoint_rows
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob
-from featuredb.export.tally import folder_for_each_map
+from featuredb.export.tally import folder_for_any_map
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.rotation import quaternion_from_matrix
-from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 
 HEADER = "# kapture format: 1.1"
 SENSORS, RECONSTRUCTION = "sensors", "reconstruction"
@@ -32,10 +32,10 @@ def write_kapture(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    return folder_for_each_map(job, write_map)
+    return folder_for_any_map(job, write_map)
 
 
-def write_map(folder: Path, feature_map: FeatureMap) -> None:
+def write_map(folder: Path, feature_map: AnyMap) -> None:
     """One map to a new folder; see `write_kapture`."""
     names, keypoints = kapture_names(feature_map), keypoint_rows(feature_map)
     for part in (SENSORS, RECONSTRUCTION):
@@ -47,7 +47,7 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
 
 
-def kapture_names(feature_map: FeatureMap) -> list[str]:
+def kapture_names(feature_map: AnyMap) -> list[str]:
     """The images' names as kapture can have them: what tables or paths may not have is percent-encoded."""
     return ["/".join(_part(part) for part in name.split("/")) for name in image_names(feature_map)]
 
@@ -64,7 +64,7 @@ def _device(camera_id: int) -> str:
     return f"camera{camera_id}"
 
 
-def _write_sensors(folder: Path, feature_map: FeatureMap, names: Sequence[str]) -> None:
+def _write_sensors(folder: Path, feature_map: AnyMap, names: Sequence[str]) -> None:
     with_gps = [i for i in feature_map.images if i.gps is not None and i.gps.height_m is not None]
     sensors: list[Sequence[object]] = []
     for k, camera in enumerate(feature_map.cameras):
@@ -102,9 +102,7 @@ def _write_sensors(folder: Path, feature_map: FeatureMap, names: Sequence[str]) 
     _write_table(folder / "records_gnss.txt", "timestamp, device_id, x, y, z, utc, dop", gnss)
 
 
-def _write_features(
-    folder: Path, feature_map: FeatureMap, keypoints: KeypointRows, names: Sequence[str]
-) -> None:
+def _write_features(folder: Path, feature_map: AnyMap, keypoints: KeypointRows, names: Sequence[str]) -> None:
     """Keypoints x, y, scale, orientation as COLMAP has them, and descriptors: zeros where there is none."""
     points, descriptors = folder / "keypoints" / _KIND, folder / "descriptors" / _KIND
     for path in (points, descriptors):
@@ -119,9 +117,7 @@ def _write_features(
         (descriptors / f"{name}.desc").write_bytes(feature_map.observations.descriptors[rows].tobytes())
 
 
-def _write_points(
-    folder: Path, feature_map: FeatureMap, keypoints: KeypointRows, names: Sequence[str]
-) -> None:
+def _write_points(folder: Path, feature_map: AnyMap, keypoints: KeypointRows, names: Sequence[str]) -> None:
     """Points in their order, and who sees each of them."""
     points = zip(feature_map.points_local().tolist(), feature_map.points.rgb.tolist(), strict=True)
     _write_table(folder / "points3d.txt", "X, Y, Z, R, G, B", ((*xyz, *rgb) for xyz, rgb in points))

@@ -14,7 +14,8 @@ from featuredb.errors import ExportError
 from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_csv
 from featuredb.geo.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap, MapPoints
+from featuredb.maps.feature_map import FeatureMap, PointColumns
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.snapshot import MapSummary
 
 MAPS_TABLE = "maps.csv"
@@ -72,8 +73,11 @@ def zones_of(maps: list[MapSummary]) -> dict[tuple[int, str], Zone]:
     return zones
 
 
-def sigma_m(points: MapPoints) -> NDArray[np.float32]:
-    """(n,) standard deviation of each point in its worst direction, metres, relative to the map's gauge."""
+def sigma_m(points: PointColumns) -> NDArray[np.float32]:
+    """(n,) standard deviation of each point in its worst direction, relative to the map's gauge.
+
+    Metres; own units of a map without a place.
+    """
     c = points.covariance.astype(np.float64)
     matrices = c[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     largest = np.linalg.eigvalsh(matrices)[:, -1] if len(c) else np.zeros(0)
@@ -87,15 +91,18 @@ class MapList:
         self._rows: list[tuple[object, ...]] = []
         self._photos: list[Attribution] = []
 
-    def add(self, feature_map: FeatureMap, attribution: list[Attribution], file: str) -> int:
+    def add(self, feature_map: AnyMap, attribution: list[Attribution], file: str) -> int:
         """The map's number, which its points carry."""
         index = len(self._rows)
         licences = "; ".join(sorted({row.licence for row in attribution if row.licence}))
         points = len(feature_map.points)
+        place: tuple[object, object] = ("", "")
+        if isinstance(feature_map, FeatureMap):
+            place = feature_map.epsg, feature_map.height_datum
         self._rows.append(
             (
                 *(index, feature_map.map_id, feature_map.name, file if points else ""),
-                *(feature_map.epsg, feature_map.height_datum, points, licences),
+                *(*place, points, licences),
             )
         )
         self._photos.extend(attribution)

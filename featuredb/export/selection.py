@@ -1,18 +1,21 @@
 """Which maps of a snapshot are exported, and what of them: by id, status, place, SQL and licence."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
-from featuredb.errors import ExportError
+from featuredb.errors import ExportError, UnplacedMapError
 from featuredb.export.forget import forget, names_of
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapStatus
 from featuredb.maps.subset import only_images
+from featuredb.maps.unplaced_map import AnyMap, MapKind, UnplacedMap, UnplacedStatus
 from featuredb.store.database import Database
-from featuredb.store.snapshot import MapSummary, Snapshot
+from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.sql import SqlSession
 
+_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 _VERSION = re.compile(r"-v?\d+(\.\d+)*$")
 
 
@@ -31,7 +34,7 @@ class Selection:
     """
 
     maps: tuple[str, ...] = ()
-    statuses: tuple[MapStatus, ...] = ("active",)
+    statuses: tuple[MapStatus | UnplacedStatus, ...] = ("active",)
     bbox: tuple[float, float, float, float] | None = None
     where: str = ""
     licences: tuple[str, ...] | None = None
@@ -51,20 +54,51 @@ class Selection:
 
 
 def selected_maps(database: Database, snapshot: Snapshot, selection: Selection) -> list[MapSummary]:
-    """The maps that are meant, oldest first.
+    """The maps that are meant, oldest first, where they need a place.
+
+    Raises:
+        ExportError: no map is; which condition left none; or one is asked for that has no place.
+        StoreError: `where` is no condition. MapNotFoundError: an id that the snapshot does not have.
+    """
+    found = selected_any(database, snapshot, selection)
+    asked = bool(selection.maps) or "unplaced" in selection.statuses
+    placed = [m for m in found if isinstance(m, MapSummary)]
+    for summary in found if asked else ():
+        if isinstance(summary, UnplacedSummary):
+            try:
+                snapshot.get(summary.map_id)
+            except UnplacedMapError as error:
+                raise ExportError(f"{error}. Exports to {', '.join(KEEP_UNPLACED)} need none") from error
+    _some(placed, "maps with a place")
+    return placed
+
+
+KEEP_UNPLACED = ("colmap", "kapture", "ply")  # formats that have a frame of their own
+
+
+def selected_any(
+    database: Database, snapshot: Snapshot, selection: Selection
+) -> list[MapSummary | UnplacedSummary]:
+    """The maps that are meant, oldest first, with a place or without.
 
     Raises:
         ExportError: no map is; which condition left none. StoreError: `where` is no condition.
         MapNotFoundError: an id that the snapshot does not have.
     """
+    there: list[MapSummary | UnplacedSummary] = [
+        *snapshot.maps(include_retired=True),
+        *snapshot.unplaced_maps(include_retired=True),
+    ]
+    there.sort(key=lambda m: m.created_at)
     if selection.maps:
-        wanted = {snapshot.get(map_id).map_id for map_id in selection.maps}
-        found = [m for m in snapshot.maps(include_retired=True) if m.map_id in wanted]
+        wanted = {snapshot.get_any(map_id).map_id for map_id in selection.maps}
+        found = [m for m in there if m.map_id in wanted]
     else:
-        found = [m for m in snapshot.maps(include_retired=True) if m.status in selection.statuses]
+        found = [m for m in there if m.status in selection.statuses]
         _some(found, f"maps that are {' or '.join(selection.statuses)}")
     if selection.bbox is not None:
-        found = [m for m in found if _touches(m, selection.bbox)]
+        box = selection.bbox
+        found = [m for m in found if isinstance(m, MapSummary) and _touches(m, box)]
         _some(found, f"maps in {','.join(f'{v:g}' for v in selection.bbox)} (west,south,east,north)")
     if selection.where:
         with SqlSession(snapshot, database) as session:
@@ -83,9 +117,26 @@ def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) 
     Raises:
         ExportError: none is selected, or none is left by its licence.
     """
+    summaries = selected_maps(database, snapshot, selection)
+    return _some_left(
+        (licensed(snapshot.load_map(m.map_id), selection.licences) for m in summaries), selection
+    )
+
+
+def exported_any(database: Database, snapshot: Snapshot, selection: Selection) -> Iterator[AnyMap]:
+    """The same for a format that keeps maps without a place, too."""
+
+    def part(summary: MapSummary | UnplacedSummary) -> AnyMap | None:
+        if isinstance(summary, UnplacedSummary):
+            return licensed(snapshot.load_unplaced(summary.map_id), selection.licences)
+        return licensed(snapshot.load_map(summary.map_id), selection.licences)
+
+    return _some_left(map(part, selected_any(database, snapshot, selection)), selection)
+
+
+def _some_left(parts: Iterator[_Kind | None], selection: Selection) -> Iterator[_Kind]:
     left = False
-    for summary in selected_maps(database, snapshot, selection):
-        part = licensed(snapshot.load_map(summary.map_id), selection.licences)
+    for part in parts:
         if part is not None:
             left = True
             yield part
@@ -97,7 +148,7 @@ def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) 
         )
 
 
-def licence_of(image: MapImage, feature_map: FeatureMap) -> str:
+def licence_of(image: MapImage, feature_map: AnyMap) -> str:
     """The photo's licence, or that of its whole map; "" where nobody has said."""
     return image.licence or feature_map.licence
 
@@ -108,7 +159,7 @@ def licence_is(licence: str, wanted: str) -> bool:
     return bool(mine) and theirs in (mine, _VERSION.sub("", mine))
 
 
-def licensed(feature_map: FeatureMap, licences: tuple[str, ...] | None) -> FeatureMap | None:
+def licensed(feature_map: MapKind, licences: tuple[str, ...] | None) -> MapKind | None:
     """What the photos with these licences have contributed; None where that is nothing.
 
     Photos with other licences, or without, are left out, with their observations and descriptors, and with
@@ -133,12 +184,12 @@ def licensed(feature_map: FeatureMap, licences: tuple[str, ...] | None) -> Featu
     note = {"licences": sorted(licences), "photos_left_out": left_out}
     part = only_images(feature_map, kept)
     gone = names_of(i for i in feature_map.images if i.image_id not in kept) - names_of(part.images)
+    provenance = forget(feature_map.provenance, gone) | {"exported_by_licence": note}
+    if isinstance(part, UnplacedMap):
+        no_place = replace(part.no_place, evidence=forget(part.no_place.evidence, gone))
+        return replace(part, no_place=no_place, provenance=provenance)
     evidence = forget(part.placement.evidence, gone)
-    return replace(
-        part,
-        placement=replace(part.placement, evidence=evidence),
-        provenance=forget(feature_map.provenance, gone) | {"exported_by_licence": note},
-    )
+    return replace(part, placement=replace(part.placement, evidence=evidence), provenance=provenance)
 
 
 def _spelled(licence: str) -> str:
@@ -170,6 +221,6 @@ def _meet(a: tuple[float, float], b: tuple[float, float]) -> bool:
     return any(w <= e2 and w2 <= e for w, e in parts(*a) for w2, e2 in parts(*b))
 
 
-def _some(found: list[MapSummary], what: str) -> None:
+def _some(found: Sequence[object], what: str) -> None:
     if not found:
         raise ExportError(f"expected {what}, found none; `featuredb maps DB --all` lists what there is")

@@ -1,11 +1,13 @@
 """What an export has written so far, and the formats that give each map a folder."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import TypeVar
 
 from featuredb.export.attribution import folder_name
 from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 
 
 class Tally:
@@ -14,7 +16,7 @@ class Tally:
     def __init__(self) -> None:
         self._maps = self._images = self._points = self._observations = 0
 
-    def add(self, feature_map: FeatureMap, *, images: int | None = None) -> None:
+    def add(self, feature_map: AnyMap, *, images: int | None = None) -> None:
         """Count a map; `images` where not all of its photos were written."""
         self._maps += 1
         self._images += len(feature_map.images) if images is None else images
@@ -38,10 +40,23 @@ def folder_for_each_map(job: ExportJob, write: Callable[[Path, FeatureMap], None
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`; and what `write` raises.
     """
+    return _folders(job, job.maps(), write)
+
+
+def folder_for_any_map(job: ExportJob, write: Callable[[Path, AnyMap], None]) -> Exported:
+    """The same for a format that keeps maps without a place, too."""
+    return _folders(job, job.any_maps(), write)
+
+
+_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
+
+
+def _folders(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
     tally = Tally()
     with whole_or_nothing(job.out) as part:
         part.mkdir()
-        for feature_map in job.maps():
+        for feature_map in maps:
             write(part / folder_name(feature_map.map_id), feature_map)
             tally.add(feature_map)
+            del feature_map  # or it would stay while the next one is loaded
         return tally.exported(part)

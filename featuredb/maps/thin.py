@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.subset import only_points
+from featuredb.maps.unplaced_map import AnyMap, MapKind
 
 # The grid on which acceptance counts how much of a photo holds inliers.
 _GRID = 10
@@ -51,7 +51,7 @@ class ThinOptions:
             raise InvalidValueError(f"ThinOptions.max_views: expected at least 2, found {self.max_views}")
 
 
-def thin_map(feature_map: FeatureMap, options: ThinOptions | None = None) -> FeatureMap:
+def thin_map(feature_map: MapKind, options: ThinOptions | None = None) -> MapKind:
     """The map with as few described points and observations as the cover asks for.
 
     Every image sees at least `cover` described points, or as many as before. Poses, placement, parents and
@@ -73,11 +73,11 @@ def thin_map(feature_map: FeatureMap, options: ThinOptions | None = None) -> Fea
 
 
 def with_descriptors(
-    feature_map: FeatureMap,
+    feature_map: MapKind,
     described: NDArray[np.bool_],
     keep_points: bool,
     provenance: dict[str, object] | None = None,
-) -> FeatureMap:
+) -> MapKind:
     """The map with descriptors at some of its observations only.
 
     Args:
@@ -98,7 +98,7 @@ def with_descriptors(
     return only_points(replace(feature_map, observations=observations, provenance=noted), stays)
 
 
-def k_cover(feature_map: FeatureMap, cover: int) -> NDArray[np.bool_]:
+def k_cover(feature_map: AnyMap, cover: int) -> NDArray[np.bool_]:
     """Chosen points (n,): every image sees `cover` of them, or all of its described points.
 
     Args:
@@ -139,14 +139,14 @@ def k_cover(feature_map: FeatureMap, cover: int) -> NDArray[np.bool_]:
     return chosen
 
 
-def described_points_of_images(feature_map: FeatureMap) -> NDArray[np.int64]:
+def described_points_of_images(feature_map: AnyMap) -> NDArray[np.int64]:
     """How many described points each image (i,) sees."""
     _, image, _ = _sightings(feature_map)
     return np.bincount(image, minlength=len(feature_map.images)).astype(np.int64)
 
 
 def _sightings(
-    feature_map: FeatureMap,
+    feature_map: AnyMap,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Point row, image row and cell of the image's grid, once for each image that sees a described point."""
     seen = feature_map.observations
@@ -162,13 +162,13 @@ def _sightings(
     return seen.point_index[rows], image, place[:, 1] * _GRID + place[:, 0]
 
 
-def _image_rows(feature_map: FeatureMap, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
+def _image_rows(feature_map: AnyMap, image_id: NDArray[np.int32]) -> NDArray[np.int64]:
     ids = np.array([image.image_id for image in feature_map.images], dtype=np.int32)
     by_id = np.argsort(ids)
     return np.asarray(by_id[np.searchsorted(ids[by_id], image_id)], dtype=np.int64)
 
 
-def _precision(feature_map: FeatureMap) -> FloatArray:
+def _precision(feature_map: AnyMap) -> FloatArray:
     """Weight (n,) in (0, 1) of each point: a half at the median of sigma over viewing distance.
 
     A pose feels a point's error as an angle. Within a factor of two of the median the weight changes less
@@ -185,7 +185,7 @@ def _precision(feature_map: FeatureMap) -> FloatArray:
     return np.asarray(1.0 / (1.0 + angle / middle), dtype=np.float64)
 
 
-def _views(feature_map: FeatureMap) -> tuple[FloatArray, FloatArray]:
+def _views(feature_map: AnyMap) -> tuple[FloatArray, FloatArray]:
     """Unit vector (m, 3) from the point to the camera and distance (m,) of each observation, local metres."""
     seen = feature_map.observations
     centers = np.array([i.cam_from_local.center for i in feature_map.images]).reshape(-1, 3)
@@ -194,9 +194,7 @@ def _views(feature_map: FeatureMap) -> tuple[FloatArray, FloatArray]:
     return toward / distance[:, None], distance
 
 
-def _thinned_views(
-    feature_map: FeatureMap, points: NDArray[np.bool_], options: ThinOptions
-) -> NDArray[np.bool_]:
+def _thinned_views(feature_map: AnyMap, points: NDArray[np.bool_], options: ThinOptions) -> NDArray[np.bool_]:
     """Observations (m,) of the chosen points that keep their descriptor.
 
     A point with too many views keeps those that are farthest apart, and those of images that would fall below
@@ -240,12 +238,12 @@ def _farthest_first(place: FloatArray) -> NDArray[np.intp]:
     return np.array(order)
 
 
-def _described_points(feature_map: FeatureMap) -> NDArray[np.int64]:
+def _described_points(feature_map: AnyMap) -> NDArray[np.int64]:
     seen = feature_map.observations
     return np.unique(seen.point_index[seen.has_descriptor])
 
 
-def _has_any(feature_map: FeatureMap, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _has_any(feature_map: AnyMap, which: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Points (n,) with at least one observation of `which` (m,)."""
     found = np.zeros(len(feature_map.points), dtype=np.bool_)
     found[feature_map.observations.point_index[which]] = True

@@ -67,7 +67,7 @@ def test_selection_and_json(db: str, tmp_path: Path, capsys: pytest.CaptureFixtu
         (("--bbox", "-122.5,37,-122"), "expected four numbers of degrees"),
         (("--bbox", "-122.5,37,-122,38"), "expected maps in -122.5,37,-122,38"),
         (("--bbox", "1,9,2,8"), "south < north"),
-        (("--status", "gone"), "expected names of quarantined, active, retired, found 'gone'"),
+        (("--status", "gone"), "expected names of quarantined, active, retired, unplaced, found 'gone'"),
         (("--maps", "map-9"), "map-9"),
         (("--maps", "map-1", "--status", "active"), "leave out --status"),
         (("--licence", "cc0,"), "licences: expected names"),
