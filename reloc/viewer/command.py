@@ -91,6 +91,7 @@ def _run(args: argparse.Namespace) -> int:
     options = SceneOptions(
         selection=_selection(args),
         points=usual if args.points is None else args.points,
+        photos=None if args.photos is None else args.photos.absolute(),
         told=progress_of_maps(),
     )
     database = open_database(args)
@@ -116,7 +117,7 @@ def _selection(args: argparse.Namespace) -> "Selection":
     from dataclasses import replace
 
     from featuredb.cli.export import selection_of
-    from featuredb.maps.feature_map import MAP_STATUSES
+    from reloc.viewer.scene import SceneOptions
 
     chosen = selection_of(args)
-    return chosen if args.status else replace(chosen, statuses=MAP_STATUSES)
+    return chosen if args.status else replace(chosen, statuses=SceneOptions().selection.statuses)

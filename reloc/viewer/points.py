@@ -87,7 +87,7 @@ def sampled(count: int, wanted: int) -> NDArray[np.int64]:
 def map_points(points: MapPoints, epsg: int, frame: LocalFrame, wanted: int) -> DrawnPoints:
     """At most `wanted` points of a map in the place's frame."""
     rows = sampled(len(points), wanted)
-    return _drawn(near_enu_from_utm(frame, points.utm[rows], epsg), points.rgb[rows], len(points))
+    return drawn_points(near_enu_from_utm(frame, points.utm[rows], epsg), points.rgb[rows], len(points))
 
 
 def scan_points_in(
@@ -119,7 +119,7 @@ def scan_points_in(
         rgb.append(_colours(table, colour)[rows])
     places, colours = np.concatenate(utm), np.concatenate(rgb)
     mixed = sampled(len(places), len(places))
-    return _drawn(near_enu_from_utm(frame, places[mixed], scan.epsg), colours[mixed], of)
+    return drawn_points(near_enu_from_utm(frame, places[mixed], scan.epsg), colours[mixed], of)
 
 
 def _colours(table: pa.Table, names: tuple[str, ...]) -> NDArray[np.uint8]:
@@ -130,7 +130,8 @@ def _colours(table: pa.Table, names: tuple[str, ...]) -> NDArray[np.uint8]:
     return np.stack(columns * (3 // len(columns)), axis=1)
 
 
-def _drawn(enu: FloatArray, rgb: NDArray[np.uint8], of: int) -> DrawnPoints:
+def drawn_points(enu: FloatArray, rgb: NDArray[np.uint8], of: int) -> DrawnPoints:
+    """Points (n, 3) in the place's frame as they are drawn, of so many that there are."""
     origin = np.zeros(3) if len(enu) == 0 else np.round((enu.min(axis=0) + enu.max(axis=0)) / 2.0)
     return DrawnPoints(
         origin=origin,

@@ -6,18 +6,20 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from featuredb.errors import InvalidValueError
-from featuredb.export.selection import Selection, licence_is, licensed, selected_maps
+from featuredb.export.selection import Selection, licence_is, licensed, selected_any
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.maps.feature_map import MapImage
-from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.maps.feature_map import MAP_STATUSES, MapImage
+from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import ScanSummary, count_points, list_scans
 from reloc.tracking.trajectory import Trajectory
 from reloc.viewer.map_layer import coverage, describe_map, describe_photos, spot_of_map
+from reloc.viewer.own_layer import describe_own_place, own_points, picks_command
 from reloc.viewer.places import Spot, group, scan_box, spot_of
 from reloc.viewer.points import DrawnPoints, map_points, scan_points_in, shares
 from reloc.viewer.trajectories import describe_trajectory, spot_of_trajectory
@@ -32,13 +34,13 @@ class SceneOptions:
     Attributes:
         selection: of maps; of their photos where it names licences.
         points: at most so many in each place, of maps and scans together.
+        photos: folder of the photos, for the command that places a map without a place.
         told: is called with the number of maps read and their total.
     """
 
-    selection: Selection = field(
-        default_factory=lambda: Selection(statuses=("active", "quarantined", "retired"))
-    )
+    selection: Selection = field(default_factory=lambda: Selection(statuses=(*MAP_STATUSES, "unplaced")))
     points: int = DEFAULT_POINTS
+    photos: Path | None = None
     told: Callable[[int, int], None] = lambda done, total: None
 
     def __post_init__(self) -> None:
@@ -54,7 +56,7 @@ class Scene:
         document: ready for JSON; each map and scan names its part of its place's points by `buffer`.
         points: of each place, the buffers of its maps and scans one after the other.
         images: by map id and image id.
-        frames: of each place.
+        frames: of each place on Earth; maps without a place come after them, each a place of the page.
         place_of_map: row of the place, by map id.
     """
 
@@ -92,8 +94,10 @@ class _Builder:
     ) -> None:
         self._database, self._snapshot = database, snapshot
         self._trajectories, self._options = trajectories, options
-        known = snapshot.maps(include_retired=True)
-        self._maps = selected_maps(database, snapshot, options.selection) if known else []
+        known = snapshot.rows()
+        chosen = selected_any(database, snapshot, options.selection) if known else []
+        self._maps = [m for m in chosen if isinstance(m, MapSummary)]
+        self._unplaced = [m for m in chosen if isinstance(m, UnplacedSummary)]
         self._shown = {m.map_id for m in self._maps}
         self._lineages = snapshot.lineages()
         self._images: dict[tuple[str, int], MapImage] = {}
@@ -120,6 +124,8 @@ class _Builder:
             places.append(place)
             points.append(data)
             frames.append(frame)
+        for summary in self._unplaced:
+            self._add_own_place(summary, places, points)
         document = {
             "database": self._database.name,
             "snapshot": self._snapshot.version,
@@ -134,6 +140,24 @@ class _Builder:
             frames=tuple(frames),
             place_of_map=self._place_of_map,
         )
+
+    def _add_own_place(
+        self, summary: UnplacedSummary, places: list[dict[str, Any]], points: list[bytes]
+    ) -> None:
+        """A map without a place, unless no photo of it has one of the licences."""
+        unplaced = licensed(self._snapshot.load_unplaced(summary.map_id), self._options.selection.licences)
+        self._tell()
+        if unplaced is None:
+            return
+        buffers, drawn = _Buffers(), own_points(unplaced, self._options.points)
+        command = picks_command(self._database.url, summary.map_id, self._options.photos)
+        places.append(describe_own_place(summary, unplaced, drawn, buffers.add(drawn), command))
+        points.append(buffers.data())
+        self._images |= {(summary.map_id, image.image_id): image for image in unplaced.images}
+
+    def _tell(self) -> None:
+        self._read += 1
+        self._options.told(self._read, len(self._maps) + len(self._unplaced))
 
     @property
     def _is_part(self) -> bool:
@@ -194,8 +218,7 @@ class _Builder:
     ) -> tuple[dict[str, Any], DrawnPoints] | None:
         """A map and at most `wanted` of its points; None where no photo has one of the licences."""
         feature_map = licensed(self._snapshot.load_map(summary.map_id), self._options.selection.licences)
-        self._read += 1
-        self._options.told(self._read, len(self._maps))
+        self._tell()
         if feature_map is None:
             return None
         drawn = map_points(feature_map.points, feature_map.epsg, frame, wanted)

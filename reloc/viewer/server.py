@@ -163,7 +163,8 @@ def _where(scene: Scene, place: int, east: float, north: float, up: float) -> di
         HTTPException: no such place. GeodesyError, InvalidValueError: no such spot.
     """
     if not 0 <= place < len(scene.frames):
-        raise HTTPException(404, f"no place {place}")
+        own = 0 <= place < len(scene.points)
+        raise HTTPException(404, f"place {place} is no place on Earth" if own else f"no place {place}")
     frame, epsg = scene.frames[place], scene.document["places"][place]["epsg"]
     latitude, longitude, height = frame.geodetic_from_enu((east, north, up))
     easting, northing, _ = frame.utm_from_enu((east, north, up), epsg)

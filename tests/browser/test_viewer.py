@@ -16,9 +16,10 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from featuredb.store import Database
 from reloc.tracking.trajectory_read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
-from reloc.viewer.scene import build_scene
+from reloc.viewer.scene import SceneOptions, build_scene
 from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database
+from tests.support.maps import random_map, random_unplaced_map
 from tests.support.viewer import MISSING, QUERY_POSE, ViewerWorld, make_world, running_viewer
 
 pytestmark = pytest.mark.slow
@@ -372,6 +373,40 @@ def test_places_far_apart_are_shown_one_at_a_time(seen: Seen, tmp_path: Path) ->
             seen.page.wait_for_selector(f"#tree button[title='{name}']")
             seen.only("points", "photos")
             assert coloured(seen.pixels()) > 500
+
+
+def test_a_map_without_a_place_is_shown_in_its_own_frame_and_says_how_to_place_it(
+    seen: Seen, tmp_path: Path
+) -> None:
+    database = Database.create(tmp_path / "maps.db")
+    unplaced = random_unplaced_map(1)
+    database.commit_maps([random_map(2), unplaced])
+    options = SceneOptions(photos=tmp_path / "my photos")
+    scene = build_scene(database, database.snapshot(), options=options)
+    with running_viewer(database, scene) as address:
+        seen.open(address)
+        assert not seen.page.locator("#own-frame").is_visible()
+        seen.page.select_option("#place", label="random map 1, no place on Earth")
+        seen.page.wait_for_selector("#own-frame:has-text('No place on Earth')")
+        assert not seen.page.locator("#north").is_visible()
+        assert seen.page.locator("#scale-text").inner_text().endswith(" units")
+        seen.only("points", "photos")
+        assert coloured(seen.pixels()) > 500
+        seen.page.locator("#canvas").hover(position={"x": 300, "y": 200})
+        assert seen.page.locator("#readout").inner_text().endswith("units, no place on Earth")
+        seen.page.wait_for_timeout(300)  # longer than a spot on Earth would be asked for
+        assert not [request for request in seen.requests if "/api/where" in request]
+        seen.page.locator("#tree button[title=map-1]").click()
+        command = f"featuredb anchor {database.url} map-1 --photos '{tmp_path}/my photos' --page"
+        assert seen.page.locator("#place-this-map").inner_text() == command
+        assert seen.page.locator("#panel li").all_inner_texts() == ["place it by picks"]
+        assert not {"zone", "placed by"} & seen.panel().keys()
+        seen.page.locator("#panel .photos button").first.click()
+        rows = seen.panel()
+        assert float(rows["x"]) == pytest.approx(unplaced.images[0].cam_from_local.center[0], abs=1e-3)
+        assert not {"easting", "latitude", "zone"} & rows.keys()
+        seen.page.wait_for_selector("#picture .note:has-text('No picture')")
+    seen.errors[:] = [e for e in seen.errors if "404" not in e]
 
 
 def test_an_empty_database_says_so(seen: Seen, tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 /** What each colour means; docs/viewer.md says the same. */
 
-export const STATUS = { active: "#2a7d3f", quarantined: "#d98a00", retired: "#8a8f98" };
+export const STATUS = { active: "#2a7d3f", quarantined: "#d98a00", retired: "#8a8f98", unplaced: "#6b5b95" };
 export const STATE = { tracking: "#1f5fa8", relocalised: "#8e44ad", lost: "#c0392b" };
 export const SELECTED = "#d0006f";
 export const ANSWER = "#0a8f3c";

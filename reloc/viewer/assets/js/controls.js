@@ -1,7 +1,7 @@
 /** The controls on the left: view, colours, what is shown, the photo to be localised. */
 
 import { colourOfMap, generationKeys, generationName, rampStyle, SCAN, STATE, STATUS } from "viewer/colours.js";
-import { byId, check, colourDot, make } from "viewer/dom.js";
+import { byId, check, colourDot, make, unitOf } from "viewer/dom.js";
 
 const KINDS = { points: "points", photos: "photos", coverage: "coverage", tracks: "tracks" };
 const LAST_GENERATION = generationKeys.length - 1;
@@ -11,7 +11,7 @@ export class Controls {
   constructor(viewer) {
     this.viewer = viewer;
     this.kinds = Object.fromEntries(Object.keys(KINDS).map((kind) => [kind, true]));
-    this.statuses = { active: true, quarantined: true, retired: false };
+    this.statuses = { active: true, quarantined: true, retired: false, unplaced: true };
     this.generations = generationKeys.map(() => true);
     byId("view-plan").addEventListener("click", () => viewer.view("plan"));
     byId("view-space").addEventListener("click", () => viewer.view("space"));
@@ -38,7 +38,7 @@ export class Controls {
   fillPlaces(places) {
     byId("place-row").hidden = places.length < 2;
     byId("place").replaceChildren(
-      ...places.map((place, k) => make("option", { value: k }, `${place.name}: ${place.maps.length} maps`)),
+      ...places.map((place, k) => make("option", { value: k }, place.own ? place.name : `${place.name}: ${place.maps.length} maps`)),
     );
     byId("place").addEventListener("change", () => this.viewer.open(Number(byId("place").value)));
   }
@@ -80,7 +80,7 @@ export class Controls {
   showMode(mode) {
     byId("view-plan").setAttribute("aria-pressed", String(mode === "plan"));
     byId("view-space").setAttribute("aria-pressed", String(mode === "space"));
-    byId("north").hidden = mode !== "plan";
+    byId("north").hidden = mode !== "plan" || Boolean(this.viewer.place.own);
     byId("scale").hidden = mode !== "plan";
   }
 
@@ -93,7 +93,8 @@ export class Controls {
       const ramp = make("span", { class: "ramp" });
       ramp.style.background = rampStyle;
       const datum = place.height_datums.join(", ");
-      const text = ground.heights.map((h) => `${(h + place.frame.height_m).toFixed(1)} m`);
+      const base = place.frame?.height_m ?? 0;
+      const text = ground.heights.map((h) => `${(h + base).toFixed(1)} ${unitOf(place)}`);
       keys.push(ramp, make("span", { class: "ends" }, text[0], make("span", {}, datum), text[1]));
     }
     if (this.mode === "map") {

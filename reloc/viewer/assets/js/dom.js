@@ -51,3 +51,6 @@ export function metres(value) {
   if (size < 1000) return `${value.toFixed(size < 10 ? 2 : 1)} m`;
   return `${(value / 1000).toFixed(2)} km`;
 }
+
+/** What a length of a place is counted in: a map without a place may have no scale. */
+export const unitOf = (place) => (!place.own || place.own.metric ? "m" : "units");

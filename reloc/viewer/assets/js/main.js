@@ -51,6 +51,8 @@ class Viewer {
     });
     byId("scans").replaceChildren(...this.scanBoxes.map((box) => make("li", {}, box.parentElement)));
     byId("scans-section").hidden = this.scanBoxes.length === 0;
+    byId("own-frame").hidden = !this.place.own;
+    this.controls.showMode(this.stage.mode);
     this.controls.fill(this.place);
     this.player.load(this.place.trajectories);
     this.refresh();
@@ -180,7 +182,8 @@ class Viewer {
   select(pose, colour) {
     this.selected = pose;
     this.selectedCameras = new Cameras([pose], colour, 14);
-    this.selection.add(this.selectedCameras.object, ellipseOf(pose, colour));
+    this.selection.add(this.selectedCameras.object);
+    if (pose.ellipse) this.selection.add(ellipseOf(pose, colour));
     this.stage.draw();
   }
 

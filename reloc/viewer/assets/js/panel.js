@@ -20,11 +20,30 @@ export function aboutPhoto(photo, map, openMap) {
   return [
     frame,
     table([["map", link], ["owner", photo.owner], ["licence", photo.licence], ["taken", photo.time]]),
-    make("h3", {}, "Pose"),
-    placeTable(photo),
-    make("h3", {}, "Uncertainty"),
-    ...uncertainty(photo, SELECTED),
+    ...(photo.utm ? poseOnEarth(photo) : poseInOwnFrame(photo)),
     table([["camera", photo.camera]]),
+  ];
+}
+
+function poseOnEarth(photo) {
+  return [make("h3", {}, "Pose"), placeTable(photo), make("h3", {}, "Uncertainty"), ...uncertainty(photo, SELECTED)];
+}
+
+function poseInOwnFrame(photo) {
+  const axes = ["x", "y", "z"].map((axis, k) => [axis, photo.center[k].toFixed(3)]);
+  return [make("h3", {}, "Pose in the map's own frame"), make("p", { class: "bad" }, "No place on Earth"), table(axes)];
+}
+
+/** That a map has no place, why, and what would give it one. */
+function withoutPlace({ reason, ways, command }) {
+  return [
+    make("p", { class: "bad" }, "No place on Earth"),
+    make("p", {}, `It lies in a frame of its own: ${reason}.`),
+    make("h3", {}, "Place this map"),
+    make("p", {}, "Click the same spots in a photo and on the scan, in a page that this command opens:"),
+    make("code", { id: "place-this-map" }, command),
+    make("p", {}, "What else would place it:"),
+    make("ul", {}, ...ways.map((way) => make("li", {}, way))),
   ];
 }
 
@@ -56,15 +75,18 @@ export function aboutMap(map, nameOf, openMap, openPhoto) {
     photos.append(row);
   }
   const status = map.status + (map.status_reason ? `: ${map.status_reason}` : "");
-  return [
-    table([
-      ["status", status], ["placed by", map.method], ["generation", map.generation], ["lineage", map.lineage],
+  const place = map.no_place
+    ? []
+    : [["placed by", map.method], ["generation", map.generation], ["lineage", map.lineage],
       ["placed by maps", links(map.parents)],
       ["drift", map.drift_m === null ? null : `${metres(map.drift_m)} (95 %), ${budget(map)}`],
-      ["residual", metres(map.residual_rms_m)],
+      ["residual", metres(map.residual_rms_m)], ["zone", `EPSG:${map.epsg}, heights ${map.height_datum}`]];
+  return [
+    ...(map.no_place ? withoutPlace(map.no_place) : []),
+    table([
+      ["status", status], ...place,
       ["points", `${map.points.toLocaleString("en")}, ${map.buffer.count.toLocaleString("en")} drawn`],
-      ["zone", `EPSG:${map.epsg}, heights ${map.height_datum}`], ["licence", map.licence], ["source", map.source],
-      ["made", map.created_at], ["id", map.id],
+      ["licence", map.licence], ["source", map.source], ["made", map.created_at], ["id", map.id],
     ]),
     make("h3", {}, `${map.photos.length} photos`),
     photos,

@@ -1,7 +1,7 @@
 /** The pointer over the view: which photo is under it, where it is on Earth, and the scale bar. */
 
 import { where } from "viewer/data.js";
-import { byId } from "viewer/dom.js";
+import { byId, unitOf } from "viewer/dom.js";
 
 const REACH_PX = 12; // around a photo's dot
 const STILL_MS = 150; // before the server is asked where the pointer is
@@ -56,6 +56,11 @@ export class Pointing {
       return;
     }
     const [east, north] = stage.unprojectPlan(px, py);
+    const { own } = this.viewer.place;
+    if (own) {
+      byId("readout").textContent = `x ${east.toFixed(2)}, y ${north.toFixed(2)} ${unitOf(this.viewer.place)}, no place on Earth`;
+      return;
+    }
     const local = `E ${east.toFixed(2)} m, N ${north.toFixed(2)} m`;
     byId("readout").textContent = local;
     this.waiting = setTimeout(() => this.tell(local, east, north), STILL_MS);
@@ -83,6 +88,8 @@ export class Pointing {
     const power = 10 ** Math.floor(Math.log10(140 * perPixel));
     const length = [5, 2, 1].map((f) => f * power).find((l) => l <= 140 * perPixel);
     byId("scale-bar").style.width = `${length / perPixel}px`;
-    byId("scale-text").textContent = length >= 1000 ? `${length / 1000} km` : `${+length.toPrecision(1)} m`;
+    const unit = this.viewer.ground ? unitOf(this.viewer.place) : "m";
+    const far = length >= 1000 && unit === "m";
+    byId("scale-text").textContent = far ? `${length / 1000} km` : `${+length.toPrecision(1)} ${unit}`;
   }
 }

@@ -27,7 +27,7 @@ export class Tree {
     const box = make("input", { type: "checkbox", checked: true, "aria-label": `Show ${map.name || map.id}` });
     box.addEventListener("change", onToggle);
     const drift = map.drift_m === null ? "" : `, drift ${map.drift_m.toFixed(2)} m`;
-    const about = `${map.status}, generation ${map.generation}${drift}`;
+    const about = map.no_place ? "no place on Earth" : `${map.status}, generation ${map.generation}${drift}`;
     const name = make("button", { title: map.id }, map.name || map.id, make("small", {}, about));
     name.addEventListener("click", () => onSelect(map.id));
     const dot = colourDot("#000");
