@@ -33,6 +33,8 @@ class ShotOutcome:
         frames: number of them. keyframes: names of those that are photos of the ingest.
         step: between keyframes, a share of the picture's longer side.
         dropped: number of the other frames by reason, see `DROPPED`.
+        bars: left, top, right and bottom, burnt in, shares of the picture's width and height.
+        overlay_share: of the picture within the bars that logos and captions cover, painted over.
     """
 
     start_s: float
@@ -41,6 +43,8 @@ class ShotOutcome:
     keyframes: tuple[str, ...]
     step: float
     dropped: Mapping[str, int] = field(default_factory=dict)
+    bars: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    overlay_share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,6 +96,8 @@ def films_json(films: Sequence[FilmOutcome]) -> list[dict[str, Any]]:
                     "step": shot.step,
                     "keyframes": shot.keyframes,
                     "dropped": shot.dropped,
+                    "bars": shot.bars,
+                    "overlay_share": shot.overlay_share,
                 }
                 for shot in film.shots
             ],
@@ -152,7 +158,17 @@ def _kept(shot: ShotOutcome, known: Mapping[str, "PhotoOutcome"]) -> str:
         if photo is not None:
             where[f"in map {photo.map_id}" if photo.map_id else f"in none: {photo.reason_code}"] += 1
     said = ", ".join(f"{count} {text}" for text, count in where.most_common())
-    return f"{len(shot.keyframes)} keyframes" + (f" ({said})" if said else "")
+    text = f"{len(shot.keyframes)} keyframes" + (f" ({said})" if said else "")
+    if any(shot.bars):
+        text += f", bars over {1.0 - _inside(shot):.0%} of the picture"
+    if shot.overlay_share:
+        text += f", {shot.overlay_share:.1%} under logos or captions"
+    return text
+
+
+def _inside(shot: ShotOutcome) -> float:
+    left, top, right, bottom = shot.bars
+    return (1.0 - left - right) * (1.0 - top - bottom)
 
 
 def _dropped(shot: ShotOutcome) -> str:

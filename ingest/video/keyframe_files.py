@@ -6,13 +6,17 @@ from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
 from featuredb.features.exif_write import gps_directory
-from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions
+from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
 from featuredb.video.frames import open_video
 from ingest.executor import Progress
+from ingest.video.burnt_in import BurntIn, BurntInOptions, find_burnt_in, painted_over
 from ingest.video.keyframes import KeyframeChoice
 from ingest.video.positions import Position
 from ingest.workspace import atomic_file
@@ -98,3 +102,33 @@ def _jpeg(
     out = io.BytesIO()
     Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif)
     return out.getvalue()
+
+
+def clean_keyframes(
+    folder: Path, choice: KeyframeChoice, side_px: int, quality: int, options: BurntInOptions
+) -> dict[int, BurntIn]:
+    """Paint over what is burnt into the keyframes of each shot, so that no feature comes of it.
+
+    Args:
+        side_px: of the pictures that it is looked for in, and whose pixels the answer has.
+    """
+    files = [folder / keyframe_name(index) for index in choice.index]
+    pictures = [_shrunk(file, side_px) for file in files]
+    found = find_burnt_in(pictures, choice.shot, options)
+    for file, shot in zip(files, choice.shot, strict=True):
+        if found[shot].mask.any():
+            with Image.open(file) as picture:
+                rgb, exif = np.asarray(picture.convert("RGB")), picture.info["exif"]
+            size = (rgb.shape[1], rgb.shape[0])
+            mask = cv2.resize(found[shot].mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            with atomic_file(file) as target:
+                clean = Image.fromarray(painted_over(rgb, mask))
+                clean.save(target, format="JPEG", quality=quality, subsampling=0, exif=exif)
+    return found
+
+
+def _shrunk(file: Path, side_px: int) -> NDArray[np.uint8]:
+    with Image.open(file) as picture:
+        gray = np.asarray(picture.convert("L"))
+    width, height = fitted_size(gray.shape[1], gray.shape[0], side_px)
+    return np.asarray(cv2.resize(gray, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 
 
@@ -38,18 +39,9 @@ def same_scene(one: NDArray[np.uint8], other: NDArray[np.uint8], options: SceneO
     """Whether two grey frames (h, w) of one size show the same, moved and turned as may be."""
     options = options or SceneOptions()
     a, b = (extract(gray, options.features) for gray in (one, other))
-    if min(len(a.xy), len(b.xy)) < 8:
+    start, end = matched(a, b, options.max_ratio)
+    if len(start) < 8:
         return False
-    likeness = a.descriptors.astype(np.float32) @ b.descriptors.astype(np.float32).T
-    lengths = [np.linalg.norm(f.descriptors.astype(np.float32), axis=1) for f in (a, b)]
-    distance = np.sqrt(np.maximum(2.0 - 2.0 * likeness / np.outer(*lengths), 0.0))
-    best = distance.argmin(axis=1)
-    two = np.partition(distance, 1, axis=1)[:, :2]
-    mutual = distance.argmin(axis=0)[best] == np.arange(len(best))
-    rows = np.flatnonzero(mutual & (two[:, 0] < options.max_ratio * two[:, 1]))
-    if len(rows) < 8:
-        return False
-    start, end = a.xy[rows].astype(np.float64), b.xy[best[rows]].astype(np.float64)
     cv2.setRNGSeed(0)  # as in motion.py
     found, agree = cv2.estimateAffinePartial2D(
         start, end, method=cv2.RANSAC, ransacReprojThreshold=options.tolerance_rel * max(one.shape)
@@ -61,6 +53,20 @@ def same_scene(one: NDArray[np.uint8], other: NDArray[np.uint8], options: SceneO
         return False
     held = _cells(start[agree.reshape(-1) == 1], one.shape, options)
     return len(held) >= options.least_cells * len(_cells(a.xy, one.shape, options))
+
+
+def matched(one: Features, other: Features, max_ratio: float) -> tuple[FloatArray, FloatArray]:
+    """Pixels (m, 2) of both frames of features that are each other's nearest, and clearly so."""
+    if min(len(one), len(other)) < 2:
+        return np.zeros((0, 2)), np.zeros((0, 2))
+    a, b = (f.descriptors.astype(np.float32) for f in (one, other))
+    a, b = (d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-6) for d in (a, b))
+    distance = np.sqrt(np.maximum(2.0 - 2.0 * a @ b.T, 0.0))
+    best = distance.argmin(axis=1)
+    two = np.partition(distance, 1, axis=1)[:, :2]
+    mutual = distance.argmin(axis=0)[best] == np.arange(len(best))
+    rows = np.flatnonzero(mutual & (two[:, 0] < max_ratio * two[:, 1]))
+    return one.xy[rows].astype(np.float64), other.xy[best[rows]].astype(np.float64)
 
 
 def _cells(xy: FloatArray | NDArray[np.float32], shape: tuple[int, ...], options: SceneOptions) -> set[int]:

@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +15,10 @@ from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.report_films import ShotOutcome
+from ingest.video.burnt_in import BurntIn, BurntInOptions
 from ingest.video.clocks import ClockOptions, check_overlap
 from ingest.video.film_time import FilmTime
-from ingest.video.keyframe_files import Encoding, keyframe_name, write_keyframes
+from ingest.video.keyframe_files import Encoding, clean_keyframes, keyframe_name, write_keyframes
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.lag import LagOptions
 from ingest.video.motion import FrameKind, Motion, MotionOptions, measure_motion
@@ -56,6 +57,7 @@ class StillsOptions:
     clock: ClockOptions = field(default_factory=ClockOptions)
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
+    burnt_in: BurntInOptions = field(default_factory=BurntInOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,6 +142,8 @@ def make_stills(
         video=_video_options(options, options.max_side_px), quality=options.quality, unnamed=content[:16]
     )
     write_keyframes(film, folder, choice, places, encoding, progress)
+    burnt_in = clean_keyframes(folder, choice, options.motion_side_px, options.quality, options.burnt_in)
+    shots = tuple(_with_burnt_in(shot, burnt_in.get(k)) for k, shot in enumerate(shots))
     made = Stills(
         folder=folder,
         shots=shots,
@@ -161,7 +165,8 @@ def _known(folder: Path) -> Stills | None:
         return None
     record = json.loads(done.read_text(encoding="utf-8"))
     shots = tuple(
-        ShotOutcome(**{**shot, "keyframes": tuple(shot["keyframes"])}) for shot in record.pop("shots")
+        ShotOutcome(**{**shot, "keyframes": tuple(shot["keyframes"]), "bars": tuple(shot["bars"])})
+        for shot in record.pop("shots")
     )
     names = [name for shot in shots for name in shot.keyframes]
     if not all((folder / name).is_file() for name in names):
@@ -198,6 +203,12 @@ def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
             )
         )
     return tuple(shots)
+
+
+def _with_burnt_in(shot: ShotOutcome, found: BurntIn | None) -> ShotOutcome:
+    if found is None:
+        return shot
+    return replace(shot, bars=found.bar_shares, overlay_share=round(found.overlay_share, 4))
 
 
 def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
