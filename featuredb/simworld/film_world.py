@@ -14,7 +14,6 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from functools import lru_cache
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +26,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.simworld.film_frame import Exposure, draw_frame
 from featuredb.simworld.flight_path import FlightPath, PathOptions
-from featuredb.simworld.look import scene_look
-from featuredb.simworld.photograph import moving_cars
-from featuredb.simworld.raster import render
-from featuredb.simworld.scene import Faces, Scene
-from featuredb.simworld.sensor import SensorOptions, expose
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.sensor import SensorOptions
 from featuredb.simworld.texture import Image8
 from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.world import WorldOptions, town_of
@@ -44,8 +41,6 @@ FILM_FILE, TRUTH_FILE, TELEMETRY_FILE = "film.mp4", "film.json", "film.srt"
 _FORMAT = 1  # raised when the same options give other files
 _OTHER_SEED = 1000
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
-_GLITTER_HZ = 5.0  # how often the water looks new
-_BANDS = 12  # of rows, where they are not exposed at once
 _CHUNK = 4  # frames that travel to a process at a time
 
 
@@ -203,49 +198,17 @@ def read_film_truth(folder: Path) -> FilmTruth:
 
 def film_frame(options: FilmOptions, frame: int) -> Image8:
     """One frame (h, w, 3) uint8 RGB as the camera's sensor gives it."""
-    scene, path = _scene(options, options.at_home(frame)), _path(options, options.at_home(frame))
-    time_s = options.time_s(frame)
-    rng = np.random.default_rng((options.path.seed, 72, frame))
-    look = scene_look(scene, water_seed=int(time_s * _GLITTER_HZ))
-    faces = Faces.concatenate([scene.faces, moving_cars(scene, options.path.seed, time_s=time_s)])
-    light: NDArray[np.float32] = np.zeros((options.height, options.width, 3), np.float32)
-    n = options.samples
-    for k in range(n):
-        moment_s = time_s + options.shutter_s * ((k + 0.5) / n - 0.5)
-        camera = _shifted(options.camera, k, n)
-        for top, bottom, later_s in _bands(options):
-            part = _rows(camera, top, bottom)
-            pose = path.pose(moment_s + later_s)
-            rendered = render(faces, scene.ellipsoids, part, pose, look=look, supersample=1)
-            assert rendered.rgb is not None
-            light[top:bottom] += rendered.rgb
-    light *= 2.0 ** _exposure_ev(options, time_s) / n
-    sensor = replace(options.sensor, exposure_sigma_ev=0.0, white_balance_sigma=0.0)
-    return expose(np.clip(light, 0, 255).astype(np.uint8), rng, sensor)
-
-
-def _shifted(camera: Camera, k: int, n: int) -> Camera:
-    """The camera whose rays go through another part of each pixel: a rank-1 lattice over its square."""
-    shift = np.array([(k + 0.5) / n, ((k * 0.618034) + 0.5 / n) % 1.0]) - 0.5
-    f, cx, cy, *rest = camera.params
-    return replace(camera, params=(f, cx - float(shift[0]), cy - float(shift[1]), *rest))
-
-
-def _bands(options: FilmOptions) -> list[tuple[int, int, float]]:
-    """Rows (first, last + 1) that are exposed together, and how much later than the frame's middle."""
-    if options.readout_s == 0:
-        return [(0, options.height, 0.0)]
-    edges = np.linspace(0, options.height, _BANDS + 1).round().astype(int).tolist()
-    return [
-        (top, bottom, options.readout_s * (0.5 * (top + bottom) / options.height - 0.5))
-        for top, bottom in pairwise(edges)
-    ]
-
-
-def _rows(camera: Camera, top: int, bottom: int) -> Camera:
-    """The camera of some rows of the picture."""
-    f, cx, cy, *rest = camera.params
-    return replace(camera, height=bottom - top, params=(f, cx, cy - top, *rest))
+    home, time_s = options.at_home(frame), options.time_s(frame)
+    exposure = Exposure(
+        shutter_s=options.shutter_s,
+        samples=options.samples,
+        readout_s=options.readout_s,
+        ev=_exposure_ev(options, time_s),
+        sensor=options.sensor,
+    )
+    pose_at = _path(options, home).pose
+    seeds = (options.path.seed, frame)
+    return draw_frame(_scene(options, home), options.camera, pose_at, time_s, exposure, seeds)
 
 
 def _exposure_ev(options: FilmOptions, time_s: float) -> float:
