@@ -44,6 +44,8 @@ class LocaliseRequest:
             exactly.
         camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
             key lends its calibrated intrinsics.
+        film: of a film that does not name its camera, `featuredb.features.film_lens.unnamed_model`; the
+            lenses that maps have of its shots are tried.
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
         prior: where the photo may have been taken; None: anywhere in the database.
         beyond: a prior that was tried in vain; what it reaches is not tried again.
@@ -55,6 +57,7 @@ class LocaliseRequest:
     camera: Camera | None = None
     camera_prior: LensPrior | None = None
     camera_key: str | None = None
+    film: str | None = None
     exif_focal_px: float | None = None
     prior: GeoPrior | None = None
     beyond: GeoPrior | None = None

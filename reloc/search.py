@@ -207,7 +207,7 @@ def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -
 def camera_hypotheses(
     features: Features, area: Area, request: LocaliseRequest
 ) -> list[tuple[Camera, CameraSource]]:
-    """Intrinsics to try: the request's; else a map camera with the same EXIF key; else the focal is free.
+    """Intrinsics to try: the request's; else map cameras of the same key, or film; else the focal is free.
 
     Raises:
         InvalidValueError: the request's camera is of another image size.
@@ -225,6 +225,11 @@ def camera_hypotheses(
             camera = _resampled(camera, features.width, features.height)  # frames of films are made smaller
         if camera is not None:
             return [(camera, "map")]
+    if request.film:
+        of_film = area.cameras_of_film(request.film)
+        lent = [_resampled(camera, features.width, features.height) for camera in of_film]
+        if any(camera is not None for camera in lent):
+            return [(camera, "map") for camera in lent if camera is not None]
     longer = max(features.width, features.height)
     if request.exif_focal_px:
         return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]

@@ -15,6 +15,7 @@ from scipy import sparse
 
 from featuredb.errors import IncompatibleExtractorError, InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.features.film_lens import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -89,6 +90,15 @@ class Area:
                 if key and key == camera_key:
                     taken[feature_map.cameras[c]] += images[c]
         return max(taken, key=lambda camera: (len(camera.params), taken[camera]), default=None)
+
+    def cameras_of_film(self, film: str) -> list[Camera]:
+        """Intrinsics that the maps have of a film's shots, each once; `film`: `film_lens.unnamed_model`."""
+        found: dict[Camera, None] = {}
+        for feature_map in self.maps:
+            for camera, key in zip(feature_map.cameras, feature_map.camera_keys, strict=False):
+                if is_of_film(key, film):
+                    found[camera] = None
+        return list(found)
 
 
 def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> Area:

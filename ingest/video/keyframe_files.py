@@ -13,6 +13,7 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
 from featuredb.features.exif_write import gps_directory
+from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
 from featuredb.video.frames import open_video
 from ingest.executor import Progress
@@ -78,8 +79,7 @@ def _camera(info: VideoInfo, unnamed: str, shot: int) -> tuple[str, str]:
     Films that do not say theirs name themselves, so that no other film takes that lens for its own. Shots
     after the first have a lens of their own: who cuts a film may have had several cameras.
     """
-    model = info.model or unnamed
-    return info.make or "film", model if shot == 0 else f"{model} shot {shot + 1}"
+    return info.make or UNNAMED_MAKE, shot_model(info.model or unnamed, shot)
 
 
 def _jpeg(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.errors import VideoError
+from featuredb.features.film_lens import unnamed_model
 from featuredb.file_digest import file_sha256
 from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import open_video
@@ -139,7 +140,9 @@ def make_stills(
         notes += said
     places, heights = positions_at(telemetry, choice, late_s)
     encoding = Encoding(
-        video=_video_options(options, options.max_side_px), quality=options.quality, unnamed=content[:16]
+        video=_video_options(options, options.max_side_px),
+        quality=options.quality,
+        unnamed=unnamed_model(content),
     )
     write_keyframes(film, folder, choice, places, encoding, progress)
     burnt_in = clean_keyframes(folder, choice, options.motion_side_px, options.quality, options.burnt_in)

@@ -13,6 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from reloc.tracking.flow import follow
 from reloc.tracking.ground import Keyframe, Unmatched
 from reloc.tracking.landmarks import Landmarks
+from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
 from reloc.tracking.recent import RecentFrame
@@ -27,34 +28,48 @@ class FlowTrack:
         why: the last thing that went wrong, in words.
     """
 
-    def __init__(self, keyframe: Keyframe, frame: RecentFrame, camera: Camera, options: TrackOptions) -> None:
+    def __init__(
+        self,
+        keyframe: Keyframe,
+        frame: RecentFrame,
+        camera: Camera,
+        options: TrackOptions,
+        lens_rel: float = 0.0,
+    ) -> None:
         """
         Args:
             frame: the keyframe's own, at which the track begins.
-            camera: intrinsics of the frames.
+            camera: intrinsics of the frames. lens_rel: standard deviation of the logarithm of its focal
+                length, which is estimated with every pose; 0: it is given.
         """
         self.ground = keyframe.ground
         self.why = ""
-        self._camera, self._options = camera, options
+        self._given, self._options = camera, options
+        self._lens = None
+        if lens_rel > 0.0:
+            self._lens = LensWalk(camera=camera, rel=lens_rel, options=options.lens)
         self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
         self._poses: deque[tuple[float, Rigid3]] = deque([(frame.time_s, keyframe.cam_from_local)], maxlen=2)
 
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the last frame."""
+        return self._given if self._lens is None else self._lens.camera
+
     def settle(self) -> FittedPose | None:
         """The pose of the landmarks as they are; those that disagree are dropped. None: too few agree."""
-        return self._replaced(self._agreed(self.landmarks, None, self._poses[-1][1]))
+        return self._replaced(self._agreed(self.landmarks, None, self._poses[-1][1], self._poses[-1][0]))
 
     def follow(self, before: RecentFrame, now: RecentFrame) -> FittedPose | None:
         """Carry the landmarks from the last frame to the next; None where too few are found, or agree."""
         marks, last = self.landmarks, self._poses[-1][1]
         predicted = self._predicted(now.time_s)
-        step = self._camera.project(predicted.act(marks.points)) - self._camera.project(
-            last.act(marks.points)
-        )
+        step = self.camera.project(predicted.act(marks.points)) - self.camera.project(last.act(marks.points))
         guess = marks.pixels + np.where(np.isfinite(step), step, 0.0)
         pixels, good = follow(before.gray, now.gray, marks.pixels, guess, self._options.flow)
         height, width = now.gray.shape
         in_view = int(((guess >= 0) & (guess < (width, height))).all(axis=1).sum())
-        fitted = self._agreed(replace(marks, pixels=pixels), good, predicted, in_view)
+        fitted = self._agreed(replace(marks, pixels=pixels), good, predicted, now.time_s, in_view)
         if fitted is not None:
             self._poses.append((now.time_s, fitted.cam_from_local))
         return fitted
@@ -65,7 +80,7 @@ class FlowTrack:
         The guess where they are now is the track's.
         """
         fresh, pose = _landmarks_of(keyframe, then.index), self._poses[-1][1]
-        step = self._camera.project(pose.act(fresh.points)) - self._camera.project(
+        step = self.camera.project(pose.act(fresh.points)) - keyframe.camera.project(
             keyframe.cam_from_local.act(fresh.points)
         )
         usable = np.flatnonzero(np.isfinite(step).all(axis=1))
@@ -74,7 +89,7 @@ class FlowTrack:
             then.gray, now.gray, fresh.pixels, fresh.pixels + step[usable], self._options.flow
         )
         everything = self.landmarks.joined(replace(fresh, pixels=pixels).take(np.flatnonzero(good)))
-        return self._replaced(self._agreed(self._spread(everything, now.gray), None, pose))
+        return self._replaced(self._agreed(self._spread(everything, now.gray), None, pose, now.time_s))
 
     def _replaced(self, fitted: FittedPose | None) -> FittedPose | None:
         """The last frame has this pose."""
@@ -83,7 +98,12 @@ class FlowTrack:
         return fitted
 
     def _agreed(
-        self, marks: Landmarks, good: NDArray[np.bool_] | None, predicted: Rigid3, in_view: int = 0
+        self,
+        marks: Landmarks,
+        good: NDArray[np.bool_] | None,
+        predicted: Rigid3,
+        time_s: float,
+        in_view: int = 0,
     ) -> FittedPose | None:
         """The pose of the landmarks that were followed (None: all); what agrees with it stays.
 
@@ -94,7 +114,7 @@ class FlowTrack:
         if len(followed) < options.min_landmarks:
             self.why = f"{len(followed)} of {len(marks)} landmarks are found again"
             return None
-        fitted = fit_pose(self._camera, followed.pixels, followed.points, predicted, options.fit)
+        fitted = self._fitted(followed, predicted)
         agree = 0 if fitted is None else int(fitted.inlier.sum())
         if fitted is None or agree < max(options.min_landmarks, options.least_share * len(followed)):
             self.why = f"{agree} of {len(followed)} landmarks agree with a pose"
@@ -103,7 +123,20 @@ class FlowTrack:
             self.why = f"{agree} of {in_view} landmarks that should be in view agree with a pose: a cut?"
             return None
         self.landmarks = followed.take(fitted.inlier)
+        if self._lens is not None:
+            self._lens.take(fitted.focal_px, fitted.focal_rel, time_s)
         return fitted
+
+    def _fitted(self, marks: Landmarks, predicted: Rigid3) -> FittedPose | None:
+        """The pose of landmarks, with the focal length where it was not given."""
+        fit, lens = self._options.fit, self._lens
+        if lens is None:
+            return fit_pose(self._given, marks.pixels, marks.points, predicted, fit)
+        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.before_rel)
+        if lens.zooming or (fitted is not None and not lens.surprised(fitted.focal_px, fitted.focal_rel)):
+            return fitted
+        lens.zooms()
+        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.before_rel)
 
     def _predicted(self, time_s: float) -> Rigid3:
         """The last pose, moved on as it moved before."""

@@ -10,6 +10,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from reloc.pose import CameraSource
 from reloc.result import LocaliseRequest
 from reloc.tracking.options import TrackOptions
 
@@ -81,7 +82,7 @@ class Keyframe:
 
     Attributes:
         cam_from_local: pose in the ground's frame. ground: that it is of.
-        camera: intrinsics; the given ones, or estimated along.
+        camera: intrinsics; the given ones, or estimated along. camera_source: whence they come.
         pixels: (k, 2) of its inliers. points: (k, 3) that they see, metres in the ground's frame.
         rows: (k,) numbers of the points, by which they are told apart.
     """
@@ -92,6 +93,7 @@ class Keyframe:
     pixels: FloatArray
     points: FloatArray
     rows: NDArray[np.int64]
+    camera_source: CameraSource = "request"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -124,6 +124,7 @@ class MapFinder:
             pixels=pixels[best.rows],
             points=points[best.rows],
             rows=best.matches.point[best.rows].astype(np.int64),
+            camera_source=best.pose.camera_source,
         )
 
     def has(self, ground: Ground) -> bool:

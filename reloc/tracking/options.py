@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
 from reloc.options import LocaliseOptions
+from reloc.tracking.lens_walk import LensWalkOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,7 @@ class TrackOptions:
     """From frames to poses.
 
     Attributes:
+        lens: how the focal length of a lens that nobody gave is followed.
         landmarks: that are followed; more sharpen the pose as their root, and cost in proportion.
         columns, rows: of the grid over which they are spread.
         min_landmarks: that agree with a pose; fewer are a lost track. On the simulated flights the mean error
@@ -85,6 +87,7 @@ class TrackOptions:
 
     flow: FlowOptions = field(default_factory=FlowOptions)
     fit: FitOptions = field(default_factory=FitOptions)
+    lens: LensWalkOptions = field(default_factory=LensWalkOptions)
     landmarks: int = 220
     columns: int = 16
     rows: int = 9

@@ -1,4 +1,4 @@
-"""The pose of a frame from pixels of known points: Gauss-Newton with a Cauchy loss, fast enough for video."""
+"""A frame's pose, and focal length if need be, from pixels of known points: Gauss-Newton, Cauchy loss."""
 
 from dataclasses import dataclass
 
@@ -24,61 +24,84 @@ class FittedPose:
         cam_from_local: the pose.
         inlier: (n,) bool, pixels within the tolerance.
         residual_px: (n, 2) of all.
+        focal_px, focal_rel: focal length, and the standard deviation of its logarithm; 0 where it was given.
         covariance: (6, 6) of the camera's rotation about the local axes (rad) before the displacement of its
-            centre (m), as in `reloc.result`; of independent pixels, scaled by their residuals.
+            centre (m), as in `reloc.result`; of independent pixels, scaled by their residuals, and of what
+            they leave open of the focal length.
     """
 
     cam_from_local: Rigid3
     inlier: NDArray[np.bool_]
     residual_px: FloatArray
     covariance: FloatArray
+    focal_px: float
+    focal_rel: float
 
 
 def fit_pose(
-    camera: Camera, pixels: FloatArray, points: FloatArray, start: Rigid3, options: FitOptions
+    camera: Camera,
+    pixels: FloatArray,
+    points: FloatArray,
+    start: Rigid3,
+    options: FitOptions,
+    focal_rel: float = 0.0,
 ) -> FittedPose | None:
     """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
 
     Args:
         start: a pose within some degrees and a few per cent of the distance.
+        focal_rel: standard deviation of the logarithm of the camera's focal length, which is fitted, too;
+            0: it is given.
     """
     if len(pixels) < 4:
         return None
     scale = max(camera.width, camera.height) / options.reference_side_px
     seen = camera.unproject(pixels)
     focal, loss = camera.focal_px, options.loss_px * scale
-    pose = start
+    pose, zoom = start, 0.0
     depth = max(float(np.median(start.act(points)[:, 2])), 1e-6)
-    still = np.repeat([1.0, 1.0 / depth], 3)
+    still = np.array([1.0, 1.0, 1.0, *[1.0 / depth] * 3, 1.0])
+    # What was known of the focal length weighs as much as pixels that are off by half the loss's scale.
+    known_focal = (0.5 * loss / focal_rel) ** 2 if focal_rel > 0.0 else 0.0
+    count = 7 if focal_rel > 0.0 else 6
     for _ in range(options.iterations):
-        residual, jacobian = _linearised(pose, points, seen, focal)
+        residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
         squared = (residual * residual).sum(axis=0)
         known = np.isfinite(squared)
         weight = np.where(known, 1.0 / (1.0 + squared / loss**2), 0.0)
         weighted = jacobian * weight
         normal = _product(weighted, jacobian)
-        if not _is_determined(normal):
+        if not _is_determined(normal[:6, :6]):
             return None
-        step = -np.linalg.solve(normal, _product(weighted, np.where(known, residual, 0.0)[None])[:, 0])
-        pose = Rigid3.exp(step) @ pose
-        if np.abs(step * still).max() < _STILL:
+        gradient = _product(weighted, np.where(known, residual, 0.0)[None])[:, 0]
+        normal[6:, 6:] += known_focal
+        gradient[6:] += known_focal * zoom
+        step = -np.linalg.solve(normal, gradient)
+        pose = Rigid3.exp(step[:6]) @ pose
+        zoom += float(step[6]) if count == 7 else 0.0
+        if np.abs(step * still[:count]).max() < _STILL:
             break
-    residual, jacobian = _linearised(pose, points, seen, focal)
+    residual, jacobian = _linearised(pose, points, seen, focal, zoom, count)
     distance = np.hypot(*residual)
     inlier = np.asarray(distance < options.tolerance_px * scale)
     if inlier.sum() < 4:
         return None
-    variance = float((distance[inlier] ** 2).sum()) / max(2 * int(inlier.sum()) - 6, 1)
+    variance = float((distance[inlier] ** 2).sum()) / max(2 * int(inlier.sum()) - count, 1)
     agreeing = jacobian[:, :, inlier]
     normal = _product(agreeing, agreeing)
-    if not _is_determined(normal):
+    if not _is_determined(normal[:6, :6]):
         return None
-    covariance = np.asarray(np.linalg.inv(normal) * max(variance, 1e-4), dtype=np.float64)
+    normal /= max(variance, 1e-4)
+    if count == 7:
+        normal[6, 6] += 1.0 / focal_rel**2
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     return FittedPose(
         cam_from_local=pose,
         inlier=inlier,
         residual_px=np.ascontiguousarray(residual.T),
-        covariance=of_camera(pose, covariance),
+        covariance=of_camera(pose, covariance[:6, :6]),
+        focal_px=focal * float(np.exp(zoom)),
+        focal_rel=float(np.sqrt(covariance[6, 6])) if count == 7 else 0.0,
     )
 
 
@@ -100,24 +123,30 @@ def _is_determined(normal: FloatArray) -> bool:
 
 
 def _linearised(
-    pose: Rigid3, points: FloatArray, seen: FloatArray, focal: float
+    pose: Rigid3, points: FloatArray, seen: FloatArray, focal: float, zoom: float, count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals (2, n) in pixels and derivatives (6, 2, n) by the pose's left perturbation.
+    """Residuals (2, n) in pixels and derivatives (count, 2, n) by the pose's left perturbation, and the zoom.
 
     Points behind the camera have residuals of infinity and no derivatives.
+
+    Args:
+        seen: (n, 2) rays by the camera's focal length. zoom: logarithm of the true one over it.
     """
     x, y, z = pose.act(points).T
     front = z > 1e-6
     inverse = np.where(front, 1.0 / np.where(front, z, 1.0), 0.0)
     u, v = x * inverse, y * inverse
-    residual = focal * (np.stack([u, v]) - seen.T)
+    longer = focal * float(np.exp(zoom))
+    projected = longer * np.stack([u, v])
+    residual = projected - focal * seen.T
     residual[:, ~front | ~np.isfinite(seen).all(axis=1)] = np.inf
-    near, across = focal * inverse, focal * front
-    jacobian = np.zeros((6, 2, len(z)))
+    near, across = longer * inverse, longer * front
+    jacobian = np.zeros((count, 2, len(z)))
     jacobian[0, 0], jacobian[1, 0], jacobian[2, 0] = across * (-u * v), across * (1.0 + u * u), -across * v
     jacobian[3, 0], jacobian[5, 0] = near, -near * u
     jacobian[0, 1], jacobian[1, 1], jacobian[2, 1] = -across * (1.0 + v * v), across * (u * v), across * u
     jacobian[4, 1], jacobian[5, 1] = near, -near * v
+    jacobian[6:] = projected * front
     return residual, jacobian
 
 

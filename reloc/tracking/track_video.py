@@ -10,6 +10,8 @@ from pathlib import Path
 import cv2
 
 from featuredb.errors import VideoError
+from featuredb.features.film_lens import unnamed_model
+from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
 from featuredb.video.ahead import ReadAhead
 from featuredb.video.film import VideoInfo, VideoOptions
@@ -120,7 +122,7 @@ def track_video(
             video = stack.enter_context(open_video(source, settings))
             info = video.info
             lens = None if camera is None else _resized(camera, info.frame_width, info.frame_height)
-            request = _with_film(request or LocaliseRequest(), info)
+            request = _with_film(request or LocaliseRequest(), info, source)
             tracker = stack.enter_context(Tracker(finder, lens, options.track, request))
             writer = None
             if overlay is not None:
@@ -190,12 +192,19 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
         points[-1] = replace(points[-1], state="tracking")
 
 
-def _with_film(request: LocaliseRequest, info: VideoInfo) -> LocaliseRequest:
+def _with_film(request: LocaliseRequest, info: VideoInfo, source: Source) -> LocaliseRequest:
     """What is known of the frames, with what the film says of its camera where nothing else was said."""
     if request.camera_key is not None or request.exif_focal_px is not None:
         return request
     focal_px = None if info.focal_px is None else info.focal_px * info.frame_width / info.width
-    return replace(request, camera_key=info.camera_key or None, exif_focal_px=focal_px)
+    named = bool(info.camera_key or info.make or info.model)
+    film = None if named or not isinstance(source, str | Path) else _digest(Path(source))
+    return replace(request, camera_key=info.camera_key or None, film=film, exif_focal_px=focal_px)
+
+
+def _digest(film: Path) -> str | None:
+    """By which maps of a film know it; None for what is no file."""
+    return unnamed_model(file_sha256(film)) if film.is_file() else None
 
 
 def _resized(camera: Camera, width: int, height: int) -> Camera:

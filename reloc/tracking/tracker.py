@@ -100,12 +100,13 @@ class Tracker:
         """
         Args:
             finder: finds the first frame, and the track again where it was lost.
-            camera: intrinsics of the frames; None: those of the first frame that is localised.
+            camera: intrinsics of the frames; None: estimated with the poses, and anew where the track was
+                lost, since a film may be cut together of several cameras.
             request: what else is known of the first frame.
         """
         self._finder, self._options = finder, options or TrackOptions()
         self._request = replace(request or LocaliseRequest(), camera=camera)
-        self._camera = camera
+        self._given = self._camera = camera
         self._found = False
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="keyframes")
         self._ground: Ground | None = None
@@ -130,8 +131,8 @@ class Tracker:
 
     @property
     def camera(self) -> Camera | None:
-        """Intrinsics in use; None until something was localised."""
-        return self._camera
+        """Intrinsics in use, or of the last frame with a pose; None until something was localised."""
+        return self._camera if self._track is None else self._track.camera
 
     @property
     def ground(self) -> Ground | None:
@@ -231,7 +232,7 @@ class Tracker:
             state=state,
             cam_from_local=fitted.cam_from_local,
             covariance=fitted.covariance,
-            camera=self._camera,
+            camera=track.camera,
             ground=track.ground,
             inliers=len(track.landmarks),
             pixels=track.landmarks.pixels,
@@ -240,6 +241,7 @@ class Tracker:
         )
 
     def _lost(self, why: str) -> None:
+        self._camera = self.camera
         self._track, self._catching, self._why = None, None, why
 
     def _needed_from(self) -> int | None:
@@ -279,9 +281,8 @@ class Tracker:
             return track.refresh(found, since[0], now)
         if isinstance(found, FlowTrack):
             return self._caught_up(found, since)
-        self._camera = self._camera or found.camera
         self._ground, self._found, self._unconfirmed = found.ground, True, 0
-        begun = FlowTrack(found, since[0], self._camera, self._options)
+        begun = self._begun(found, since[0])
         fitted = begun.settle()
         if fitted is None:
             self._why = f"LOST: {begun.why}"
@@ -290,6 +291,15 @@ class Tracker:
             return self._caught_up(begun, since)
         self._catching = _Catching(track=begun, at=since[0], fitted=fitted)
         return self._caught_up_by(self._options.catch_up)
+
+    def _begun(self, found: Keyframe, frame: RecentFrame) -> FlowTrack:
+        """A track from a localised frame on, with a lens that is followed where nobody gave it."""
+        options = self._options
+        if self._given is not None:
+            return FlowTrack(found, frame, self._given, options)
+        self._camera = found.camera
+        lens_rel = options.lens.map_rel if found.camera_source == "map" else options.lens.estimated_rel
+        return FlowTrack(found, frame, found.camera, options, lens_rel)
 
     def _caught_up_by(self, most: int) -> FittedPose | None:
         """Carry the track that was found through `most` more frames; the pose if that is all there are.
@@ -352,11 +362,10 @@ class Tracker:
         in_frames = now.index >= self._next_keyframe - (early if few else 0)
         if not in_frames and now.time_s < self._next_keyframe_s:
             return
-        assert self._camera is not None
         if few:
             options = replace(options, keyframes=options.fine_keyframes)
         answer = self._pool.submit(
-            track.ground.match, now.gray.copy(), self._camera, fitted.cam_from_local, options
+            track.ground.match, now.gray.copy(), track.camera, fitted.cam_from_local, options
         )
         due = (now.index + options.answer_after, now.time_s + options.answer_after_s)
         self._hand_over(now.index, answer, due, slow=few)
@@ -377,7 +386,10 @@ class Tracker:
         if not self._found:
             return self._request
         # What was known of the first frame is not known of one after a loss.
-        return replace(self._request, camera=self._camera, prior=None)
+        asked = replace(self._request, camera=self._given, prior=None)
+        if self._camera is None or asked.exif_focal_px is not None:
+            return asked
+        return replace(asked, exif_focal_px=self._camera.focal_px)
 
 
 def _frames_kept(options: TrackOptions) -> int:

@@ -1,0 +1,92 @@
+"""The focal length of a film whose lens nobody gave: estimated with every frame's pose, through zooms.
+
+A lens that stands still is known better with every frame, down to a floor; one that a frame contradicts is
+zooming, and each frame has a focal length of its own until it stands still again.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensWalkOptions:
+    """How a focal length is followed; shares of it are standard deviations of its logarithm.
+
+    Attributes:
+        estimated_rel: of a lens that the first frame was localised with. map_rel: of one that the map lends.
+        floor_rel: frames share their errors, so that many do not tell more than this.
+        zoom_rel: what a zoom changes from one frame to the next; quick ones go through two to one in a
+            second, 3 % a frame.
+        surprise: times its standard deviation by which a frame's focal length may differ from what was
+            known; beyond the lens is zooming. One of sixteen thousand frames differs by more by chance, and
+            then has a pose that is less sure, no wrong one.
+        still_s: a lens that has not changed for so long is not zooming.
+    """
+
+    estimated_rel: float = 0.2
+    map_rel: float = 0.005
+    floor_rel: float = 0.001
+    zoom_rel: float = 0.03
+    surprise: float = 4.0
+    still_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.floor_rel <= self.map_rel <= self.estimated_rel:
+            raise InvalidValueError(
+                f"LensWalkOptions: expected 0 < floor_rel <= map_rel <= estimated_rel, found {self}"
+            )
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class LensWalk:
+    """A lens as the last frame has it.
+
+    Attributes:
+        camera: intrinsics. rel: how sure its focal length is. zooming: whether it may change.
+    """
+
+    camera: Camera
+    rel: float
+    options: LensWalkOptions
+    zooming: bool = False
+    _seen: deque[tuple[float, float, float]] = field(default_factory=deque)
+
+    @property
+    def before_rel(self) -> float:
+        """How sure the next frame's focal length is before it is looked at."""
+        walk = self.options.zoom_rel if self.zooming else 0.0
+        return float(np.hypot(max(self.rel, self.options.floor_rel), walk))
+
+    def surprised(self, focal_px: float, focal_rel: float) -> bool:
+        """Whether a frame's focal length contradicts what was known of it."""
+        if self.zooming:
+            return False
+        spread = np.sqrt(max(self.before_rel**2 - focal_rel**2, 1e-12))
+        return bool(abs(np.log(focal_px / self.camera.focal_px)) > self.options.surprise * spread)
+
+    def zooms(self) -> None:
+        """From now on the focal length may change."""
+        self.zooming = True
+        self._seen.clear()
+
+    def take(self, focal_px: float, focal_rel: float, time_s: float) -> None:
+        """The focal length of the frame at a time, as it was estimated."""
+        self.camera, self.rel = self.camera.with_focal(focal_px), focal_rel
+        if not self.zooming:
+            return
+        self._seen.append((time_s, float(np.log(focal_px)), focal_rel))
+        while self._seen[-1][0] - self._seen[0][0] > 2.0 * self.options.still_s:
+            self._seen.popleft()
+        if time_s - self._seen[0][0] < self.options.still_s:
+            return
+        recent = np.array([one for one in self._seen if time_s - one[0] <= self.options.still_s])
+        half = len(recent) // 2
+        change = abs(recent[:half, 1].mean() - recent[half:, 1].mean())
+        if half and change < 0.5 * self.options.surprise * recent[:, 2].mean():
+            self.zooming = False
+            self._seen.clear()
