@@ -38,14 +38,13 @@ from tools.anchor_simworld import featuredb
 from tools.figures import write_figures
 from tools.growth_common import table
 from tools.made_maps import bare_film, copied, make, photo_names
-from tools.picked import picks, read_scan, write_picks
+from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import errors, film_options
 
 _PARTS = ("descriptors", "film", "shares")
 _METHODS = ("SIFT", "SIFT upright", "KAZE upright", "ORB", "FREAK")
 _RATIO = 0.9  # of the table's matches; the curves are in the figure
 _FILM_SEED = 1
-_PICK_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,8 +121,9 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
         return [_refused("no map came of the film")], {"placed": 0}
     biggest = max(unplaced, key=lambda one: one.images)
     stills = next((default_root(Database.open(database).url) / "films").iterdir())
-    placed = placed_by_picks(database, biggest.map_id, stills, truth, world.scan, work, args.seed)
-    if not placed:
+    seen = seen_in_the_middle(database, biggest.map_id, truth)
+    cloud = read_scan(world.scan, truth.frame, truth.epsg)
+    if not place_by_picks(database, biggest.map_id, stills, seen, cloud, work, args.seed):
         return [_refused("the map was not placed by the picks of one frame")], {"placed": 0}
     snapshot = Database.open(database).snapshot()
     feature_map = snapshot.load_map(biggest.map_id)
@@ -189,21 +189,14 @@ def _refused(why: str) -> Line:
     return Line(what="film without telemetry", section="3.1.2", paper="0.4 m", ours=f"FAILED: {why}")
 
 
-def placed_by_picks(
-    database: Path, map_id: str, stills: Path, truth: FilmTruth, scan: Path, work: Path, seed: int
-) -> bool:
-    """Place the map by six picks in its middle keyframe."""
+def seen_in_the_middle(database: Path, map_id: str, truth: FilmTruth) -> Seen:
+    """The map's middle keyframe."""
     unplaced = Database.open(database).snapshot().load_unplaced(map_id)
     image = unplaced.images[len(unplaced.images) // 2].name
     pose = truth.cam_from_local[frame_of(image)]
     if pose is None:
         raise SystemExit(f"{image}: a frame that does not show the town cannot be picked in")
-    cloud = read_scan(scan, truth.frame, truth.epsg)
-    drawn = picks(cloud, truth.camera, pose, np.random.default_rng(seed), _PICK_SIGMA_PX)
-    file = write_picks(work / "picks.csv", image, *drawn)
-    words = ("anchor", str(database), map_id, "--photos", str(stills), "--picks", str(file))
-    out = ("--image", image, "--out", str(work / "anchor"), "--auto", "--quiet")
-    return featuredb(*words, *out, may_refuse=True) == 0
+    return Seen(image=image, camera=truth.camera, cam_from_local=pose)
 
 
 def frame_of(image: str) -> int:

@@ -12,11 +12,13 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from tools.anchor_simworld import featuredb
 
 # A point hides others of its cell that are farther by more than this share of the distance.
 _CELL_PX, _HIDDEN_REL = 12.0, 0.01
 _MARGIN = 0.05  # of the picture's sides: nobody picks at the rim
 _COLUMNS, _ROWS = 3, 2  # parts of the picture, in each of which one pick lies
+_SIGMA_PX = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,6 +27,15 @@ class Scan:
 
     utm: FloatArray
     local: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Seen:
+    """An image of a map with its true camera and pose, in the local frame of the scan."""
+
+    image: str
+    camera: Camera
+    cam_from_local: Rigid3
 
 
 def read_scan(path: Path, frame: LocalFrame, epsg: int) -> Scan:
@@ -61,6 +72,23 @@ def visible(scan: Scan, camera: Camera, cam_from_local: Rigid3) -> tuple[NDArray
     np.minimum.at(nearest, key, depth)
     seen = depth <= nearest[key] * (1.0 + _HIDDEN_REL)
     return rows[seen], pixels[seen]
+
+
+def place_by_picks(
+    database: Path,
+    map_id: str,
+    photos: Path,
+    seen: Seen,
+    scan: Scan,
+    work: Path,
+    seed: int,
+) -> bool:
+    """Place a map on its scan by six picks with 3 px of error in one image; whether it was placed."""
+    drawn = picks(scan, seen.camera, seen.cam_from_local, np.random.default_rng(seed), _SIGMA_PX)
+    file = write_picks(work / "picks.csv", seen.image, *drawn)
+    words = ("anchor", str(database), map_id, "--photos", str(photos), "--picks", str(file))
+    out = ("--image", seen.image, "--out", str(work / "anchor"), "--auto", "--quiet")
+    return featuredb(*words, *out, may_refuse=True) == 0
 
 
 def write_picks(path: Path, image: str, pixels: FloatArray, utm: FloatArray) -> Path:

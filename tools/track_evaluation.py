@@ -28,6 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
@@ -46,6 +47,7 @@ from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
+from reloc.tracking.trajectory import Trajectory
 from reloc.tracking.trajectory_plot import plot_png
 from tools.anchor_simworld import anchored, featuredb
 from tools.growth_common import Verdict, conclude, say, table
@@ -115,7 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         metres, degrees = errors(tracked, truth)
         results[name] = judge_film(tracked, truth, metres, degrees, overlay_hz, load)
         _draw(ax, name, truth, metres)
-        drawing = plot_png(tracked.trajectory, axis_errors(tracked, truth))
+        off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
+        drawing = plot_png(tracked.trajectory, off)
         (args.out / f"axes-{name}.png").write_bytes(drawing)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
     figure.tight_layout()
@@ -203,15 +206,17 @@ def errors(tracked: TrackedVideo, truth: FilmTruth) -> tuple[FloatArray, FloatAr
     return metres, degrees
 
 
-def axis_errors(tracked: TrackedVideo, truth: FilmTruth) -> FloatArray:
+def axis_errors(
+    trajectory: Trajectory, frame: LocalFrame, cam_from_local: Sequence[Rigid3 | None]
+) -> FloatArray:
     """(n, 6) of every frame, east-north-up: rotation (rad) before displacement (m); NaN without a pose."""
-    off = np.full((len(tracked.trajectory.points), 6), np.nan)
-    for row, point in enumerate(tracked.trajectory.points):
-        true = truth.cam_from_local[point.index]
+    off = np.full((len(trajectory.points), 6), np.nan)
+    for row, point in enumerate(trajectory.points):
+        true = cam_from_local[point.index]
         if point.pose is None or true is None:
             continue
-        center = truth.frame.enu_from_utm(point.pose.utm, point.pose.epsg)
-        grid = truth.frame.grid_from_enu(center, point.pose.epsg)
+        center = frame.enu_from_utm(point.pose.utm, point.pose.epsg)
+        grid = frame.grid_from_enu(center, point.pose.epsg)
         rotation = matrix_from_quaternion(point.pose.cam_from_utm_xyzw) @ grid
         off[row] = [*so3_log(rotation.T @ true.rotation), *(center - true.center)]
     return off

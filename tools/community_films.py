@@ -1,0 +1,175 @@
+"""A folder of films by strangers: maps of what shows the place, placed by one frame, every frame tracked.
+
+    python -m tools.community_films --work DIR [--seed N] [--reuse]
+
+1. Six simulated films without telemetry: three of one place (cuts, a title, black, a zoom, a logo, bars), one
+   of another town, two of the place that are compressed badly, one of which shows the other town in between.
+   They are drawn once and kept, with the truth of every frame in truth.json.
+2. `featuredb init`, `featuredb ingest video DB FOLDER --no-telemetry`: every shot of the place must be in a
+   map, nothing else in that map, and what is in none must have a reason in the report.
+3. `featuredb lidar add` of the place's scan (intensities only); `featuredb anchor --picks` by six picks with
+   3 px of error in one keyframe.
+4. `featuredb track` of every film, without being told a lens. A frame's errors are inside their bounds where
+   all six together are in the region that the stated covariance gives 95 %.
+
+Prints what holds, writes community_films.json. Exit code 0 if everything holds.
+"""
+
+import argparse
+import shutil
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.scan_file import write_scan
+from reloc.tracking.trajectory_read import read_trajectory_csv
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
+from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
+from tools.film_scripts import Script, six_films
+from tools.film_tracks import JudgedTrack, judge_track, track_figures
+from tools.growth_common import Verdict, conclude, say, table
+from tools.picked import place_by_picks, read_scan
+
+_TRACKED = 0.9  # of the place's frames, inside their bounds
+_WRONG_M = 1.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    inputs = (args.inputs or args.work) / f"community-{args.seed}"
+    scripts = six_films(args.seed)
+    truth = write_films(inputs / "films", scripts, args.workers)
+    write_truth(inputs / "truth.json", truth)
+    work = args.work / f"run-{args.seed}"
+    made, seconds = work / "made", 0.0
+    if not (args.reuse and made.exists()):
+        shutil.rmtree(work, ignore_errors=True)
+        seconds = _ingest(made, inputs / "films", work)
+    found = read_film_maps(made, work / "report", truth)
+    say(found.as_text())
+    verdicts = map_verdicts(found, scripts)
+    figures: dict[str, Any] = found.figures(scripts) | {"ingest_s": seconds, "placed": 0}
+    if found.of_place:
+        database = work / "placed"
+        shutil.rmtree(database, ignore_errors=True)
+        shutil.copytree(made, database)
+        placed = _placed(database, found, truth, _scan(inputs, args.seed), work, args.seed)
+        verdicts.append(Verdict(name="placed", text="by six picks in one frame", holds=placed))
+        figures["placed"] = int(placed)
+        tracks = _tracked(database, inputs / "films", work, truth) if placed else []
+        figures |= track_figures(tracks)
+        verdicts += track_verdicts(tracks)
+    write_figures(args.json, figures)
+    return conclude(args.work, f"community_films-{args.seed}", verdicts, figures)
+
+
+def map_verdicts(found: FilmMaps, scripts: Sequence[Script]) -> list[Verdict]:
+    """The lines about maps."""
+    figures = found.figures(scripts)
+    shots, mapped = figures["place_shots"], figures["shots_in_maps"]
+    foreign, silent = figures["foreign_in_maps"], figures["lost_without_reason"]
+    return [
+        Verdict(
+            name="shots of the place",
+            text=f"{mapped} of {shots} in {figures['place_maps']} maps of it, all wanted",
+            holds=mapped == shots,
+        ),
+        Verdict(
+            name="other town, titles, black",
+            text=f"{foreign} keyframes in maps of the place, none wanted",
+            holds=foreign == 0,
+        ),
+        Verdict(
+            name="lost",
+            text=f"{silent} shots or keyframes in no map and without a reason, none wanted",
+            holds=silent == 0,
+        ),
+    ]
+
+
+def track_verdicts(tracks: Sequence[JudgedTrack]) -> list[Verdict]:
+    """The lines about tracks."""
+    rows = [
+        (t.film, t.frames, len(t.metres), t.inside, t.foreign, *track_figures([t]).values()) for t in tracks
+    ]
+    head = ("film", "frames", "tracked", "inside", "foreign", *track_figures([]))
+    sys.stdout.write(table(rows, head) + "\n" if rows else "")
+    figures = track_figures(tracks)
+    largest = figures["largest_m"]
+    return [
+        Verdict(
+            name="tracked inside their bounds",
+            text=f"{figures['inside_share']:.1%} of {figures['place_frames']} frames of the place "
+            f"({figures['tracked_share']:.1%} tracked), {_TRACKED:.0%} wanted; median "
+            f"{figures['median_m']:.3f} m, 95 % {figures['p95_m']:.3f} m",
+            holds=figures["inside_share"] >= _TRACKED,
+        ),
+        Verdict(
+            name="wrong", text=f"largest {largest:.2f} m, under {_WRONG_M:g} wanted", holds=largest < _WRONG_M
+        ),
+        Verdict(
+            name="tracked elsewhere",
+            text=f"{figures['foreign_tracked']} frames that do not show the place, none wanted",
+            holds=bool(tracks) and figures["foreign_tracked"] == 0,
+        ),
+    ]
+
+
+def _ingest(database: Path, films: Path, work: Path) -> float:
+    """Seconds that the films took."""
+    featuredb("init", str(database))
+    start = time.monotonic()
+    words = ("ingest", "video", str(database), str(films), "--no-telemetry", "--quiet")
+    featuredb(*words, "--report", str(work / "report"), "--work", str(work / "stages"), may_refuse=True)
+    return time.monotonic() - start
+
+
+def _scan(inputs: Path, seed: int) -> Path:
+    """The place's scan, made once."""
+    file = inputs / "scan.laz"
+    if not file.exists():
+        part = file.with_name("scan.part.laz")
+        write_scan(part, scan_town(place_scene(seed), ScanOptions()))
+        part.rename(file)
+    return file
+
+
+def _placed(database: Path, found: FilmMaps, truth: FilmsTruth, scan: Path, work: Path, seed: int) -> bool:
+    """Place the largest map of the place."""
+    featuredb("lidar", "add", str(database), str(scan), "--quiet")
+    biggest = max(found.of_place, key=lambda one: len(one.keyframes))
+    photos, seen = keyframe_to_pick_in(biggest, work / "stages" / "films")
+    cloud = read_scan(scan, truth.frame, truth.epsg)
+    return place_by_picks(database, biggest.map_id, photos, seen, cloud, work, seed)
+
+
+def _tracked(database: Path, films: Path, work: Path, truth: FilmsTruth) -> list[JudgedTrack]:
+    tracks = []
+    for film, frames in truth.films.items():
+        out = work / "tracks" / f"{film}.csv"
+        words = ("track", str(database), str(films / film), "--out", str(out))
+        featuredb(*words, may_refuse=True)
+        tracks.append(judge_track(film, read_trajectory_csv(out), frames, truth.frame))
+    return tracks
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument(
+        "--work", type=Path, required=True, help="databases, reports and tracks are kept there"
+    )
+    parser.add_argument("--inputs", type=Path, default=None, help="keep films and scan there, not in --work")
+    parser.add_argument("--seed", type=int, default=1, help="of town, flights and picks")
+    parser.add_argument("--reuse", action="store_true", help="take the maps of the last run")
+    parser.add_argument("--workers", type=int, default=0, help="processes that draw; default: cores")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,178 @@
+"""Draws the films of scripts into a folder, and the truth of every frame into a file beside it."""
+
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.simworld.film_frame import Exposure, draw_frame
+from featuredb.simworld.flight_path import FlightPath
+from featuredb.simworld.scene import Scene
+from featuredb.simworld.texture import Image8
+from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.world import WorldOptions
+from featuredb.video.writer import VideoWriter, VideoWriterOptions
+from tools.film_scripts import HEIGHT, RATE_HZ, WIDTH, Kind, Piece, Script
+
+_FORMAT = 1  # raised when the same scripts give other films
+_OTHER_SEED = 1000
+_SAMPLES = 1
+_CHUNK = 5  # frames that travel to a process at a time
+_CARD = (38, 30, 26)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameTruth:
+    """A frame of a film.
+
+    Attributes:
+        piece, kind: what it belongs to. camera: true intrinsics; None where no camera saw it.
+        pose: cam_from_local; None where it does not show the place.
+    """
+
+    piece: int
+    kind: Kind
+    camera: Camera | None
+    pose: Rigid3 | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmsTruth:
+    """What is true of a folder of films: frames by the name of the film's file, in the place's frame."""
+
+    frame: LocalFrame
+    epsg: int
+    films: dict[str, tuple[FrameTruth, ...]]
+
+
+def write_films(folder: Path, scripts: tuple[Script, ...], workers: int = 0) -> FilmsTruth:
+    """Draw what is not there yet; a film whose script is the same is left as it is."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stamps = folder.with_suffix(".json")
+    known = json.loads(stamps.read_text(encoding="utf-8")) if stamps.is_file() else {}
+    for script in scripts:
+        stamp = f"{_FORMAT} {script.fingerprint()}"
+        file = folder / f"{script.name}.mp4"
+        if known.get(file.name) == stamp and file.is_file():
+            continue
+        quality = VideoWriterOptions(crf=script.crf, preset="veryfast")
+        with VideoWriter(file, width=WIDTH, height=HEIGHT, fps=RATE_HZ, options=quality) as writer:
+            for picture in _pictures(script, workers):
+                writer.write(picture)
+        known[file.name] = stamp
+        stamps.write_text(json.dumps(known) + "\n", encoding="utf-8")
+    town = place_scene(scripts[0].town)
+    films = {f"{s.name}.mp4": tuple(_truth(s, i) for i in range(s.frames)) for s in scripts}
+    return FilmsTruth(frame=town.frame, epsg=town.epsg, films=films)
+
+
+def write_truth(path: Path, truth: FilmsTruth) -> None:
+    """The truth as a table: a row for each frame of each film."""
+    rows: list[dict[str, Any]] = []
+    for film, frames in truth.films.items():
+        for number, one in enumerate(frames):
+            row = {"film": film, "frame": number, "shot": one.piece, "kind": one.kind}
+            if one.pose is not None:
+                row |= {"xyzw": one.pose.quaternion_xyzw.tolist(), "t_m": one.pose.translation.tolist()}
+            if one.camera is not None:
+                row["focal_px"] = one.camera.focal_px
+            rows.append(row)
+    document = {"frame": asdict(truth.frame), "epsg": truth.epsg, "frames": rows}
+    path.write_text(json.dumps(document) + "\n", encoding="utf-8")
+
+
+def film_picture(script: Script, frame: int) -> Image8:
+    """A frame (h, w, 3) uint8 RGB as it is given to the encoder."""
+    number, at = script.at(frame)
+    piece = script.pieces[number]
+    if piece.kind == "black":
+        return np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    if piece.kind == "title":
+        return _card(piece.text)
+    exposure = Exposure(samples=_SAMPLES, ev=script.ev)
+    pose_at = _path(script.town, piece).pose
+    time_s = at / RATE_HZ
+    scene = _scene(script.town, piece.kind)
+    picture = draw_frame(scene, piece.camera(at), pose_at, time_s, exposure, (piece.path.seed, at))
+    bar = round(script.bars * HEIGHT)
+    if bar:
+        picture[:bar] = picture[-bar:] = 0
+    return _with_logo(picture, bar) if script.logo else picture
+
+
+def _truth(script: Script, frame: int) -> FrameTruth:
+    number, at = script.at(frame)
+    piece = script.pieces[number]
+    camera = piece.camera(at) if piece.kind in ("place", "other") else None
+    pose = _path(script.town, piece).pose(at / RATE_HZ) if piece.kind == "place" else None
+    return FrameTruth(piece=number, kind=piece.kind, camera=camera, pose=pose)
+
+
+def place_scene(seed: int) -> Scene:
+    """The place of the scripts of a seed."""
+    return _scene(seed, "place")
+
+
+@lru_cache(maxsize=2)
+def _scene(seed: int, kind: Kind) -> Scene:
+    size = WorldOptions.short(seed).town_size_m
+    if kind == "place":
+        return make_town(seed, size_m=size)
+    return make_town(seed + _OTHER_SEED, name="other town", size_m=size, place=OTHER_TOWN_PLACE)
+
+
+@lru_cache(maxsize=8)
+def _path(town: int, piece: Piece) -> FlightPath:
+    return FlightPath(_scene(town, piece.kind), piece.path)
+
+
+def _card(text: str) -> Image8:
+    """A title card."""
+    card: Image8 = np.full((HEIGHT, WIDTH, 3), _CARD, np.uint8)
+    font, size, thick = cv2.FONT_HERSHEY_TRIPLEX, 1.8, 3
+    (wide, high), _ = cv2.getTextSize(text, font, size, thick)
+    at = ((WIDTH - wide) // 2, (HEIGHT + high) // 2)
+    cv2.putText(card, text, at, font, size, (235, 228, 210), thick, cv2.LINE_AA)
+    cv2.rectangle(card, (at[0], at[1] + 24), (at[0] + wide, at[1] + 28), (190, 150, 90), -1)
+    return card
+
+
+def _with_logo(picture: Image8, bar: int) -> Image8:
+    """The sign of a channel over the lower right corner, half transparent."""
+    drawn = picture.copy()
+    right, low = WIDTH - 30, HEIGHT - bar - 24
+    cv2.circle(drawn, (right - 150, low - 12), 20, (240, 240, 240), -1, cv2.LINE_AA)
+    cv2.circle(drawn, (right - 150, low - 12), 11, (200, 40, 40), -1, cv2.LINE_AA)
+    font = cv2.FONT_HERSHEY_DUPLEX
+    cv2.putText(drawn, "SKY TV", (right - 120, low), font, 0.95, (245, 245, 245), 2, cv2.LINE_AA)
+    return np.asarray(cv2.addWeighted(drawn, 0.75, picture, 0.25, 0.0), dtype=np.uint8)
+
+
+def _pictures(script: Script, workers: int) -> Iterator[Image8]:
+    """All frames in their order, from a pool of processes."""
+    count = workers or os.cpu_count() or 1
+    # Spawned, not forked: the caller may have threads that a fork would cut off.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
+        chunks = range(0, script.frames, _CHUNK)
+        ahead = 4 * count
+        waiting = [pool.submit(_chunk, script, first) for first in chunks[:ahead]]
+        for k in range(len(chunks)):
+            yield from waiting.pop(0).result()
+            if k + ahead < len(chunks):
+                waiting.append(pool.submit(_chunk, script, chunks[k + ahead]))
+
+
+def _chunk(script: Script, first: int) -> list[Image8]:
+    return [film_picture(script, i) for i in range(first, min(first + _CHUNK, script.frames))]
