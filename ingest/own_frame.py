@@ -10,6 +10,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap_bridge import Model
 
+# What gives a map without a place its place; for people.
+WAYS_TO_A_PLACE = (
+    "a scan and a person's hand: featuredb lidar add DB SCAN, then "
+    "featuredb anchor DB MAP --photos FOLDER --page",
+    "ground control points, three or more, each marked in two photos: featuredb register DB MAP --gcp FILE",
+    "maps with a place that show the same: featuredb grow DB",
+)
 # A frame is called upright where the standard error of its vertical is below this about both horizontal axes.
 _UPRIGHT_SIGMA_RAD = np.radians(2.0)
 _ROBUST_ROUNDS = 5

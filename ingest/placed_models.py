@@ -15,6 +15,7 @@ from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import PhotoFeatures
 from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
+from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
 from ingest.reconstruction import (
     MapMakingOptions,
@@ -36,14 +37,6 @@ _WEAKLY_TIED = (
 _ELSEWHERE = (
     "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
     "that looks like it, or their positions have one error"
-)
-
-
-_WAYS = (
-    "a scan and a person's hand: featuredb lidar add DB SCAN, then "
-    "featuredb anchor DB MAP --photos FOLDER --page",
-    "ground control points, three or more, each marked in two photos: featuredb register DB MAP --gcp FILE",
-    "maps with a place that show the same: featuredb grow DB",
 )
 
 
@@ -231,7 +224,7 @@ def _without_place(
     no_place = NoPlace(
         reason_code=component.reason_code,
         reason=component.reason,
-        ways=_WAYS,
+        ways=WAYS_TO_A_PLACE,
         evidence=component.placement.figures,
     )
     unplaced = build_unplaced_map(

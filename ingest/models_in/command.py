@@ -1,4 +1,4 @@
-"""`featuredb ingest model DB FOLDER`: a model of another program with its place on Earth as a map."""
+"""`featuredb ingest model DB FOLDER`: a model of another program as a map, with its place or without one."""
 
 import argparse
 import sys
@@ -78,6 +78,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
 def run_model(args: argparse.Namespace) -> int:
     """Import, commit, and say in a line what came of it."""
     from featuredb.cli.common import storage_options
+    from featuredb.maps.unplaced_map import UnplacedMap
     from featuredb.store import Database
     from ingest.models_in.model_map import ModelOptions, map_of_model
 
@@ -99,6 +100,13 @@ def run_model(args: argparse.Namespace) -> int:
     database = Database.create(args.db, storage_options=storage_options(args))
     result = database.commit_map(made)
     state = "committed" if result.created else "there already"
+    if isinstance(made, UnplacedMap):
+        sys.stdout.write(
+            f"map {made.map_id} ({made.name}): {state}, without a place, {len(made.images)} photos, "
+            f"{len(made.points)} points; {made.no_place.reason_code}: {made.no_place.reason}\n"
+            "  `featuredb maps` says what would give it one; named by --map it answers in its own frame\n"
+        )
+        return 0
     if made.status != "active":
         state += f", {made.status}: it was placed by maps that this database may not have"
     sys.stdout.write(

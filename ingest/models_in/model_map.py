@@ -1,4 +1,4 @@
-"""A model of another program with its place on Earth becomes a map of a database."""
+"""A model of another program becomes a map of a database, with its place on Earth or without one."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,9 +14,11 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.file_digest import file_sha256
 from featuredb.geo.datum import check_datum
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
+from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.fingerprint import digest
-from ingest.map_builder import MapIdentity, MapOptions, build_map
+from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
 from ingest.models_in.anew import DescribedAnew
 from ingest.models_in.json_values import read_json
 from ingest.models_in.place import (
@@ -67,11 +69,13 @@ class ModelOptions:
     reconstruction: int | None = field(default=None, repr=False)
 
 
-def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
+def map_of_model(folder: Path, options: ModelOptions) -> AnyMap:
     """The map of the model in a folder: of COLMAP, of OpenSfM or OpenDroneMap, or of kapture.
 
+    Without a place where nobody says it, and the photos' GPS does not.
+
     Raises:
-        IngestError: the model cannot be read, placed or described; what is missing.
+        IngestError: the model cannot be read or described, or not be where it is said to be; what is missing.
     """
     check_datum(options.height_datum)
     source = open_model(folder, options.colmap_database, options.reconstruction)
@@ -79,10 +83,10 @@ def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
     document = read_georeference(folder, source.place)
     photos = photos_of_model(source, document, options, anew=anew)
     place = place_of(source, document, photos, options)
-    if place.height_datum is not None and options.height_datum not in ("unknown", place.height_datum):
+    said = None if isinstance(place, NoPlace) else place.height_datum
+    if said is not None and options.height_datum not in ("unknown", said):
         raise IngestError(
-            f"--height-datum {options.height_datum}: {GEOREFERENCE} says that heights are "
-            f"{place.height_datum}"
+            f"--height-datum {options.height_datum}: {GEOREFERENCE} says that heights are {said}"
         )
     fingerprint = ExtractorOptions().fingerprint
     ours = document is not None and document["map"].get("extractor_fingerprint")
@@ -92,21 +96,30 @@ def map_of_model(folder: Path, options: ModelOptions) -> FeatureMap:
         features: Sequence[PhotoFeatures] = stored
         if anew:
             features = DescribedAnew(stored, [photo.path for photo in photos])
-        made = build_map(
-            source.stored.model,
-            place.placement,
-            place.frame,
-            photos,
-            features,
-            _identity(folder, source, photos, options, document),
-            MapOptions(
-                min_track_length=options.min_track_length,
-                height_datum=place.height_datum or options.height_datum,
-            ),
+        identity = _identity(folder, source, photos, options, document)
+        kept = MapOptions(
+            min_track_length=options.min_track_length, height_datum=said or options.height_datum
         )
+        made = _built(source.stored.model, place, photos, features, identity, kept)
     if made is None:
         raise IngestError(f"{folder}: no point is placed well enough: the photos' rays are parallel")
-    return _finished(made, place)
+    return made
+
+
+def _built(
+    model: Model,
+    place: Place | NoPlace,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    identity: MapIdentity,
+    options: MapOptions,
+) -> AnyMap | None:
+    """The map where it lies, or in a frame of its own; None if no point is placed well enough."""
+    if isinstance(place, NoPlace):
+        unplaced = build_unplaced_map(model, place, photos, features, identity, options)
+        return None if unplaced is None else _described(unplaced)
+    made = build_map(model, place.placement, place.frame, photos, features, identity, options)
+    return None if made is None else _finished(_described(made), place)
 
 
 def _described_anew(source: ModelSource, options: ModelOptions) -> bool:
@@ -155,7 +168,7 @@ def _names_photo(entry: Any) -> bool:
 
 def place_of(
     source: ModelSource, document: dict[str, Any] | None, photos: Sequence[Photo], options: ModelOptions
-) -> Place:
+) -> Place | NoPlace:
     """What a person states counts before the file, the file before the photos' GPS.
 
     Raises:
@@ -275,26 +288,30 @@ def _identity(
     )
 
 
-def _finished(made: FeatureMap, place: Place) -> FeatureMap:
-    """Zeros are no descriptors; the zone and the status are those of the place."""
+def _described(made: MapKind) -> MapKind:
+    """Zeros are no descriptors.
+
+    Raises:
+        IngestError: nothing is described.
+    """
     seen = made.observations
     described = seen.has_descriptor & seen.descriptors.any(axis=1)
     if not described.any():
         raise IngestError("none of the model's keypoints has a descriptor: the map could not answer anything")
+    observations = replace(
+        seen,
+        has_descriptor=described,
+        descriptors=np.where(described[:, None], seen.descriptors, np.uint8(0)),
+    )
+    return replace(made, observations=observations)
+
+
+def _finished(made: FeatureMap, place: Place) -> FeatureMap:
+    """The zone and the status are those of the place."""
     points = made.points
     if made.epsg != place.epsg:
         points = replace(points, utm=made.frame.utm_from_enu(made.points_local(), place.epsg))
-    return replace(
-        made,
-        epsg=place.epsg,
-        status=place.status,
-        points=points,
-        observations=replace(
-            seen,
-            has_descriptor=described,
-            descriptors=np.where(described[:, None], seen.descriptors, np.uint8(0)),
-        ),
-    )
+    return replace(made, epsg=place.epsg, status=place.status, points=points)
 
 
 def _plain(options: ModelOptions) -> str:

@@ -1,4 +1,4 @@
-"""Where a model lies on Earth: as its geo-reference says, as a person says, or by its photos' GPS."""
+"""Where a model lies on Earth: as its geo-reference says, as a person says, by its photos' GPS, or not."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,7 +13,9 @@ from featuredb.geo.utm import utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
+from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap_bridge import Model
+from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
 from ingest.reconstruction import gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps, similarity_closed_form
@@ -62,8 +64,10 @@ class Place:
     status: MapStatus = "active"
 
 
-def place_of_georeference(document: Mapping[str, Any]) -> Place:
+def place_of_georeference(document: Mapping[str, Any]) -> Place | NoPlace:
     """As our own export says. A map that other maps had placed comes in quarantine: they may not be here.
+
+    A map that had no place has none here.
 
     Raises:
         IngestError: not such a document.
@@ -74,6 +78,11 @@ def place_of_georeference(document: Mapping[str, Any]) -> Place:
             "away and give --epsg, --origin and --sigma"
         )
     try:
+        if document["placement"] is None:
+            why = document["no_place"]
+            return NoPlace(
+                reason_code=str(why["reason_code"]), reason=str(why["reason"]), ways=WAYS_TO_A_PLACE
+            )
         origin, placed = document["frame"]["origin"], document["placement"]
         method = placed["method"]
         if method not in MAP_METHODS:
@@ -155,12 +164,8 @@ def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float
     )
 
 
-def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place:
-    """By the GPS of the photos, with the gates of an ordinary ingest.
-
-    Raises:
-        IngestError: the placement is refused, for the reason that it says.
-    """
+def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
+    """By the GPS of the photos, with the gates of an ordinary ingest; or why they refuse it."""
     frame = local_frame_of(photos)
     positions, sigmas = gps_priors(photos, frame)
     known = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
@@ -171,9 +176,12 @@ def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place:
         or placed.covariance is None
         or frame is None
     ):
-        raise IngestError(
-            f"the model cannot be placed by its photos' GPS: {placed.reason}: {placed.message}; give --epsg, "
-            "--origin and --sigma if its coordinates are known"
+        known_place = "its coordinates, where they are known: import it with --epsg, --origin and --sigma"
+        return NoPlace(
+            reason_code=placed.reason or "TOO_FEW",
+            reason=f"the model cannot be placed by its photos' GPS: {placed.message}",
+            ways=(known_place, *WAYS_TO_A_PLACE),
+            evidence=placed.figures,
         )
     return Place(
         frame=frame,

@@ -20,6 +20,7 @@ from featuredb.features.exif_write import gps_directory
 from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from ingest.models_in.model_map import ModelOptions, map_of_model
 from ingest.models_in.place import Stated
@@ -27,6 +28,7 @@ from reloc.localise import localise
 from reloc.result import LocaliseRequest
 from tests.support import planar_map as field
 from tests.support.command_line import only_command
+from tests.support.maps import without_place
 from tests.support.scenes import indexed
 
 ORIGIN = (field.EASTING, field.NORTHING, field.HEIGHT)
@@ -137,6 +139,26 @@ def test_an_export_comes_back(tmp_path: Path, field_map: FeatureMap, text: bool)
         np.testing.assert_array_equal(mine, theirs, err_msg=name)
     assert np.linalg.norm(localised(back).center - localised(field_map).center) < 0.002
     assert map_of_model(tmp_path / "field", ModelOptions()).map_id == back.map_id
+
+
+def test_a_map_without_a_place_comes_back_without_one(
+    tmp_path: Path, field_map: FeatureMap, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unplaced = without_place(field_map)
+    write_map(tmp_path / "field", unplaced)
+    with only_command(monkeypatch, "ingest", "ingest.cli:register"):
+        assert main(["ingest", "model", str(tmp_path / "db"), str(tmp_path / "field")]) == 0
+    assert "committed, without a place, 9 photos" in capsys.readouterr().out
+    (summary,) = Database.open(tmp_path / "db").snapshot().unplaced_maps()
+    back = Database.open(tmp_path / "db").snapshot().load_unplaced(summary.map_id)
+    assert (back.no_place.reason_code, back.name) == ("TOO_FEW", field_map.name)
+    assert "featuredb grow DB" in back.no_place.ways[-1]
+    assert isinstance(back, UnplacedMap)
+    seen, was = back.observations, unplaced.observations
+    assert (len(back.points), len(seen)) == (len(unplaced.points), len(was))
+    pixels = back.cameras[0].project(back.images[0].cam_from_local.act(back.points.xyz[seen.point_index]))
+    mine = seen.image_id == back.images[0].image_id
+    assert np.abs(pixels[mine] - seen.xy[mine]).max() < 5.0  # the same model, of whatever size
 
 
 def test_a_map_that_maps_had_placed_comes_in_quarantine(tmp_path: Path, field_map: FeatureMap) -> None:

@@ -14,6 +14,7 @@ from featuredb.errors import IngestError
 from featuredb.export.opensfm import write_map
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from ingest.models_in.model_map import ModelOptions, map_of_model
 from ingest.models_in.opensfm_folder import read_opensfm
@@ -114,11 +115,13 @@ def gps_of(feature_map: FeatureMap, image: Any) -> GeoPrior:
 
 
 def test_no_accuracy_is_made_up(tmp_path: Path, field_map: FeatureMap, photos: Path) -> None:
-    """A reference alone, without GPS of photos or shots, places nothing."""
+    """A reference alone, without GPS of photos or shots, places nothing; the map is kept without a place."""
     write_map(tmp_path / "field", field_map)
     (tmp_path / "field" / "georeference.json").unlink()
-    with pytest.raises(IngestError, match="cannot be placed by its photos' GPS"):
-        map_of_model(tmp_path / "field", ModelOptions(photos=photos))
+    made = map_of_model(tmp_path / "field", ModelOptions(photos=photos))
+    assert isinstance(made, UnplacedMap)
+    assert made.no_place.reason_code == "TOO_FEW"
+    assert "--epsg, --origin and --sigma" in made.no_place.ways[0]
 
 
 # A reconstruction as OpenSfM writes it, small enough to be computed by hand; f is 0.9 of 1000 px. "a.jpg" is

@@ -42,7 +42,7 @@ function withoutPlace({ reason, ways, command }) {
     make("h3", {}, "Place this map"),
     make("p", {}, "Click the same spots in a photo and on the scan, in a page that this command opens:"),
     make("code", { id: "place-this-map" }, command),
-    make("p", {}, "What else would place it:"),
+    make("p", {}, "What would place it:"),
     make("ul", {}, ...ways.map((way) => make("li", {}, way))),
   ];
 }
