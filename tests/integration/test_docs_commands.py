@@ -23,9 +23,15 @@ from tests.support.doc_runner import CommandFailedError, PageRun, is_free, ports
 from tests.support.doc_usage import UsageError, check_usage
 
 _REAL_DATA = "needs photos or scans that are not in the repository"
+_BY_HAND = "needs a person's clicks; tools/paper.py runs the same with picks, tests/browser the page"
 _STUDY = "a study of its own world: many minutes, or hours"
 # Commands of blocks that are not run, by their beginning, and why. Their programs read their arguments.
 NOT_RUN = {
+    "featuredb ingest video film.db": _BY_HAND,
+    "featuredb lidar add film.db": _BY_HAND,
+    "featuredb anchor film.db": _BY_HAND,
+    "featuredb track film.db": _BY_HAND,
+    "featuredb localise film.db": _BY_HAND,
     "featuredb demo": "the last step of tools/check.py runs it",
     "tools/check.py": "it runs these tests",
     "pip install": "installs; the extra is looked up",
