@@ -15,10 +15,11 @@ from featuredb.export.dataset import import_dataset, read_dataset
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
+from featuredb.store.encode import content_digest
 from featuredb.store.verify import verify
 from tests.support.command_line import only_command
 from tests.support.datasets import EVERYTHING, export, files_of, map_at, varied_database
-from tests.support.maps import assert_same_map, random_map
+from tests.support.maps import assert_same_map, random_map, random_unplaced_map
 
 
 @pytest.fixture(scope="module")
@@ -275,3 +276,27 @@ def rewritten(folder: Path) -> None:
     """Make the checksums fit again."""
     (folder / "SHA256SUMS").unlink()
     write_sums(folder)
+
+
+def test_maps_without_a_place_come_back_beside_the_others(tmp_path: Path, target: Database) -> None:
+    source = Database.create(tmp_path / "source.db")
+    unplaced = random_unplaced_map(1)
+    source.commit_maps([unplaced, random_map(2)])
+    source.commit_map(random_unplaced_map(3))
+    source.retire("map-3", "blurred")
+    export(source, tmp_path / "out", Selection(statuses=("active", "unplaced", "retired")))
+    assert "maps without a place" in (tmp_path / "out" / "README.md").read_text()
+    assert import_dataset(target, tmp_path / "out", dry_run=True).created == ("map-2", "map-1", "map-3")
+    assert import_dataset(target, tmp_path / "out").created == ("map-2", "map-1", "map-3")
+    assert import_dataset(target, tmp_path / "out").created == ()
+    again = target.snapshot().load_unplaced("map-1")
+    assert content_digest(again) == content_digest(unplaced)
+    (retired,) = (m for m in target.snapshot().unplaced_maps(include_retired=True) if m.map_id == "map-3")
+    assert (retired.status, retired.status_reason) == ("retired", "blurred")
+    assert verify(target).ok
+    points = tmp_path / "out" / "own_frame" / "points.parquet"
+    pq.write_table(pq.read_table(points).slice(1), points)
+    (tmp_path / "out" / "SHA256SUMS").unlink()
+    write_sums(tmp_path / "out")
+    with pytest.raises(ExportError, match="map-1: its files do not make a map"):
+        import_dataset(Database.create(tmp_path / "third.db"), tmp_path / "out")

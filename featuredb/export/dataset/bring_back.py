@@ -6,10 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from featuredb.errors import ExportError
+from featuredb.export.dataset.own_frame import load_own, own_rows
 from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
+from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
 from featuredb.store.changes import ACTIVE, RETIRED, anchored
 from featuredb.store.database import Database
+from featuredb.store.snapshot import MapSummary, UnplacedSummary
 
 Told = Callable[[int, int], None]
 
@@ -59,20 +62,32 @@ def import_dataset(
             has been committed. ConflictError, StoreError: the store failed; the import can be run again.
     """
     rows, listed = open_dataset(folder)
-    there = {m.map_id: m for m in database.snapshot().maps(include_retired=True)}
+    own = own_rows(folder, listed)
+    if own and not dry_run:
+        database.require_newest_format("keep maps without a place")
+    rows = [*rows, *own]
+    own_ids = {row["map_id"] for row in own}
+    snapshot = database.snapshot()
+    everything: list[MapSummary | UnplacedSummary] = [
+        *snapshot.maps(include_retired=True),
+        *snapshot.unplaced_maps(include_retired=True),
+    ]
+    there = {m.map_id: m for m in everything}
     live = {map_id: m for map_id, m in there.items() if m.status != RETIRED}
     _check_rows(folder, rows, {map_id: m.content_digest for map_id, m in live.items()})
-    missing = _missing_parents(rows, {map_id: m.parents for map_id, m in live.items()})
+    missing = _missing_parents(
+        rows, {map_id: m.parents if isinstance(m, MapSummary) else () for map_id, m in live.items()}
+    )
     created: list[str] = []
     present: list[str] = []
     for done, row in enumerate(_parents_first(rows)):
         map_id = row["map_id"]
         new = map_id not in there or (map_id not in live and row["status"] != RETIRED)
         (created if new else present).append(map_id)
-        if dry_run:
-            load_map(folder, row, listed)
-        elif new:
-            _commit(database, load_map(folder, row, listed), row["status_reason"], missing.get(map_id, ()))
+        if dry_run or new:
+            found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
+            if not dry_run:
+                _commit(database, found, row["status_reason"], missing.get(map_id, ()))
         told(done + 1, len(rows))
     return Imported(
         created=tuple(created),
@@ -83,8 +98,8 @@ def import_dataset(
     )
 
 
-def _commit(database: Database, feature_map: FeatureMap, reason: str, missing: Sequence[str]) -> None:
-    if missing:
+def _commit(database: Database, feature_map: AnyMap, reason: str, missing: Sequence[str]) -> None:
+    if missing and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
         reason = f"what placed it is not here: {', '.join(missing)}"
     if feature_map.status == RETIRED and not reason:
@@ -97,11 +112,10 @@ def _check_rows(folder: Path, rows: Sequence[Row], digests: Mapping[str, str]) -
     twice = sorted(map_id for map_id, count in Counter(row["map_id"] for row in rows).items() if count > 1)
     if twice:
         raise ExportError(f"{folder}: expected different map ids, found {', '.join(twice)} more than once")
-    wrong = sorted({row["status"] for row in rows} - set(MAP_STATUSES))
+    known = dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES))
+    wrong = sorted({row["status"] for row in rows} - known.keys())
     if wrong:
-        raise ExportError(
-            f"{folder}: expected a status of {', '.join(MAP_STATUSES)}, found {', '.join(wrong)}"
-        )
+        raise ExportError(f"{folder}: expected a status of {', '.join(known)}, found {', '.join(wrong)}")
     others = [
         r["map_id"] for r in rows if digests.get(r["map_id"], r["content_digest"]) != r["content_digest"]
     ]

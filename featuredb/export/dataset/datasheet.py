@@ -7,6 +7,7 @@ from typing import Any
 
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
+from featuredb.export.dataset.own_frame import FOLDER
 from featuredb.export.dataset.picture import places_of
 from featuredb.export.dataset.sums import SUMS
 from featuredb.geo.wkt import utm_projjson
@@ -153,6 +154,8 @@ def _made(contents: Contents, description: Mapping[str, Any]) -> str:
 
 
 def _files(folder: Path, contents: Contents) -> str:
+    own = (folder / FOLDER).is_dir()
+
     def row(name: str, what: str) -> tuple[str, str, str]:
         found = sorted(folder.glob(name))
         return f"`{name}`", f"{sum(f.stat().st_size for f in found):,}", what
@@ -164,6 +167,7 @@ def _files(folder: Path, contents: Contents) -> str:
         row(f"{layout.POINTS}/*.parquet", "3D points; GeoParquet 1.1"),
         row(f"{layout.OBSERVATIONS}/*.parquet", "keypoints and descriptors; Parquet"),
         *([row(f"{layout.LIDAR}/**/*.laz", "LiDAR tiles; LAZ 1.4")] if contents.scans else []),
+        *([row(f"{FOLDER}/*.parquet", "maps without a place, own frames; Parquet")] if own else []),
         row(layout.ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
     ]
     return (

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from featuredb.errors import ExportError
 from featuredb.export.attribution import AttributionFile
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
@@ -27,6 +28,7 @@ from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
 from featuredb.export.dataset.datasheet import write_datasheet
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, wkb_of
 from featuredb.export.dataset.lidar_part import check_lidar, write_scans
+from featuredb.export.dataset.own_frame import OwnFrameFiles
 from featuredb.export.dataset.partitions import PartitionFiles
 from featuredb.export.dataset.picture import write_picture
 from featuredb.export.dataset.stac import check_stac, write_catalogue
@@ -34,8 +36,9 @@ from featuredb.export.dataset.sums import write_sums
 from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import Lineage
+from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
-from featuredb.store.snapshot import MapSummary
+from featuredb.store.snapshot import MapSummary, UnplacedSummary
 
 # Rows of maps.parquet and cameras.parquet that are kept before they are written.
 _ROWS_AT_ONCE = 256
@@ -57,10 +60,10 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         check_lidar()
     with whole_or_nothing(job.out) as folder:
         folder.mkdir()
-        contents = _write_maps(job, folder)
+        contents, own = _write_maps(job, folder)
         if with_lidar:
             contents.scans.extend(write_scans(job, contents, folder))
-        description = _description(job, contents)
+        description = _description(job, contents, own)
         layout.write_json(folder / layout.DESCRIPTION, description)
         write_picture(contents, folder / layout.PICTURE)
         write_datasheet(contents, description, folder)
@@ -68,15 +71,15 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
         write_sums(folder)
         size = size_of(folder)
     return Exported(
-        maps=len(contents.maps),
-        images=contents.total("images"),
-        points=contents.total("points"),
-        observations=contents.total("observations"),
+        maps=len(contents.maps) + len(own.rows),
+        images=contents.total("images") + own.total("images"),
+        points=contents.total("points") + own.total("points"),
+        observations=contents.total("observations") + own.total("observations"),
         bytes=size,
     )
 
 
-def _write_maps(job: ExportJob, folder: Path) -> Contents:
+def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     """All tables and the attribution, with one map in memory at a time."""
     contents, lineages = Contents(), job.snapshot.lineages()
     with (
@@ -84,8 +87,13 @@ def _write_maps(job: ExportJob, folder: Path) -> Contents:
         _RowFile(GeoFile(folder / layout.MAPS, MAPS.schema, MAPS.repeating, None), MAPS.schema) as maps,
         _RowFile(TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()), CAMERAS.schema) as cameras,
         AttributionFile(folder / layout.ATTRIBUTION) as attribution,
+        OwnFrameFiles(folder) as own,
     ):
-        for feature_map in job.maps():
+        for feature_map in job.any_maps():
+            attribution.add(feature_map)
+            if isinstance(feature_map, UnplacedMap):
+                own.add(feature_map, _unplaced(job, feature_map.map_id))
+                continue
             row = _write_rows(feature_map, job.snapshot.get(feature_map.map_id), files)
             row["lineage"] = _lineage_json(lineages[feature_map.map_id])
             entry = entry_of(feature_map, row)
@@ -93,9 +101,19 @@ def _write_maps(job: ExportJob, folder: Path) -> Contents:
             maps.add(_area_columns(entry))
             for camera in _camera_rows(feature_map):
                 cameras.add(camera)
-            attribution.add(feature_map)
             del feature_map  # before the next one is loaded
-    return contents
+    if not contents.maps:
+        job.summaries()  # names what has no place
+        raise ExportError(
+            "a dataset says where maps lie: expected one with a place in the selection, found none"
+        )
+    return contents, own
+
+
+def _unplaced(job: ExportJob, map_id: str) -> UnplacedSummary:
+    summary = job.snapshot.get_any(map_id)
+    assert isinstance(summary, UnplacedSummary)
+    return summary
 
 
 def _write_rows(feature_map: FeatureMap, summary: MapSummary, files: PartitionFiles) -> dict[str, Any]:
@@ -176,7 +194,7 @@ def _lineage_json(lineage: Lineage) -> str:
     return json.dumps(document, sort_keys=True)
 
 
-def _description(job: ExportJob, contents: Contents) -> dict[str, Any]:
+def _description(job: ExportJob, contents: Contents, own: OwnFrameFiles) -> dict[str, Any]:
     """What `dataset.json` says, and the datasheet and the catalogue are made of."""
     chosen = job.selection
     return {
@@ -195,6 +213,7 @@ def _description(job: ExportJob, contents: Contents) -> dict[str, Any]:
         },
         **{name: contents.total(name) for name in ("images", "points", "observations", "descriptors")},
         "maps": len(contents.maps),
+        **({"maps_without_a_place": len(own.rows)} if own.rows else {}),
         "scans": len(contents.scans),
         "bbox": list(contents.bbox()),
     }

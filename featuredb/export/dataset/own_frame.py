@@ -1,0 +1,107 @@
+"""Maps without a place in a dataset: rows as the store has them, in a folder of their own.
+
+They have no coordinates on Earth, so neither GeoParquet nor the catalogue has room for them.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+import pyarrow.parquet as pq
+
+from featuredb.errors import ExportError, FeatureDbError
+from featuredb.export.dataset.geoparquet import TableFile
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.store.decode import decode_map
+from featuredb.store.encode import content_digest, encode_map
+from featuredb.store.snapshot import UnplacedSummary
+from featuredb.store.tables import IMAGES, MAPS, OBSERVATIONS, POINTS, SPECS
+
+FOLDER = "own_frame"
+_CHILDREN = (IMAGES, POINTS, OBSERVATIONS)
+
+
+def table_path(table: str) -> str:
+    """Where a table's rows are in the dataset."""
+    return f"{FOLDER}/{table}.parquet"
+
+
+class OwnFrameFiles:
+    """Writes maps without a place one after the other; use it in a `with` block. No map, no folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._open: dict[str, TableFile] = {}
+        self.rows: list[dict[str, Any]] = []
+
+    def add(self, unplaced: UnplacedMap, summary: UnplacedSummary) -> None:
+        """A map; a row group has rows of one map only."""
+        encoded = encode_map(unplaced, "", summary.created_at)
+        row = encoded.row | {"status_reason": summary.status_reason}
+        self.rows.append(row)
+        tables = {MAPS: pa.Table.from_pylist([row], schema=SPECS[MAPS].schema), **encoded.children}
+        for table, rows in tables.items():
+            if table not in self._open:
+                path = self._folder / table_path(table)
+                self._open[table] = TableFile(path, SPECS[table].schema, ("map_id",))
+            if len(rows):
+                self._open[table].write(rows.cast(SPECS[table].schema))
+
+    def total(self, column: str) -> int:
+        """Sum of `images`, `points`, `observations` or `descriptors`."""
+        return sum(int(row[column]) for row in self.rows)
+
+    def __enter__(self) -> "OwnFrameFiles":
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        for file in self._open.values():
+            file.close()
+
+
+def own_rows(folder: Path, listed: frozenset[str]) -> list[dict[str, Any]]:
+    """What is known of the maps without a place, by the store's columns; none where the dataset has none.
+
+    Args:
+        listed: files that SHA256SUMS vouches for.
+
+    Raises:
+        ExportError: the table cannot be read.
+    """
+    if table_path(MAPS) not in listed:
+        return []
+    return list(_read(folder / table_path(MAPS)).to_pylist())
+
+
+def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> UnplacedMap:
+    """One map without a place.
+
+    Raises:
+        ExportError: its rows cannot be read, or are not the map that was exported.
+    """
+    map_id = row["map_id"]
+    missing = [table_path(table) for table in _CHILDREN if table_path(table) not in listed]
+    if missing:
+        raise ExportError(f"{folder}: SHA256SUMS does not list {missing[0]}, which has rows; copy it again")
+    only = ds.field("map_id") == map_id
+    try:
+        found = decode_map(
+            dict(row), {table: _read(folder / table_path(table), only).to_batches() for table in _CHILDREN}
+        )
+    except FeatureDbError as error:
+        raise ExportError(f"{folder}, map {map_id}: its files do not make a map ({error})") from error
+    if not isinstance(found, UnplacedMap) or content_digest(found) != row["content_digest"]:
+        raise ExportError(
+            f"{folder}, map {map_id}: the files hold another map than the one that was exported (its digest "
+            f"was {row['content_digest']}); get the dataset once more from its source"
+        )
+    return found
+
+
+def _read(path: Path, only: ds.Expression | None = None) -> pa.Table:
+    try:
+        return pq.read_table(path, filters=only, use_threads=False, partitioning=None)
+    except (OSError, pa.ArrowException, KeyError) as error:
+        raise ExportError(f"{path}: expected a table of a dataset, cannot read it ({error})") from error
