@@ -7,7 +7,7 @@ believe it. It keeps its id, and what could not be taken along stays a map witho
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -125,7 +125,7 @@ def _place(
             return Refused(reason=scan.reason, message=scan.message, rows=(), gates=gates)
     try:
         database.commit_maps(
-            [feature_map, *_rest(unplaced, feature_map, grown)],
+            [feature_map, *left_over(unplaced, feature_map, grown.left_out)],
             replaces=(summary.map_id,),
             based_on={summary.map_id: summary.write_id},
         )
@@ -189,8 +189,14 @@ def _matchable(feature_map: FeatureMap) -> FeatureMap:
     return replace(feature_map, observations=replace(seen, has_descriptor=real))
 
 
-def _rest(unplaced: UnplacedMap, placed: FeatureMap, grown: GrownMap) -> list[UnplacedMap]:
-    """What was not taken along, where it is a map still: a map without a place, under an id of its own."""
+def left_over(
+    unplaced: UnplacedMap, placed: FeatureMap, left_out: Mapping[int, tuple[str, str]]
+) -> list[UnplacedMap]:
+    """What was not taken along, where it is a map still: a map without a place, under an id of its own.
+
+    Args:
+        left_out: why photos of the map, by row, are not in the placed one: code and message.
+    """
     taken = {image.name for image in placed.images}
     left = [image for image in unplaced.images if image.name not in taken]
     if len(left) < _LEAST_PHOTOS:
@@ -198,7 +204,7 @@ def _rest(unplaced: UnplacedMap, placed: FeatureMap, grown: GrownMap) -> list[Un
     rest = only_images(unplaced, [image.image_id for image in left])
     if not len(rest.points):
         return []
-    said = Counter(grown.left_out.values()).most_common(1)
+    said = Counter(left_out.values()).most_common(1)
     code, why = said[0][0] if said else ("DRIFT_BUDGET", "they may be further off than the budget of drift")
     reason = f"left out when map {unplaced.map_id} was placed by {', '.join(placed.parents)}: {why}"
     key = digest(unplaced.map_id, *sorted(image.sha256 or image.name for image in left))[:12]

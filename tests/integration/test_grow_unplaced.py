@@ -7,13 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from featuredb.geometry.sim3 import Sim3
+from featuredb.maps.feature_map import Placement
+from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from ingest.growth.grow import grow
-from ingest.growth.place_unplaced import PlaceUnplacedOptions, place_unplaced_maps
+from ingest.growth.place_unplaced import PlaceUnplacedOptions, left_over, place_unplaced_maps
 from ingest.growth.run_record import no_photos
 from ingest.map_builder import MapOptions, build_unplaced_map
+from ingest.register.place_map import placed_map
 from reloc.localiser import Localiser
 from tests.support.growth_box import DESCRIPTORS, FRAME, KEY, POINTS, existing, walk
 from tests.support.new_photos import identity, take_photos
@@ -67,6 +71,21 @@ def test_a_map_without_a_place_is_placed_by_one_that_shows_the_same(
     assert seen.descriptors[seen.has_descriptor].any(axis=1).all()
     database.rollback(before)
     assert content_digest(database.snapshot().load_unplaced("loose")) == content_digest(unplaced)
+
+
+def test_photos_that_are_not_taken_along_stay_a_map_without_a_place() -> None:
+    unplaced = _unplaced("loose", range(4))
+    here = Placement(
+        method="map", local_from_sfm=Sim3.identity(), covariance=np.eye(7) * 1e-6, residual_rms_m=0.0
+    )
+    whole = replace(placed_map(unplaced, here, FRAME, "unknown"), parents=("old",))
+    (rest,) = left_over(unplaced, only_images(whole, [0]), {1: ("CONTRADICTS", "it lies elsewhere")})
+    assert [image.name for image in rest.images] == [f"new-{k}.jpg" for k in (1, 2, 3)]
+    assert rest.map_id.startswith("loose-")
+    assert rest.no_place.reason_code == "CONTRADICTS"
+    assert "placed by old: it lies elsewhere" in rest.no_place.reason
+    assert rest.no_place.ways == ("picks",)
+    assert left_over(unplaced, only_images(whole, [0, 1]), {}) == []  # two photos are no map
 
 
 def test_what_the_gates_refuse_stays_without_a_place(database: Database, tmp_path: Path) -> None:
