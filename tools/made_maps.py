@@ -109,7 +109,7 @@ def bare_film(film: Path, folder: Path) -> Path:
 
 def copied(folder: Path, names: Sequence[str], target: Path, *, strip: bool) -> Path:
     """Copies of photos, without positions where `strip` says so; the pictures stay bit for bit."""
-    target.mkdir(parents=True)
+    target.mkdir(parents=True, exist_ok=True)
     for name in names:
         data = (folder / name).read_bytes()
         (target / name).write_bytes(without_position(data) if strip else data)

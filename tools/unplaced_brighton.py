@@ -32,7 +32,7 @@ from tools.anchor_brighton import read_poses
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
 from tools.made_maps import copied, make, photo_names
-from tools.picked import picks, read_scan, write_picks
+from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
@@ -60,24 +60,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
         (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
         for number in range(args.draws):
-            rng = np.random.default_rng((args.seed, number))
-            image = str(rng.choice([name for name in names if name in poses]))
-            drawn = picks(scan, camera, poses[image], rng, args.sigma_px)
-            file = write_picks(work / f"picks-{number}.csv", image, *drawn)
-            database = work / "placed"
-            shutil.rmtree(database, ignore_errors=True)
-            shutil.copytree(work / "db", database)
-            words = ("anchor", str(database), summary.map_id, "--photos", str(photos), "--picks", str(file))
-            out = ("--image", image, "--out", str(work / f"anchor-{number}"), "--auto", "--quiet")
-            if featuredb(*words, *out, may_refuse=True) != 0:
-                sys.stdout.write(f"draw {number}, {image}: refused\n")
-                continue
-            placed.append(judged(database, work / "asked", args.held_out, frame, poses))
-            sys.stdout.write(f"draw {number}, {image}: {placed[-1]}\n")
-    figures |= {"maps": made.maps, "largest": made.largest} | summed(placed, args.draws)
+            done = work / f"draw-{number}.json"
+            if not done.exists():
+                judgement = _draw(args, number, work, summary.map_id, scan, camera, frame, poses)
+                done.write_text(json.dumps(judgement), encoding="utf-8")
+            one = json.loads(done.read_text(encoding="utf-8"))
+            sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
+            placed += [one] if one else []
+    figures |= {"maps": made.maps, "largest": made.largest}
+    figures |= summed(placed, args.draws)
     sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
     return 0 if holds(figures) else 1
+
+
+def _draw(
+    args: argparse.Namespace,
+    number: int,
+    work: Path,
+    map_id: str,
+    scan: Scan,
+    camera: Camera,
+    frame: LocalFrame,
+    poses: dict[str, Rigid3],
+) -> dict[str, float] | None:
+    """Place a copy of the map by the picks of one draw: errors of the held-out photos, or None: refused."""
+    rng = np.random.default_rng((args.seed, number))
+    photos = work / "photos"
+    image = str(rng.choice([name for name in photo_names(photos) if name in poses]))
+    drawn = picks(scan, camera, poses[image], rng, args.sigma_px)
+    file = write_picks(work / f"picks-{number}.csv", image, *drawn)
+    database = work / "placed"
+    shutil.rmtree(database, ignore_errors=True)
+    shutil.copytree(work / "db", database)
+    words = ("anchor", str(database), map_id, "--photos", str(photos), "--picks", str(file))
+    out = ("--image", image, "--out", str(work / f"anchor-{number}"), "--auto", "--quiet")
+    if featuredb(*words, *out, may_refuse=True) != 0:
+        return None
+    return judged(database, work / "asked", args.held_out, frame, poses)
 
 
 def camera_of(document: dict[str, dict[str, object]]) -> Camera:
@@ -132,7 +152,12 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--sigma-px", type=float, default=3.0, help="of a pick, each axis")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--work", type=Path, default=None, help="keep databases and reports there")
+    parser.add_argument(
+        "--work",
+        type=Path,
+        default=None,
+        help="keep databases and reports there; a run that was stopped goes on with the next draw",
+    )
     add_json_option(parser)
     return parser.parse_args(argv)
 
