@@ -9,6 +9,8 @@ from featuredb.errors import ExportError, MissingExtraError
 
 if TYPE_CHECKING:
     from featuredb.export.selection import Selection
+    from reloc.viewer.placing import PlacingPages
+    from reloc.viewer.scene import Scene
 
 _MODULES = ("fastapi", "uvicorn")
 
@@ -104,8 +106,26 @@ def _run(args: argparse.Namespace) -> int:
     from reloc.viewer.serve import serve
     from reloc.viewer.server import create_app
 
-    serve(create_app(scene, pictures, Queries(database, scene)), args.port, browser=not args.no_browser)
+    pages = _placing_pages(scene, database.url, args)
+    try:
+        app = create_app(scene, pictures, Queries(database, scene), pages)
+        serve(app, args.port, browser=not args.no_browser, path="" if pages is None else f"#{pages.key}")
+    finally:
+        if pages is not None:
+            pages.close()
     return 0
+
+
+def _placing_pages(scene: "Scene", url: str, args: argparse.Namespace) -> "PlacingPages | None":
+    """Where maps without a place can be placed from the page: the newest ones, by photos that are there."""
+    from reloc.viewer.placing import PlacingPages, anchor_command
+
+    if args.photos is None or args.as_of is not None or args.storage_option:
+        return None
+    unplaced = [m["id"] for place in scene.document["places"] if place.get("own") for m in place["maps"]]
+    if not unplaced:
+        return None
+    return PlacingPages({m: anchor_command(url, m, args.photos.absolute()) for m in unplaced})
 
 
 def _selection(args: argparse.Namespace) -> "Selection":

@@ -1,8 +1,8 @@
 """The page and its data over HTTP, to this machine only.
 
 The socket is bound to 127.0.0.1. A web page from elsewhere, open in the same browser, could still send
-requests here: names that lead to 127.0.0.1 are refused by the Host header, and a photo is taken only with a
-media type that a browser does not send to another site unasked.
+requests here: names that lead to 127.0.0.1 are refused by the Host header, and a photo is taken, or a page
+opened on which a map is placed, only with a media type that a browser does not send to another site unasked.
 """
 
 import asyncio
@@ -24,12 +24,14 @@ from starlette.responses import JSONResponse
 from featuredb.errors import FeatureDbError, GeodesyError, InvalidValueError, ServiceError
 from reloc.viewer.page import assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
+from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import LIMITS, Queries
 from reloc.viewer.scene import Scene
 from reloc.wire import ErrorCode
 
 HOST = "127.0.0.1"
 PHOTO_TYPE = "application/octet-stream"
+KEY_HEADER = "X-Featuredb-Key"
 _STATUS = {
     ErrorCode.BAD_REQUEST.value: 400,
     ErrorCode.BAD_IMAGE.value: 415,
@@ -44,17 +46,20 @@ class ViewerStartError(FeatureDbError):
     """The viewer cannot listen."""
 
 
-def create_app(scene: Scene, pictures: Pictures, queries: Queries) -> FastAPI:
+def create_app(
+    scene: Scene, pictures: Pictures, queries: Queries, pages: PlacingPages | None = None
+) -> FastAPI:
     """The application.
 
     Args:
         queries: answers photos that are dropped on the page.
+        pages: on which maps are placed; None: the page shows the command only.
     """
     app = FastAPI(title="featuredb viewer", docs_url=None, redoc_url=None, openapi_url=None)
     # Pictures and queries are decoded beside the event loop; a query takes its own turn inside.
     threads = ThreadPoolExecutor(4, thread_name_prefix="viewer")
     files, html, policy = assets(), page(), content_policy()
-    document = {**scene.document, "queries": True}
+    document = {**scene.document, "queries": True, "placing": pages is not None}
 
     async def in_thread(work: Callable[[], Any]) -> Any:
         return await asyncio.get_running_loop().run_in_executor(threads, work)
@@ -97,6 +102,14 @@ def create_app(scene: Scene, pictures: Pictures, queries: Queries) -> FastAPI:
     async def query(request: Request, exif_prior: bool = False) -> Response:
         photo = await _photo(request)
         return JSONResponse(await in_thread(partial(queries.ask, photo, exif_prior=exif_prior)))
+
+    @app.post("/api/place")
+    async def place(request: Request, map: str) -> Response:
+        _check_type(request)
+        key = request.headers.get(KEY_HEADER, "")
+        if pages is None:
+            raise HTTPException(404, "no folder of photos was given (--photos FOLDER)")
+        return JSONResponse({"url": await in_thread(partial(pages.open, map, key))})
 
     _add_failures(app)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[HOST, "localhost"], www_redirect=False)
@@ -145,15 +158,20 @@ async def _photo(request: Request) -> bytes:
     Raises:
         HTTPException: another media type, or too large.
     """
-    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if found != PHOTO_TYPE:
-        raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
+    _check_type(request)
     data = bytearray()
     async for part in request.stream():
         data += part
         if len(data) > LIMITS.max_bytes:
             raise HTTPException(413, f"the photo has more than {LIMITS.max_bytes} bytes")
     return bytes(data)
+
+
+def _check_type(request: Request) -> None:
+    """Refuse what a browser would send for another site unasked."""
+    found = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if found != PHOTO_TYPE:
+        raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
 
 
 def _where(scene: Scene, place: int, east: float, north: float, up: float) -> dict[str, Any]:

@@ -19,6 +19,7 @@ from featuredb.store import Database
 from reloc.tracking.trajectory import EarthPose, Trajectory, TrajectoryPoint
 from reloc.tracking.trajectory_files import write_trajectory
 from reloc.viewer.photos import Pictures
+from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import Queries
 from reloc.viewer.scene import Scene, build_scene
 from reloc.viewer.server import create_app, listen, uvicorn_server
@@ -112,11 +113,14 @@ def track_over(field: FeatureMap) -> Trajectory:
 
 @contextmanager
 def running_viewer(
-    database: Database, scene: Scene | None = None, photos: Path | None = None
+    database: Database,
+    scene: Scene | None = None,
+    photos: Path | None = None,
+    pages: PlacingPages | None = None,
 ) -> Iterator[str]:
     """A viewer on a free port, in a thread of the test; gives its URL without a slash at the end."""
     scene = scene or build_scene(database, database.snapshot())
-    server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene)))
+    server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene), pages))
     with listen(0) as bound:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()

@@ -125,7 +125,8 @@ class Viewer {
     if (map === undefined) return;
     this.close();
     this.tree.mark(id);
-    const body = aboutMap(map, (other) => this.nameOf(other), (other) => this.openMap(other), (p) => this.openPhoto(map, p));
+    const photo = (p) => this.openPhoto(map, p);
+    const body = aboutMap(map, (m) => this.nameOf(m), (m) => this.openMap(m), photo, this.document.placing);
     const there = make("button", {}, "Go there");
     there.addEventListener("click", () => this.goToMap(map));
     show(map.name || map.id, () => this.close(), there, ...body);
