@@ -15,6 +15,7 @@ from featuredb.geometry.camera import Camera
 from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap_bridge import Model, SfmPhoto, run_incremental, write_database
 from ingest.extract import read_keypoints
+from ingest.global_start import map_globally, registered_with_usual_lens
 from ingest.matching import read_two_view
 from ingest.submodel import keep_photos
 from ingest.view_graph_focals import calibrate_focals, start_from
@@ -23,6 +24,7 @@ from ingest.workspace import atomic_folder
 logger = logging.getLogger(__name__)
 
 PriorUse = Literal["none", "bundle"]
+_MOSTLY = 0.5  # of the photos; fewer with a lens that people have, and the start is to blame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,6 +120,13 @@ class SfmTask:
         """Longest side of all photos."""
         return max(max(camera.width, camera.height) for camera, _ in self.cameras)
 
+    @property
+    def shares_unknown_lenses(self) -> bool:
+        """Whether lenses that nobody knows took many photos each, as those of films do."""
+        unknown = {row for row, (_, known) in enumerate(self.cameras) if not known}
+        photos = sum(view.camera_row in unknown for view in self.views)
+        return bool(unknown) and photos >= self.options.adjust.min_photos_of_camera * len(unknown)
+
     def key(self) -> str:
         """Digest (24 characters) of the content: equal keys give equal models."""
         content = hashlib.sha256(repr((self.cameras, self.options)).encode())
@@ -157,31 +166,55 @@ def reconstruct(task: SfmTask, folder: Path) -> None:
 
 
 def _map(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:
-    """Incremental mapping; once more with other focal lengths where these may be why photos stay outside."""
+    """Incremental mapping; again from another start where the first one may be why photos stay outside."""
     options = task.options
     settings = mapping_settings(options, task.side_px)
     registered = len(run_incremental(database, scratch, output, settings, lambda: None))
-    if not options.focal_from_view_graph or registered == len(task.views):
+    if options.focal_from_view_graph and registered < len(task.views):
+        focals = calibrate_focals(database, scratch, seed=options.seed)
+        if focals:
+            again = scratch / "again"
+            again.mkdir()
+            start = scratch / "start.db"
+            shutil.copyfile(database, start)
+            start_from(start, focals)
+            more = len(run_incremental(start, scratch, again, settings, lambda: None))
+            logger.info("%s: %d registered, %d with focal lengths from the pairs", task, registered, more)
+            if more > registered:
+                _take(again, output)
+    if options.refine_focal and task.shares_unknown_lenses:
+        _map_from_all(task, database, scratch, output)
+
+
+def _map_from_all(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:
+    """Global mapping, where incremental mapping found no usual lens for most photos and this finds more."""
+    known = [row for row, view in enumerate(task.views) if task.cameras[view.camera_row][1]]
+    before = registered_with_usual_lens(output, known)
+    if before >= _MOSTLY * len(task.views):
         return
-    focals = calibrate_focals(database, scratch, seed=options.seed)
-    if not focals:
-        return
-    start_from(database, focals)
-    again = scratch / "again"
-    again.mkdir()
-    more = len(run_incremental(database, scratch, again, settings, lambda: None))
-    logger.info(
-        "%s: %d registered, %d with focal lengths from the pairs of %d cameras",
-        task,
-        registered,
-        more,
-        len(focals),
+    at_once = scratch / "at once"
+    at_once.mkdir()
+    options = task.options
+    map_globally(
+        database,
+        scratch,
+        at_once,
+        min_photos=options.min_model_photos,
+        min_inliers=options.min_inliers,
+        seed=options.seed,
     )
-    if more > registered:
-        for folder in output.iterdir():
-            shutil.rmtree(folder)
-        for folder in again.iterdir():
-            shutil.move(folder, output)
+    after = registered_with_usual_lens(at_once, known)
+    logger.info("%s: %d with a usual lens, %d by global mapping", task, before, after)
+    if after > before:
+        _take(at_once, output)
+
+
+def _take(models: Path, output: Path) -> None:
+    """These model folders instead of those in `output`."""
+    for folder in output.iterdir():
+        shutil.rmtree(folder)
+    for folder in models.iterdir():
+        shutil.move(folder, output)
 
 
 def loss_scale_px(task: SfmTask) -> float:
