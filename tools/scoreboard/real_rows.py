@@ -192,6 +192,33 @@ REAL: tuple[Row, ...] = (
         readme=True,
         minutes=40,
     ),
+    Row(
+        name="brighton-grown",
+        group="real",
+        form="full",
+        claim="`brighton`: every second photo a map by GPS, the others without GPS placed by it, ten "
+        "photos of `lewis` not; against scan poses laid on the first map",
+        commands=(
+            (
+                *("tools.unplaced_grown", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--strange", "{data}/lewis/images"),
+                *("--poses", "{cache}/brighton-poses.json", "--work", "{work}/maps", *OUT),
+            ),
+        ),
+        figures=same(
+            *("photos", "grown", "strange_placed", "placed_median_m", "loose_median_m", "loose_largest_m"),
+            *("loose_median_deg", "bound_m"),
+        ),
+        text="{grown} of {photos} placed, median {loose_median_m:.2f} m and {loose_median_deg:.2f} degrees, "
+        "largest {loose_largest_m:.2f} m; the map by GPS {placed_median_m:.2f} m",
+        limits=(
+            Limit(figure="grown", least=9),
+            Limit(figure="strange_placed", most=0),
+            Limit(figure="loose_median_m", most=0.3),
+        ),
+        needs=("brighton/images", "brighton/model.laz", "lewis/images"),
+        minutes=15,
+    ),
     _made(
         *("karma-map", "`karma.mp4`, 12 s by a drone, becomes a map"),
         *(("--film", "{data}/video/karma.mp4"), "video/karma.mp4", 6),
