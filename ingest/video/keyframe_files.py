@@ -20,6 +20,7 @@ from ingest.executor import Progress
 from ingest.video.burnt_in import BurntIn, BurntInOptions, find_burnt_in, painted_over
 from ingest.video.keyframes import KeyframeChoice
 from ingest.video.positions import Position
+from ingest.video.zoom import ZoomOptions, lenses_of
 from ingest.workspace import atomic_file
 
 
@@ -104,27 +105,61 @@ def _jpeg(
     return out.getvalue()
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cleaned:
+    """What was found in keyframes.
+
+    Attributes:
+        burnt_in: of each shot. lenses: number of focal lengths of each shot.
+    """
+
+    burnt_in: dict[int, BurntIn]
+    lenses: dict[int, int]
+
+
 def clean_keyframes(
-    folder: Path, choice: KeyframeChoice, side_px: int, quality: int, options: BurntInOptions
-) -> dict[int, BurntIn]:
-    """Paint over what is burnt into the keyframes of each shot, so that no feature comes of it.
+    folder: Path,
+    choice: KeyframeChoice,
+    side_px: int,
+    quality: int,
+    options: tuple[BurntInOptions, ZoomOptions],
+) -> Cleaned:
+    """Paint over what is burnt into keyframes, so that no feature comes of it; name lenses that have zoomed.
 
     Args:
-        side_px: of the pictures that it is looked for in, and whose pixels the answer has.
+        side_px: of the pictures that are looked at, and whose pixels the answer has.
     """
     files = [folder / keyframe_name(index) for index in choice.index]
     pictures = [_shrunk(file, side_px) for file in files]
-    found = find_burnt_in(pictures, choice.shot, options)
-    for file, shot in zip(files, choice.shot, strict=True):
-        if found[shot].mask.any():
-            with Image.open(file) as picture:
-                rgb, exif = np.asarray(picture.convert("RGB")), picture.info["exif"]
-            size = (rgb.shape[1], rgb.shape[0])
-            mask = cv2.resize(found[shot].mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-            with atomic_file(file) as target:
-                clean = Image.fromarray(painted_over(rgb, mask))
-                clean.save(target, format="JPEG", quality=quality, subsampling=0, exif=exif)
-    return found
+    found = find_burnt_in(pictures, choice.shot, options[0])
+    clean = [
+        painted_over(np.dstack([picture] * 3), found[shot].mask)[..., 0]
+        for picture, shot in zip(pictures, choice.shot, strict=True)
+    ]
+    lenses = lenses_of(clean, choice.shot, options[1])
+    for file, shot, lens in zip(files, choice.shot, lenses, strict=True):
+        if lens or found[shot].mask.any():
+            _finish(file, found[shot].mask, lens, quality)
+    return Cleaned(
+        burnt_in=found,
+        lenses={
+            shot: len({n for n, s in zip(lenses, choice.shot, strict=True) if s == shot}) for shot in found
+        },
+    )
+
+
+def _finish(file: Path, mask: NDArray[np.bool_], lens: int, quality: int) -> None:
+    """Paint over a keyframe's mask, and name its lens."""
+    with Image.open(file) as picture:
+        rgb, exif = np.asarray(picture.convert("RGB")), picture.getexif()
+    if lens:
+        exif[ExifTags.Base.Model.value] += f" zoom {lens}"
+    size = (rgb.shape[1], rgb.shape[0])
+    large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    with atomic_file(file) as target:
+        Image.fromarray(painted_over(rgb, large)).save(
+            target, format="JPEG", quality=quality, subsampling=0, exif=exif
+        )
 
 
 def _shrunk(file: Path, side_px: int) -> NDArray[np.uint8]:
