@@ -37,7 +37,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     with tempfile.TemporaryDirectory() as scratch:
         work = args.work or Path(scratch)
-        world = make_scan_world(work / f"world-{args.size}-{args.seed}", args.seed, args.size, args.workers)
+        inputs = args.inputs or work
+        world = make_scan_world(
+            inputs / f"scan-world-{args.size}-{args.seed}", args.seed, args.size, args.workers
+        )
         mapped = work / f"mapped-{args.size}-{args.seed}"
         if not mapped.exists():
             featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
@@ -123,6 +126,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--queries", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
     parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
+    parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
     add_json_option(parser)
     return parser.parse_args(argv)
 

@@ -54,7 +54,7 @@ SIMULATED: tuple[Row, ...] = (
         form="quick",
         claim="24 photos with a drone's GPS, placed by an airborne scan with intensity only; another town's "
         "scan is refused",
-        commands=(("tools.anchor_simworld", "--work", "{work}/town", *OUT),),
+        commands=(("tools.anchor_simworld", "--work", "{work}/town", "--inputs", "{cache}", *OUT),),
         figures=same(
             *("placed", "other_placed", "gps_cameras_m", "scan_cameras_m", "scan_cameras_deg"),
             *("scan_queries", "scan_answered", "scan_queries_m", "scan_queries_largest_m"),
