@@ -101,8 +101,8 @@ def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, Fl
     return np.array(metres), np.array(degrees)
 
 
-def featuredb(*words: str, may_refuse: bool = False) -> int:
-    """Run a command of featuredb and show what it says; 1 is an answer where it may refuse."""
+def featuredb(*words: str, may_refuse: bool = False, refusals: Sequence[int] = (1,)) -> int:
+    """Run a command of featuredb and show what it says; `refusals` are answers where it may refuse."""
     sys.stdout.write(f"$ featuredb {' '.join(words)}\n")
     sys.stdout.flush()
     done = subprocess.run(
@@ -113,8 +113,9 @@ def featuredb(*words: str, may_refuse: bool = False) -> int:
         check=False,
     )
     sys.stdout.write(done.stdout)
-    if done.returncode != 0 and not (may_refuse and done.returncode == 1):
+    if done.returncode != 0 and not (may_refuse and done.returncode in refusals):
         raise SystemExit(f"exit code {done.returncode}\n{done.stderr}")
+    sys.stdout.write(done.stderr if done.returncode > 1 else "")
     return done.returncode
 
 

@@ -95,7 +95,8 @@ def _draw(
     shutil.copytree(work / "db", database)
     words = ("anchor", str(database), map_id, "--photos", str(photos), "--picks", str(file))
     out = ("--image", image, "--out", str(work / f"anchor-{number}"), "--auto", "--quiet")
-    if featuredb(*words, *out, may_refuse=True) != 0:
+    # 1: the map is not placed by them. 2: picks that leave the pose open, before anything is tried.
+    if featuredb(*words, *out, may_refuse=True, refusals=(1, 2)) != 0:
         return None
     return judged(database, work / "asked", args.held_out, frame, poses)
 
