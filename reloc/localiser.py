@@ -129,6 +129,17 @@ class Localiser:
         """
         return self._chosen(map_ids)
 
+    def own_area_of(self, map_ids: tuple[str, ...] | None) -> tuple[UnplacedMap, IndexedArea] | None:
+        """The map without a place that is named alone, and its area, whose local frame is the map's own.
+
+        Whoever asks for it has to word every pose in the map's frame: the area's place means nothing.
+
+        Raises:
+            UnplacedBesideOthersError: it is named beside others.
+        """
+        map_id = self._named_unplaced(map_ids)
+        return None if map_id is None else self._read_unplaced(map_id)
+
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         """Pose of the image (h, w) uint8, or the reason why there is none.
 
@@ -169,19 +180,20 @@ class Localiser:
         return named[0]
 
     def _in_own_frame(self, gray: NDArray[np.uint8], request: LocaliseRequest, map_id: str) -> LocaliseResult:
-        """The pose in the own frame of a map without a place, or the reason why there is none.
+        """The pose in the own frame of a map without a place, or the reason why there is none."""
+        unplaced, indexed = self._read_unplaced(map_id)
+        told = replace(request, prior=None, beyond=None, map_ids=None)
+        return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
 
-        The map is read when it is first asked, and the one that was asked last is kept.
-        """
+    def _read_unplaced(self, map_id: str) -> tuple[UnplacedMap, IndexedArea]:
+        """A map without a place, at its stand-in; the one that was asked last is kept."""
         with self._own_lock:
             if self._own is None or self._own[0].map_id != map_id:
                 unplaced = self._unplaced[map_id]()
                 area = build_area([at_stand_in(unplaced)])
                 index = load_or_build(area.descriptors, area.digest, None)
                 self._own = (unplaced, IndexedArea(area=area, index=index))
-            unplaced, indexed = self._own
-        told = replace(request, prior=None, beyond=None, map_ids=None)
-        return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
+            return self._own
 
     def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""

@@ -1,10 +1,9 @@
-"""What becomes of a folder of photos, or a film, whose positions nobody knows: maps, and photos in them.
+"""What becomes of a folder of photos whose positions nobody knows: maps, and photos in them.
 
     python -m tools.made_maps --photos FOLDER [--names A.JPG ...] [--strip] [--gcp FILE]
-    python -m tools.made_maps --film FILM.mp4
 
-The folder (with --strip: copies of it without any position) or the film is ingested into a new database.
-Prints how many photos or keyframes are in the largest map, in any map, and in how many, placed or not, and
+The folder (with --strip: copies of it without any position) is ingested into a new database.
+Prints how many photos are in the largest map, in any map, and in how many, placed or not, and
 what the placement of the first leaves between positions and the map (of --gcp: ground control points, of
 which no other position is known). Exit code 0 if there is a map.
 """
@@ -37,7 +36,7 @@ class Made:
     """What an ingest came to.
 
     Attributes:
-        photos: given; 0 for a film. largest, mapped: photos in the largest map, and in any.
+        photos: given; 0 for a film (`make`). largest, mapped: photos in the largest map, and in any.
         maps: with a place and without. seconds: of the command.
         residual_m: root mean square of the first placed map's; NaN without one.
     """
@@ -55,15 +54,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     with tempfile.TemporaryDirectory() as scratch:
         work = args.work or Path(scratch)
-        if args.film is not None:
-            made = make(work / "db", "video", bare_film(args.film, work / "film"), 0)
-        else:
-            names = args.names or photo_names(args.photos)
-            folder = args.photos
-            if args.strip or args.names:
-                folder = copied(args.photos, names, work / "photos", strip=args.strip)
-            control = () if args.gcp is None else ("--gcp", str(args.gcp))
-            made = make(work / "db", "photos", folder, len(names), control)
+        names = args.names or photo_names(args.photos)
+        folder = args.photos
+        if args.strip or args.names:
+            folder = copied(args.photos, names, work / "photos", strip=args.strip)
+        control = () if args.gcp is None else ("--gcp", str(args.gcp))
+        made = make(work / "db", "photos", folder, len(names), control)
     sys.stdout.write(f"{made}\n")
     write_figures(args.json, asdict(made))
     return 0 if made.maps else 1
@@ -150,9 +146,7 @@ def _picture_start(jpeg: bytes) -> int:
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    source = parser.add_mutually_exclusive_group(required=True)
-    source.add_argument("--photos", type=Path, metavar="FOLDER")
-    source.add_argument("--film", type=Path, metavar="FILE")
+    parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
     parser.add_argument("--names", nargs="+", default=[], metavar="NAME", help="default: all of the folder")
     parser.add_argument("--strip", action="store_true", help="of JPEGs: without EXIF's GPS and XMP")
     parser.add_argument("--gcp", type=Path, default=None, metavar="FILE", help="control points of the photos")

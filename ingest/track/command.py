@@ -44,7 +44,13 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "--prior", metavar="LAT,LON,SIGMA_M", help="where the film begins, WGS84 degrees and metres"
     )
-    parser.add_argument("--map", action="append", metavar="ID", help="track by this map; may be repeated")
+    parser.add_argument(
+        "--map",
+        action="append",
+        metavar="ID",
+        help="track by this map; may be repeated. One without a place is named alone, and the poses are in "
+        "its own frame",
+    )
     parser.add_argument(
         "--by",
         choices=("map", "scan", "both"),
@@ -79,9 +85,11 @@ def run_track(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from featuredb.cli.common import open_database
+    from featuredb.errors import InvalidValueError
     from ingest.track.finders import FilmGround, finder_for
     from reloc.result import LocaliseRequest
-    from reloc.tracking.outputs import check_outputs, exit_code, write_outputs
+    from reloc.tracking.map_ground import MapFinder
+    from reloc.tracking.outputs import check_outputs, check_outputs_in_map, exit_code, write_outputs
     from reloc.tracking.track_video import TrackVideoOptions, track_video
 
     check_outputs(args.out)
@@ -95,11 +103,18 @@ def run_track(args: argparse.Namespace) -> int:
         pose_file=args.pose,
     )
     finder, version = finder_for(database, asked, camera, options.track)
+    prior = _prior(args.prior)
+    if isinstance(finder, MapFinder) and finder.own_map is not None:
+        check_outputs_in_map(args.out, finder.own_map)
+        if prior is not None:
+            raise InvalidValueError(
+                f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"
+            )
     found = track_video(
         args.video,
         finder,
         camera=camera,
-        request=LocaliseRequest(prior=_prior(args.prior)),
+        request=LocaliseRequest(prior=prior),
         overlay=args.overlay,
         options=options,
     )
@@ -146,7 +161,8 @@ def _summary(found: "TrackedVideo", written: list[str]) -> dict[str, Any]:
         "video": found.trajectory.source,
         "frames": len(points),
         **states,
-        "stretches": [[s[0][0].time_s, s[-1][0].time_s] for s in found.trajectory.stretches()],
+        "stretches": [list(times) for times in found.trajectory.times_found()],
+        "frame": "own" if found.trajectory.is_in_map else "earth",
         "last_reason": lost[-1].detail if lost else "",
         "frames_per_s": round(len(points) / max(seconds.total, 1e-9), 1),
         "seconds": {
@@ -180,6 +196,8 @@ def _text(summary: dict[str, Any]) -> str:
         f"{seconds['tracking']:.1f} s tracking, {seconds['drawing']:.1f} s drawing; longest gap "
         f"{1000 * seconds['longest_gap']:.0f} ms"
     )
+    if summary["frame"] == "own":
+        lines.append("  poses are in the map's own frame, and say nothing of where on Earth that is")
     lines += [f"  the film: {what}" for what in summary["complaints"]]
     lines += [f"  wrote {file}" for file in summary["written"]]
     return "\n".join(lines) + "\n"

@@ -59,8 +59,7 @@ def finder_for(
     if asked.by == "map":
         if asked.scans or asked.pose_file:
             raise InvalidValueError("--scan and --pose are for --by scan and --by both; add one of these")
-        maps, version = _maps(database, asked, options)
-        return maps, version
+        return _maps(database, asked, options)
     rough = None if asked.pose_file is None else read_pose(asked.pose_file, "the first frame")
     if asked.by == "scan":
         if rough is None or camera is None:
@@ -70,6 +69,11 @@ def finder_for(
             )
         return _on_scan(database, asked, rough), database.snapshot().version
     maps, version = _maps(database, asked, options)
+    if maps.own_map is not None:
+        raise InvalidValueError(
+            f"--by both follows maps on a scan, and map {maps.own_map} has no place on any; leave out --by, "
+            "or place the map first: `featuredb maps` says how"
+        )
     if len(maps.grounds) != 1:
         raise InvalidValueError(
             f"--by both follows the maps of one place, found {len(maps.grounds)}; name one by --map"
@@ -81,7 +85,12 @@ def finder_for(
 
 def _maps(database: Database, asked: FilmGround, options: TrackOptions) -> tuple[MapFinder, int]:
     localiser = Localiser.open(database)
-    areas = usable_areas(localiser.areas_of(asked.maps), options.localise.extractor.fingerprint)
+    fingerprint = options.localise.extractor.fingerprint
+    own = localiser.own_area_of(asked.maps)
+    if own is not None:
+        unplaced, area = own
+        return MapFinder(usable_areas([area], fingerprint), unplaced.frame), localiser.snapshot
+    areas = usable_areas(localiser.areas_of(asked.maps), fingerprint)
     return MapFinder(areas), localiser.snapshot
 
 

@@ -12,7 +12,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.result import LocaliseRequest
-from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
+from reloc.tracking.ground import Ground, Keyframe, Standing, StandingInMap, Unmatched
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
 
@@ -44,7 +44,9 @@ class MapOverScan:
             return replace(by_scan, ground=self)
         return _both(by_map, by_scan)
 
-    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+    def standing(
+        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
+    ) -> Standing | StandingInMap:
         """On that of which more landmarks are."""
         of_map = rows >= 0
         if 2 * int(of_map.sum()) >= len(rows):

@@ -43,6 +43,14 @@ def draw_frame(rgb: NDArray[np.uint8], frame: TrackedFrame, point: TrajectoryPoi
 
 def _words(point: TrajectoryPoint) -> list[str]:
     head = f"frame {point.index}  {point.time_s:.2f} s  {point.state}"
+    if point.in_map is not None:
+        x, y, z = point.in_map.cam_from_map.center
+        unit = "m" if point.in_map.frame.metric else "units"
+        return [
+            f"{head}  {point.inliers} landmarks",
+            f"map {point.in_map.map_id[:12]}, no place on Earth",
+            f"x {x:.3f}  y {y:.3f}  z {z:.3f} {unit} in its frame",
+        ]
     if point.pose is None:
         return [head, point.detail[:80]]
     east, north, up = point.pose.utm

@@ -10,6 +10,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.unplaced_map import OwnFrame
 from reloc.pose import CameraSource
 from reloc.result import LocaliseRequest
 from reloc.tracking.options import TrackOptions
@@ -31,6 +32,21 @@ class Standing:
     covariance: FloatArray
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandingInMap:
+    """What a pose stands on whose map has no place: nothing of it is on Earth.
+
+    Attributes:
+        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
+        covariance: (6, 6) of the pose, axes of the map's own frame: rotation (rad) before displacement (units
+            of the frame).
+    """
+
+    map_id: str
+    frame: OwnFrame
+    covariance: FloatArray
+
+
 class Ground(Protocol):
     """Known points, and how a frame whose pose is known to some pixels is compared with them.
 
@@ -48,7 +64,9 @@ class Ground(Protocol):
         """What is seen of the ground in a frame (h, w) that `pose` is about right for."""
         ...
 
-    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+    def standing(
+        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
+    ) -> Standing | StandingInMap:
         """What a pose stands on whose landmarks are these.
 
         Args:

@@ -13,6 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
+from featuredb.maps.unplaced_map import OwnFrame
 from reloc.answer import on_earth
 from reloc.candidates import IndexedArea
 from reloc.localise import localise_features
@@ -20,7 +21,7 @@ from reloc.matching import guided_matches, visible_points
 from reloc.pose import PoseHypothesis, refine_pose
 from reloc.result import LocaliseRequest
 from reloc.search import pairs
-from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
+from reloc.tracking.ground import Ground, Keyframe, Standing, StandingInMap, Unmatched
 from reloc.tracking.options import TrackOptions
 
 _MOST_SHOWN = 1500  # more dots hide the picture
@@ -29,9 +30,15 @@ _MOST_LOOKED_AT = 20_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MapGround:
-    """The maps of an area."""
+    """The maps of an area, or a map without a place.
+
+    Attributes:
+        area: its local frame is the map's own where this has no place.
+        own: the frame of that map; None where the maps are placed.
+    """
 
     area: Area
+    own: OwnFrame | None = None
 
     @property
     def frame(self) -> LocalFrame:
@@ -76,9 +83,13 @@ class MapGround:
             rows=rows,
         )
 
-    def standing(self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray) -> Standing:
+    def standing(
+        self, rows: NDArray[np.int64], center: FloatArray, measured: FloatArray
+    ) -> Standing | StandingInMap:
         """By the map whose points most landmarks are."""
         area = self.area
+        if self.own is not None:
+            return StandingInMap(map_id=area.maps[0].map_id, frame=self.own, covariance=measured)
         main = area.maps[int(np.argmax(np.bincount(area.point_map[rows], minlength=len(area.maps))))]
         return Standing(
             epsg=main.epsg,
@@ -97,15 +108,25 @@ class MapGround:
 
 
 class MapFinder:
-    """Finds frames as queries are found, on the maps of some areas."""
+    """Finds frames as queries are found, on the maps of some areas.
 
-    def __init__(self, areas: Sequence[IndexedArea]) -> None:
-        self._areas = tuple(areas)
+    Args:
+        own: frame of the map without a place that is the only area.
+    """
+
+    def __init__(self, areas: Sequence[IndexedArea], own: OwnFrame | None = None) -> None:
+        self._areas, self._own = tuple(areas), own
+        assert own is None or len(self._areas) == 1
 
     @property
     def grounds(self) -> list[MapGround]:
         """A ground for each area."""
-        return [MapGround(area=a.area) for a in self._areas]
+        return [MapGround(area=a.area, own=self._own) for a in self._areas]
+
+    @property
+    def own_map(self) -> str | None:
+        """Id of the map without a place whose frame the poses are in."""
+        return None if self._own is None else self._areas[0].area.maps[0].map_id
 
     def find(
         self, gray: NDArray[np.uint8], request: LocaliseRequest, options: TrackOptions
@@ -119,7 +140,7 @@ class MapFinder:
         pixels, points = pairs(features, best.area, best.matches)
         return Keyframe(
             cam_from_local=best.pose.cam_from_local,
-            ground=MapGround(area=best.area),
+            ground=MapGround(area=best.area, own=self._own),
             camera=best.pose.camera,
             pixels=pixels[best.rows],
             points=points[best.rows],

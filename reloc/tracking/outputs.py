@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from featuredb.errors import FeatureDbError, InvalidValueError
+from reloc.tracking.own_trajectory_files import OWN_FORMATS
 from reloc.tracking.trajectory import Trajectory
 from reloc.tracking.trajectory_files import check_format, write_trajectory
 
@@ -30,6 +31,21 @@ def check_outputs(files: Sequence[Path]) -> None:
     for file in files:
         check_format(file)
         _check_folder(file)
+
+
+def check_outputs_in_map(files: Sequence[Path], map_id: str) -> None:
+    """Of a track in the frame of a map without a place, which says nothing of places on Earth.
+
+    Raises:
+        InvalidValueError: a file that needs them.
+    """
+    for file in files:
+        if file.suffix.lower() not in OWN_FORMATS:
+            raise InvalidValueError(
+                f"{file.name}: needs places on Earth, and map {map_id} has none: expected "
+                f"{' or '.join(OWN_FORMATS)}, with poses in the map's own frame; or place the map first: "
+                "`featuredb maps` says how"
+            )
 
 
 def write_outputs(files: Sequence[Path], trajectory: Trajectory) -> Outputs:
@@ -57,7 +73,7 @@ def exit_code(outputs: Outputs, trajectory: Trajectory) -> int:
 
 
 def _known(trajectory: Trajectory) -> bool:
-    return any(point.pose is not None for point in trajectory.points)
+    return any(point.found for point in trajectory.points)
 
 
 def _check_folder(file: Path) -> None:

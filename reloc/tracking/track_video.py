@@ -184,11 +184,11 @@ def _filled(points: list[TrajectoryPoint], late: Sequence[TrackedFrame]) -> None
     first = points[-1].index - len(points) + 1
     for frame in late:
         row = frame.index - first
-        if points[row].pose is not None:
+        if points[row].found:
             continue
-        goes_on = row > 0 and points[row - 1].pose is not None
+        goes_on = row > 0 and points[row - 1].found
         points[row] = replace(point_of(frame), state="tracking" if goes_on else "relocalised")
-    if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].pose is not None:
+    if late and points[-1].state == "relocalised" and len(points) > 1 and points[-2].found:
         points[-1] = replace(points[-1], state="tracking")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose_documents import irregular_series
+from reloc.tracking.own_trajectory_files import own_format
 from reloc.tracking.trajectory import EarthPose, Trajectory, TrajectoryPoint
 
 _POSE = (
@@ -37,10 +38,12 @@ CSV_COLUMNS = (
 def write_trajectory(path: Path, trajectory: Trajectory) -> None:
     """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`, `.png`.
 
+    One in the frame of a map without a place: `.csv`, `.json`, see `reloc.tracking.own_trajectory_files`.
+
     Raises:
         InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
     """
-    made = _format(path)(trajectory)
+    made = (own_format(path) if trajectory.is_in_map else _format(path))(trajectory)
     content = made if isinstance(made, bytes) else made.encode()
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")

@@ -12,6 +12,7 @@ from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
+from reloc.tracking.own_trajectory_files import OWN_CSV_COLUMNS
 from reloc.tracking.tracker import TrackState
 from reloc.tracking.trajectory import EarthPose, Trajectory, TrajectoryPoint
 from reloc.tracking.trajectory_files import CSV_COLUMNS
@@ -30,6 +31,11 @@ def read_trajectory_csv(path: Path) -> Trajectory:
         with path.open(encoding="utf-8", newline="") as file:
             rows = csv.DictReader(file, strict=True)
             missing = [name for name in CSV_COLUMNS if name not in (rows.fieldnames or ())]
+            if OWN_CSV_COLUMNS[4] in (rows.fieldnames or ()):
+                raise InvalidValueError(
+                    f"{path}: expected a track on Earth, found one in the own frame of a map without a "
+                    "place; track the film again once the map is placed"
+                )
             if missing:
                 raise InvalidValueError(
                     f"{path}: expected the columns of `featuredb track --out NAME.csv`, found none called "

@@ -219,9 +219,25 @@ REAL: tuple[Row, ...] = (
         needs=("brighton/images", "brighton/model.laz", "lewis/images"),
         minutes=15,
     ),
-    _made(
-        *("karma-map", "`karma.mp4`, 12 s by a drone, becomes a map"),
-        *(("--film", "{data}/video/karma.mp4"), "video/karma.mp4", 6),
+    Row(
+        name="karma-in-map",
+        group="real",
+        form="full",
+        claim="`karma.mp4`, 12 s by a drone, becomes a map without a place, and is followed in its frame; at "
+        "keyframes the track agrees with the map's own cameras, relative to the distance of the points",
+        commands=(("tools.film_in_map", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
+        figures=same(
+            *("keyframes", "mapped", "frames", "tracked", "center_rel", "angle_deg"),
+            *("mapped_share", "tracked_share"),
+        ),
+        text="{mapped} of {keyframes} keyframes, {tracked} of {frames} frames; {center_rel:.2%} and "
+        "{angle_deg:.2f} degrees",
+        limits=(
+            Limit(figure="mapped_share", least=0.8),
+            Limit(figure="tracked_share", least=0.9),
+            Limit(figure="center_rel", most=0.01),
+        ),
+        needs=("video/karma.mp4",),
         minutes=3,
     ),
     Row(

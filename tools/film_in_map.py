@@ -1,0 +1,110 @@
+"""A film without positions becomes a map, and the same film is followed in that map's own frame.
+
+    python -m tools.film_in_map FILM.mp4 [--work FOLDER]
+
+Ingests the film without its telemetry, tracks it by the largest map, which has no place, and compares the
+track at the keyframes with the poses that the map itself has of them: the distance of the centres over the
+median distance from the map's cameras to their points, and the angle. Exit code 0 if a frame was followed.
+"""
+
+import argparse
+import csv
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
+from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.store import Database
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmInMap:
+    """What came of a film.
+
+    Attributes:
+        keyframes: of the film; mapped: of them, in the largest map.
+        frames: of the film; tracked: of them, with a pose in the map's frame.
+        center_rel: median distance of the track from the map's own cameras at keyframes, over the median
+            distance from the cameras to the points. angle_deg: median angle between the two.
+    """
+
+    keyframes: int
+    mapped: int
+    frames: int
+    tracked: int
+    center_rel: float
+    angle_deg: float
+
+    @property
+    def mapped_share(self) -> float:
+        """Of the keyframes."""
+        return self.mapped / self.keyframes
+
+    @property
+    def tracked_share(self) -> float:
+        """Of the frames."""
+        return self.tracked / self.frames
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("film", type=Path)
+    parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        made = film_in_map(args.film, args.work or Path(scratch))
+    sys.stdout.write(f"{made}\n")
+    shares = {"mapped_share": made.mapped_share, "tracked_share": made.tracked_share}
+    write_figures(args.json, asdict(made) | shares)
+    return 0 if made.tracked else 1
+
+
+def film_in_map(film: Path, work: Path) -> FilmInMap:
+    """Ingest and track a film in a folder."""
+    database, track = work / "db", work / "track.csv"
+    featuredb("ingest", "video", str(database), str(film), "--no-telemetry", "--quiet", may_refuse=True)
+    snapshot = Database.open(database).snapshot()
+    largest = max(snapshot.unplaced_maps(), key=lambda m: m.images).map_id
+    featuredb("track", str(database), str(film), "--map", largest, "--out", str(track), may_refuse=True)
+    with track.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    unplaced = snapshot.load_unplaced(largest)
+    assert isinstance(unplaced, UnplacedMap)
+    found = {int(row["frame"]): row for row in rows if row["own_x"]}
+    center_rel, angle_deg = _against_keyframes(unplaced, found)
+    return FilmInMap(
+        keyframes=len(list((database / "_work" / "films").rglob("*.jpg"))),
+        mapped=len(unplaced.images),
+        frames=len(rows),
+        tracked=len(found),
+        center_rel=center_rel,
+        angle_deg=angle_deg,
+    )
+
+
+def _against_keyframes(unplaced: UnplacedMap, found: dict[int, dict[str, str]]) -> tuple[float, float]:
+    """Medians of centres' distances, relative, and of angles."""
+    away, turned, far = [], [], []
+    for image in unplaced.images:
+        own = image.cam_from_local
+        far.append(float(np.median(np.linalg.norm(unplaced.points.xyz - own.center, axis=1))))
+        row = found.get(int(Path(image.name).stem))
+        if row is None:
+            continue
+        center = np.array([float(row[f"own_{a}"]) for a in "xyz"])
+        rotation = matrix_from_quaternion(np.array([float(row[f"own_q{a}"]) for a in "xyzw"]))
+        away.append(float(np.linalg.norm(center - own.center)))
+        turned.append(float(np.degrees(rotation_angle(rotation @ own.rotation.T))))
+    return float(np.median(away) / np.median(far)), float(np.median(turned))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
