@@ -34,20 +34,17 @@ class FlowTrack:
         frame: RecentFrame,
         camera: Camera,
         options: TrackOptions,
-        lens_rel: float = 0.0,
+        lens: LensWalk | None = None,
     ) -> None:
         """
         Args:
             frame: the keyframe's own, at which the track begins.
-            camera: intrinsics of the frames. lens_rel: standard deviation of the logarithm of its focal
-                length, which is estimated with every pose; 0: it is given.
+            camera: intrinsics of the frames. lens: the same as it is known so far, to be estimated with the
+                poses; None: it is given.
         """
         self.ground = keyframe.ground
         self.why = ""
-        self._given, self._options = camera, options
-        self._lens = None
-        if lens_rel > 0.0:
-            self._lens = LensWalk(camera=camera, rel=lens_rel, options=options.lens)
+        self._given, self._options, self._lens = camera, options, lens
         self.landmarks = self._spread(_landmarks_of(keyframe, frame.index), frame.gray)
         self._poses: deque[tuple[float, Rigid3]] = deque([(frame.time_s, keyframe.cam_from_local)], maxlen=2)
 
@@ -132,11 +129,11 @@ class FlowTrack:
         fit, lens = self._options.fit, self._lens
         if lens is None:
             return fit_pose(self._given, marks.pixels, marks.points, predicted, fit)
-        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.before_rel)
+        fitted = fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
         if lens.zooming or (fitted is not None and not lens.surprised(fitted.focal_px, fitted.focal_rel)):
             return fitted
         lens.zooms()
-        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.before_rel)
+        return fit_pose(lens.camera, marks.pixels, marks.points, predicted, fit, lens.doubt)
 
     def _predicted(self, time_s: float) -> Rigid3:
         """The last pose, moved on as it moved before."""

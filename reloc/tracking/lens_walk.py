@@ -1,4 +1,4 @@
-"""The focal length of a film whose lens nobody gave: estimated with every frame's pose, through zooms.
+"""The lens of a film that nobody gave: its focal length is estimated with every frame's pose, through zooms.
 
 A lens that stands still is known better with every frame, down to a floor; one that a frame contradicts is
 zooming, and each frame has a focal length of its own until it stands still again.
@@ -9,37 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LensWalkOptions:
-    """How a focal length is followed; shares of it are standard deviations of its logarithm.
-
-    Attributes:
-        estimated_rel: of a lens that the first frame was localised with. map_rel: of one that the map lends.
-        floor_rel: frames share their errors, so that many do not tell more than this.
-        zoom_rel: what a zoom changes from one frame to the next; quick ones go through two to one in a
-            second, 3 % a frame.
-        surprise: times its standard deviation by which a frame's focal length may differ from what was
-            known; beyond the lens is zooming. One of sixteen thousand frames differs by more by chance, and
-            then has a pose that is less sure, no wrong one.
-        still_s: a lens that has not changed for so long is not zooming.
-    """
-
-    estimated_rel: float = 0.2
-    map_rel: float = 0.005
-    floor_rel: float = 0.001
-    zoom_rel: float = 0.03
-    surprise: float = 4.0
-    still_s: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.floor_rel <= self.map_rel <= self.estimated_rel:
-            raise InvalidValueError(
-                f"LensWalkOptions: expected 0 < floor_rel <= map_rel <= estimated_rel, found {self}"
-            )
+from reloc.tracking.options import LensWalkOptions
+from reloc.tracking.pose_fit import LensDoubt
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -48,10 +20,12 @@ class LensWalk:
 
     Attributes:
         camera: intrinsics. rel: how sure its focal length is. zooming: whether it may change.
+        lent: by a map, whose points agree with its principal point and distortion.
     """
 
     camera: Camera
     rel: float
+    lent: bool
     options: LensWalkOptions
     zooming: bool = False
     _seen: deque[tuple[float, float, float]] = field(default_factory=deque)
@@ -61,6 +35,18 @@ class LensWalk:
         """How sure the next frame's focal length is before it is looked at."""
         walk = self.options.zoom_rel if self.zooming else 0.0
         return float(np.hypot(max(self.rel, self.options.floor_rel), walk))
+
+    @property
+    def doubt(self) -> LensDoubt:
+        """What is not known of the lens before the next frame is looked at."""
+        if self.lent:
+            return LensDoubt(focal_rel=self.before_rel)
+        longer = max(self.camera.width, self.camera.height)
+        return LensDoubt(
+            focal_rel=self.before_rel,
+            center_px=self.options.center_rel * longer,
+            radial=self.options.radial,
+        )
 
     def surprised(self, focal_px: float, focal_rel: float) -> bool:
         """Whether a frame's focal length contradicts what was known of it."""

@@ -38,23 +38,41 @@ class FittedPose:
     focal_rel: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensDoubt:
+    """Standard deviations of what is not known of a lens; all 0: it is given.
+
+    Attributes:
+        focal_rel: of the focal length's logarithm, which is fitted with the pose.
+        center_px, radial: of the principal point and the first radial coefficient, which are not: what they
+            may be is in the pose's covariance.
+    """
+
+    focal_rel: float = 0.0
+    center_px: float = 0.0
+    radial: float = 0.0
+
+
+GIVEN = LensDoubt()
+
+
 def fit_pose(
     camera: Camera,
     pixels: FloatArray,
     points: FloatArray,
     start: Rigid3,
     options: FitOptions,
-    focal_rel: float = 0.0,
+    doubt: LensDoubt = GIVEN,
 ) -> FittedPose | None:
     """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
 
     Args:
         start: a pose within some degrees and a few per cent of the distance.
-        focal_rel: standard deviation of the logarithm of the camera's focal length, which is fitted, too;
-            0: it is given.
+        doubt: what is not known of the camera.
     """
     if len(pixels) < 4:
         return None
+    focal_rel = doubt.focal_rel
     scale = max(camera.width, camera.height) / options.reference_side_px
     seen = camera.unproject(pixels)
     focal, loss = camera.focal_px, options.loss_px * scale
@@ -95,6 +113,11 @@ def fit_pose(
     if count == 7:
         normal[6, 6] += 1.0 / focal_rel**2
     covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    if doubt.center_px > 0.0 or doubt.radial > 0.0:
+        lens = _by_lens(seen[inlier], focal)
+        moved = covariance @ _product(agreeing, lens) / max(variance, 1e-4)
+        sigmas = np.array([doubt.center_px, doubt.center_px, doubt.radial])
+        covariance += (moved * sigmas**2) @ moved.T
     return FittedPose(
         cam_from_local=pose,
         inlier=inlier,
@@ -148,6 +171,14 @@ def _linearised(
     jacobian[4, 1], jacobian[5, 1] = near, -near * v
     jacobian[6:] = projected * front
     return residual, jacobian
+
+
+def _by_lens(seen: FloatArray, focal: float) -> FloatArray:
+    """Derivatives (3, 2, n) of the residuals by principal point (pixels) and first radial coefficient."""
+    derivatives = np.zeros((3, 2, len(seen)))
+    derivatives[0, 0] = derivatives[1, 1] = 1.0
+    derivatives[2] = focal * seen.T * (seen**2).sum(axis=1)
+    return derivatives
 
 
 def of_camera(pose: Rigid3, covariance: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from reloc.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, carried
 from reloc.tracking.ground import Finder, Ground, Keyframe, Unmatched
+from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
 from reloc.tracking.recent import RecentFrame, RecentFrames
@@ -298,8 +299,10 @@ class Tracker:
         if self._given is not None:
             return FlowTrack(found, frame, self._given, options)
         self._camera = found.camera
-        lens_rel = options.lens.map_rel if found.camera_source == "map" else options.lens.estimated_rel
-        return FlowTrack(found, frame, found.camera, options, lens_rel)
+        lent, walk = found.camera_source == "map", options.lens
+        rel = walk.floor_rel if lent else walk.estimated_rel
+        lens = LensWalk(camera=found.camera, rel=rel, lent=lent, options=walk)
+        return FlowTrack(found, frame, found.camera, options, lens)
 
     def _caught_up_by(self, most: int) -> FittedPose | None:
         """Carry the track that was found through `most` more frames; the pose if that is all there are.
