@@ -166,6 +166,36 @@ SIMULATED: tuple[Row, ...] = (
         minutes=25,
     ),
     Row(
+        name="community-films",
+        group="simulated",
+        form="full",
+        claim="a folder of six films by strangers (cuts, titles, a zoom, logos, another town, bad "
+        "compression): maps of the place, placed by six picks in one frame, every film tracked",
+        commands=(("tools.community_films", "--work", "{work}/films", "--inputs", "{cache}", *OUT),),
+        figures=same(
+            *(
+                "place_shots",
+                "shots_in_maps",
+                "place_maps",
+                "foreign_in_maps",
+                "lost_without_reason",
+                "placed",
+            ),
+            *("place_frames", "tracked_share", "inside_share", "foreign_tracked", "median_m", "largest_m"),
+        ),
+        text="{shots_in_maps} of {place_shots} shots in {place_maps} maps of the place, {foreign_in_maps} "
+        "keyframes of elsewhere in them; {tracked_share:.1%} of {place_frames} frames tracked, "
+        "{inside_share:.1%} inside their bounds, median {median_m:.3f} m",
+        limits=(
+            Limit(figure="shots_in_maps", least=8),
+            Limit(figure="foreign_in_maps", most=0),
+            Limit(figure="lost_without_reason", most=0),
+            Limit(figure="inside_share", least=0.9),
+            Limit(figure="foreign_tracked", most=0),
+        ),
+        minutes=45,
+    ),
+    Row(
         name="paper-figure-4",
         group="simulated",
         form="full",
