@@ -18,6 +18,8 @@ from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose, fit_pose
 from reloc.tracking.recent import RecentFrame
 
+_INSTANT_S = 1e-9
+
 
 class FlowTrack:
     """Landmarks on a ground with the last poses; used from one thread at a time.
@@ -140,7 +142,8 @@ class FlowTrack:
         if len(self._poses) < 2:
             return self._poses[-1][1]
         (first_s, first), (second_s, second) = self._poses
-        share = (time_s - second_s) / max(second_s - first_s, 1e-9)
+        span_s = second_s - first_s  # negative where frames are followed backwards
+        share = (time_s - second_s) / span_s if abs(span_s) > _INSTANT_S else 0.0
         return Rigid3.exp(min(share, 3.0) * (second @ first.inverse()).log()) @ second
 
     def _spread(self, marks: Landmarks, gray: NDArray[np.uint8]) -> Landmarks:

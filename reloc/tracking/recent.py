@@ -49,5 +49,14 @@ class RecentFrames:
         found = [f for f in self._frames if f.index >= index]
         return found if found and found[0].index == index else []
 
+    def before(self, index: int) -> list[RecentFrame]:
+        """The frames before number `index`, the last first, as far as none is missing between them."""
+        found: list[RecentFrame] = []
+        for frame in reversed([f for f in self._frames if f.index < index]):
+            if frame.index != index - 1 - len(found):
+                break
+            found.append(frame)
+        return found
+
     def __len__(self) -> int:
         return len(self._frames)

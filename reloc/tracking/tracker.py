@@ -81,7 +81,7 @@ class _Catching:
     track: FlowTrack
     at: RecentFrame
     fitted: FittedPose
-    state: TrackState = "relocalised"
+    state: TrackState
 
 
 class Tracker:
@@ -119,7 +119,7 @@ class Tracker:
         self._behind = _FAR  # frames through which the thread carries a track that was found, live
         self._next_keyframe, self._next_keyframe_s = 0, float("inf")
         self._unconfirmed = 0  # keyframes in a row of which the ground knew nothing
-        self._index = -1
+        self._index = self._posed = -1  # the last frame, and the last that has a pose
         self._why = "nothing was localised yet"
 
     def __enter__(self) -> Self:
@@ -202,7 +202,8 @@ class Tracker:
     def late(self) -> Sequence[TrackedFrame]:
         """Earlier frames, said to be lost then, whose poses the last call of `track` has found.
 
-        A localised frame is answered some frames later; from it on, the frames between are tracked, too.
+        A localised frame is answered some frames later; from it on, the frames between are tracked, too, and
+        those before it, back to a cut.
         """
         return tuple(self._late)
 
@@ -227,6 +228,7 @@ class Tracker:
     def _known(
         self, frame: RecentFrame, state: TrackState, fitted: FittedPose, track: FlowTrack
     ) -> TrackedFrame:
+        self._posed = max(self._posed, frame.index)
         return TrackedFrame(
             index=frame.index,
             time_s=frame.time_s,
@@ -246,10 +248,13 @@ class Tracker:
         self._track, self._catching, self._why = None, None, why
 
     def _needed_from(self) -> int | None:
-        """Number of the first frame that is still needed."""
+        """Number of the first frame that is still needed: before one that is looked for, the others, too."""
         if self._catching is not None:
             return self._catching.at.index
-        return None if self._sent is None else self._sent.index
+        if self._sent is None:
+            return None
+        searched = self._track is None and not self._options.live
+        return self._sent.index - (self._options.lost_answer_after if searched else 0)
 
     def _answer(self, now: RecentFrame) -> "tuple[Answer | None, _Sent | None]":
         """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
@@ -290,8 +295,26 @@ class Tracker:
             return None
         if self._options.live:
             return self._caught_up(begun, since)
-        self._catching = _Catching(track=begun, at=since[0], fitted=fitted)
+        earlier = self._earlier(found, since[0])
+        self._late.extend(earlier)
+        state: TrackState = "tracking" if earlier else "relocalised"
+        self._catching = _Catching(track=begun, at=since[0], fitted=fitted, state=state)
         return self._caught_up_by(self._options.catch_up)
+
+    def _earlier(self, found: Keyframe, frame: RecentFrame) -> list[TrackedFrame]:
+        """Frames just before one that was localised, followed backwards to a cut or to the last pose."""
+        track, last = self._begun(found, frame), frame
+        unknown = [f for f in self._frames.before(frame.index) if f.index > self._posed]
+        earlier: list[TrackedFrame] = []
+        for before in unknown if track.settle() is not None else []:
+            fitted = track.follow(last, before)
+            if fitted is None:
+                break
+            earlier.append(self._known(before, "tracking", fitted, track))
+            last = before
+        if earlier:
+            earlier[-1] = replace(earlier[-1], state="relocalised")
+        return earlier[::-1]
 
     def _begun(self, found: Keyframe, frame: RecentFrame) -> FlowTrack:
         """A track from a localised frame on, with a lens that is followed where nobody gave it."""
@@ -396,8 +419,8 @@ class Tracker:
 
 
 def _frames_kept(options: TrackOptions) -> int:
-    """Frames since the one that the thread has, and those that come while a track catches up with them."""
+    """Frames before and since the one that the thread has, and those that come while a track catches up."""
     if options.live:
         return options.live_frames
     meanwhile = -(-options.lost_answer_after // (options.catch_up - 1))
-    return 2 + max(options.answer_after, options.lost_answer_after + meanwhile)
+    return 2 + max(options.answer_after, 2 * options.lost_answer_after + meanwhile)

@@ -164,6 +164,24 @@ def test_frames_between_a_localised_one_and_its_answer_have_poses_in_the_end(
         assert np.linalg.norm(off) < 0.3
 
 
+def test_frames_before_a_localised_one_are_followed_backwards_to_the_cut(
+    areas: tuple[IndexedArea, ...], film: list[np.ndarray]
+) -> None:
+    """Of four frames of elsewhere and twelve of the map the first and the seventh are looked for."""
+    area_from_hills = areas[0].area.frame.enu_from(FRAME)
+    late: dict[int, TrackedFrame] = {}
+    with Tracker(MapFinder(areas), CAMERA, _OPTIONS) as tracker:
+        for i, gray in enumerate(film[_CUT.start : _CUT.start + 16]):
+            tracker.track(gray, i / 30.0)
+            late |= {frame.index: frame for frame in tracker.late}
+    assert sorted(late) == list(range(len(_CUT), 12))
+    assert [late[i].state for i in sorted(late)] == ["relocalised", *["tracking"] * 7]
+    for i, frame in late.items():
+        assert frame.cam_from_local is not None
+        off = frame.cam_from_local.center - area_from_hills.act(pose_at(_CUT.start + i).center)
+        assert np.linalg.norm(off) < 0.3
+
+
 def test_a_film_that_ends_before_the_answer_has_its_poses(
     areas: tuple[IndexedArea, ...], film: list[np.ndarray]
 ) -> None:
