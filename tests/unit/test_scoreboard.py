@@ -1,6 +1,7 @@
 """The scoreboard: rows, limits, results by commit, and that the documentation says what was measured."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,17 @@ def test_a_row_is_run_and_its_figures_read(tmp_path: Path) -> None:
     assert failed.failure.startswith("exit code 3")
     assert not row().holds(failed.figures)
     assert run(row(code="pass"), places, "abc").failure.startswith("no figures were written")
+
+
+def test_a_stopped_row_goes_on_where_it_was_at_the_same_commit_alone(tmp_path: Path) -> None:
+    places = Places(data=tmp_path, work=tmp_path)
+    code = "import os; print(os.listdir(os.path.dirname(sys.argv[1]))); os._exit(3)"
+    for resumes, commit, kept in ((True, "abc", True), (True, "abc+", False), (False, "abc", False)):
+        folder = tmp_path / "tiny" / commit
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "half-done").touch()
+        failed = run(replace(row(code=code), resumes=resumes), places, commit).failure
+        assert ("half-done" in failed) == kept
 
 
 def test_results_are_kept_by_row_and_commit(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ REAL: tuple[Row, ...] = (
         commands=(
             (
                 *("tools.unplaced_brighton", "--photos", BRIGHTON, "--scan", SCAN),
-                *("--poses", "{cache}/brighton-poses.json", *OUT),
+                *("--poses", "{cache}/brighton-poses.json", "--work", "{work}/draws", *OUT),
             ),
         ),
         figures=same(
@@ -189,6 +189,7 @@ REAL: tuple[Row, ...] = (
             Limit(figure="median_deg", most=0.25),
         ),
         needs=("brighton/images", "brighton/model.laz"),
+        resumes=True,
         readme=True,
         minutes=40,
     ),

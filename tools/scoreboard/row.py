@@ -53,6 +53,7 @@ class Row:
         text: the figures in words, a format string.
         limits: all must hold.
         needs: paths under `{data}`; the row is skipped where one is absent.
+        resumes: whether the command goes on with what it finds in `{work}` of the same commit.
         readme: whether README shows it. minutes: about how long it takes on two cores.
     """
 
@@ -66,6 +67,7 @@ class Row:
     limits: tuple[Limit, ...]
     json: str = "{work}/figures.json"
     needs: tuple[str, ...] = ()
+    resumes: bool = False
     readme: bool = False
     minutes: float = 1.0
 

@@ -32,9 +32,12 @@ class Places:
 
 def run(row: Row, places: Places, commit: str) -> Result:
     """Measure a row. A command that fails leaves a result that says so; its output stays in `row.log`."""
-    work = places.work / row.name
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
+    work = places.work / row.name / commit
+    goes_on = row.resumes and not commit.endswith("+")
+    for old in work.parent.iterdir() if work.parent.is_dir() else ():
+        if old != work or not goes_on:
+            shutil.rmtree(old, ignore_errors=True)
+    work.mkdir(parents=True, exist_ok=True)
     cache = places.work / "cache"
     cache.mkdir(exist_ok=True)
     names = {"data": str(places.data.resolve()), "work": str(work), "cache": str(cache)}
@@ -57,6 +60,8 @@ def run(row: Row, places: Places, commit: str) -> Result:
     if failure:
         return result_now(row.name, commit, {}, seconds, f"{failure}: {tail[-300:]}")
     figures = row.read(json.loads(figures_file.read_text(encoding="utf-8")))
+    if row.resumes:  # the next run begins anew
+        shutil.rmtree(work)
     return result_now(row.name, commit, figures | {"seconds": round(seconds, 1)}, seconds)
 
 
