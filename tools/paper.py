@@ -45,6 +45,7 @@ _PARTS = ("descriptors", "film", "shares")
 _METHODS = ("SIFT", "SIFT upright", "KAZE upright", "ORB", "FREAK")
 _RATIO = 0.9  # of the table's matches; the curves are in the figure
 _FILM_SEED = 1
+_PLACED = "placed.json"  # what came of the film; who starts again goes on from there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,27 +112,17 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
     folder = write_film(inputs / f"film-short-{_FILM_SEED}-smooth-{args.frames}", options, 0)
     truth = read_film_truth(folder)
     work = args.out / "film"
-    shutil.rmtree(work, ignore_errors=True)
-    bare = bare_film(folder / FILM_FILE, work)
-    database = work / "db"
-    made = make(database, "video", bare, 0)
-    featuredb("lidar", "add", str(database), str(world.scan), "--quiet")
-    unplaced = Database.open(database).snapshot().unplaced_maps()
-    if not unplaced:
-        return [_refused("no map came of the film")], {"placed": 0}
-    biggest = max(unplaced, key=lambda one: one.images)
-    stills = next((default_root(Database.open(database).url) / "films").iterdir())
-    seen = seen_in_the_middle(database, biggest.map_id, truth)
-    cloud = read_scan(world.scan, truth.frame, truth.epsg)
-    if not place_by_picks(database, biggest.map_id, stills, seen, cloud, work, args.seed):
-        return [_refused("the map was not placed by the picks of one frame")], {"placed": 0}
-    snapshot = Database.open(database).snapshot()
-    feature_map = snapshot.load_map(biggest.map_id)
-    areas = Localiser.open(Database.open(database)).areas
+    if not (work / _PLACED).exists():
+        write_figures(work / _PLACED, placed_film(folder / FILM_FILE, world.scan, truth, work, args.seed))
+    made = json.loads((work / _PLACED).read_text(encoding="utf-8"))
+    if made["refused"]:
+        return [_refused(made["refused"])], {"placed": 0}
+    feature_map = Database.open(work / "db").snapshot().load_map(made["map_id"])
+    areas = Localiser.open(Database.open(work / "db")).areas
     camera = feature_map.cameras[0].scaled_to(truth.camera.width, truth.camera.height)
-    tracked = track_video(bare, MapFinder(areas), camera=camera)
+    tracked = track_video(work / FILM_FILE, MapFinder(areas), camera=camera)
     metres, _ = errors(tracked, truth)
-    figures = track_figures(metres) | {"placed": 1, "keyframes": biggest.images, "made_s": made.seconds}
+    figures = track_figures(metres) | {"placed": 1, "keyframes": made["keyframes"], "made_s": made["made_s"]}
     figures["adjusted_m"] = from_keyframes(tracked, feature_map)
     figures["rate_hz"] = len(metres) / tracked.seconds.total
     times = json.loads((work / "anchor" / "anchor.json").read_text(encoding="utf-8"))["times_s"]
@@ -139,6 +130,28 @@ def film(args: argparse.Namespace) -> tuple[list[Line], dict[str, Any]]:
     projection_s = times.get("(C) structure projection, all frames", float("nan"))
     figures |= {"frame_s": frame_s, "projection_s": projection_s}
     return film_lines(figures, args.frames), figures
+
+
+def placed_film(film_file: Path, scan: Path, truth: FilmTruth, work: Path, seed: int) -> dict[str, Any]:
+    """The film's map in `work`/db, placed by picks in one frame: its id, keyframes, seconds; or why not."""
+    shutil.rmtree(work, ignore_errors=True)
+    bare, database = bare_film(film_file, work), work / "db"
+    made = make(database, "video", bare, 0)
+    featuredb("lidar", "add", str(database), str(scan), "--quiet")
+    unplaced = Database.open(database).snapshot().unplaced_maps()
+    if not unplaced:
+        return {"refused": "no map came of the film"}
+    biggest = max(unplaced, key=lambda one: one.images)
+    stills = next((default_root(Database.open(database).url) / "films").iterdir())
+    seen = seen_in_the_middle(database, biggest.map_id, truth)
+    cloud = read_scan(scan, truth.frame, truth.epsg)
+    placed = place_by_picks(database, biggest.map_id, stills, seen, cloud, work, seed)
+    return {
+        "refused": "" if placed else "the map was not placed by the picks of one frame",
+        "map_id": biggest.map_id,
+        "keyframes": biggest.images,
+        "made_s": made.seconds,
+    }
 
 
 def track_figures(metres: np.ndarray) -> dict[str, float]:

@@ -162,6 +162,7 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="last_over_first", most=1.3),
             Limit(figure="lost", most=12),
         ),
+        resumes=True,
         readme=True,
         minutes=25,
     ),
