@@ -36,6 +36,7 @@ from tools.picked import Scan, picks, read_scan, write_picks
 from tools.real_photos import ask_poses, error_figures
 
 _HELD_OUT = ("DJI_0020.JPG", "DJI_0025.JPG", "DJI_0030.JPG", "DJI_0033.JPG")
+_MADE = "made.json"  # what came of the photos; who starts again goes on from there
 _WRONG_M = 1.0
 _MAX_M, _MAX_DEG = 0.25, 0.25
 _MAX_REFUSED = 0.1
@@ -54,10 +55,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     placed: list[dict[str, float]] = []
     with tempfile.TemporaryDirectory() as scratch:
         work = args.work or Path(scratch)
-        photos = copied(args.photos, names, work / "photos", strip=True)
-        copied(args.photos, args.held_out, work / "asked", strip=True)
-        made = make(work / "db", "photos", photos, len(names))
-        featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
+        if not (work / _MADE).exists():
+            photos = copied(args.photos, names, work / "photos", strip=True)
+            copied(args.photos, args.held_out, work / "asked", strip=True)
+            made = make(work / "db", "photos", photos, len(names))
+            featuredb("lidar", "add", str(work / "db"), str(args.scan), "--quiet")
+            write_figures(work / _MADE, {"maps": made.maps, "largest": made.largest})
+        figures |= json.loads((work / _MADE).read_text(encoding="utf-8"))
         (summary, *_) = Database.open(work / "db").snapshot().unplaced_maps()
         for number in range(args.draws):
             done = work / f"draw-{number}.json"
@@ -67,7 +71,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             one = json.loads(done.read_text(encoding="utf-8"))
             sys.stdout.write(f"draw {number}: {one or 'refused'}\n")
             placed += [one] if one else []
-    figures |= {"maps": made.maps, "largest": made.largest}
     figures |= summed(placed, args.draws)
     sys.stdout.write(f"{figures}\n")
     write_figures(args.json, figures)
