@@ -103,6 +103,8 @@ class TrackOptions:
             that come one in a second are each looked for, and not one in twenty.
         catch_up: frames by which a track that was found comes nearer to the frame at hand with each new one,
             two or more. With all at once one frame waited for 0.18 s.
+        earlier: frames before one that is looked for that are kept, and followed backwards once it is found:
+            the first frames of a film may be harder to find than those two seconds on. Not live.
         live: answers are taken as soon as they are there, and no frame waits for one. live_frames: that are
             kept meanwhile; 60 are two seconds, and 55 MB at 1280x720. live_steps: frames by which a track
             that was found is carried to the one at hand while a client waits; more are left to the thread.
@@ -134,6 +136,7 @@ class TrackOptions:
     answer_after_s: float = 0.6
     lost_answer_after_s: float = 1.0
     catch_up: int = 5
+    earlier: int = 60
     live: bool = False
     live_frames: int = 60
     live_steps: int = 3

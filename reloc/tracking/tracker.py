@@ -254,7 +254,7 @@ class Tracker:
         if self._sent is None:
             return None
         searched = self._track is None and not self._options.live
-        return self._sent.index - (self._options.lost_answer_after if searched else 0)
+        return self._sent.index - (self._options.earlier if searched else 0)
 
     def _answer(self, now: RecentFrame) -> "tuple[Answer | None, _Sent | None]":
         """What the thread has found: at the frame at which it is due; live: as soon as it is there."""
@@ -423,4 +423,4 @@ def _frames_kept(options: TrackOptions) -> int:
     if options.live:
         return options.live_frames
     meanwhile = -(-options.lost_answer_after // (options.catch_up - 1))
-    return 2 + max(options.answer_after, 2 * options.lost_answer_after + meanwhile)
+    return 2 + max(options.answer_after, options.earlier + options.lost_answer_after + meanwhile)
