@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from featuredb.features.extractor import extract
+from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from ingest.video.same_scene import SceneOptions, matched
 
@@ -95,23 +96,30 @@ def _changes(pictures: Sequence[NDArray[np.uint8]], options: ZoomOptions) -> NDA
     shape = pictures[0].shape
     growth = np.zeros(len(pictures))
     turned = np.zeros(len(pictures), dtype=np.bool_)
-    pairs = []
     for k in range(1, len(pictures)):
         a, b = _rays(*matched(features[k - 1], features[k], options.scene.max_ratio), shape, options)
         if len(a) >= options.least:
             growth[k], share = _turn_and_zoom(a, b, max(shape), options)
             turned[k] = share >= options.turn_share
-        if k >= options.apart:
-            other = features[k - options.apart]
-            a, b = _rays(*matched(other, features[k], options.scene.max_ratio), shape, options)
-            left = _left_over(a, b, max(shape), options) if len(a) >= options.least else None
-            if left is not None:
-                pairs.append(_Pair(first=k - options.apart, second=k, matches=len(a), left=left))
+    if np.ptp(np.cumsum(growth)) < np.log(options.least_zoom):
+        return changed  # a zoom makes the picture grow, or shrink
     for run in _runs(turned & (np.abs(growth) >= np.log(options.turn_zoom))):
         if abs(growth[run].sum()) >= np.log(options.turn_total):
             changed[run] = True
-    _split(pairs, growth, changed, options)
+    _split(_pairs(features, shape, options), growth, changed, options)
     return changed
+
+
+def _pairs(features: Sequence[Features], shape: tuple[int, ...], options: ZoomOptions) -> list[_Pair]:
+    """Pairs of pictures that say something of their focal length."""
+    pairs = []
+    for k in range(options.apart, len(features)):
+        first = k - options.apart
+        a, b = _rays(*matched(features[first], features[k], options.scene.max_ratio), shape, options)
+        left = _left_over(a, b, max(shape), options) if len(a) >= options.least else None
+        if left is not None:
+            pairs.append(_Pair(first=first, second=k, matches=len(a), left=left))
+    return pairs
 
 
 def _split(
