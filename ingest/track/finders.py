@@ -62,6 +62,8 @@ def finder_for(
         return _maps(database, asked, options)
     rough = None if asked.pose_file is None else read_pose(asked.pose_file, "the first frame")
     if asked.by == "scan":
+        if asked.maps:
+            raise InvalidValueError("--by scan follows a scan alone and no map; leave out --map or --by scan")
         if rough is None or camera is None:
             raise InvalidValueError(
                 "a scan alone tells neither the lens nor where to look: give --camera and --pose, or let a "

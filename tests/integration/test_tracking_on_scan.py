@@ -228,6 +228,7 @@ def test_the_command_follows_a_film_by_a_scan(
     ("words", "told"),
     [
         (["--by", "scan"], "give --camera and --pose"),
+        (["--by", "scan", "--map", "hills"], "leave out --map or --by scan"),
         (["--pose", "pose.json"], "are for --by scan and --by both"),
         (["--by", "both", "--scan", "none"], "no scan none"),
         (["--by", "both", "--pose", "missing.json"], "cannot be read as JSON"),
