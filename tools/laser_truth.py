@@ -20,6 +20,7 @@ import pycolmap
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import AnyMap
 from tools.figures import add_json_option, write_figures
@@ -88,7 +89,7 @@ def camera_file(folder: Path, photo: str) -> Path:
 def true_pose(path: Path) -> Rigid3:
     """The pose in a file of Strecha's: cam_from_world."""
     rows = [[float(word) for word in line.split()] for line in path.read_text(encoding="utf-8").splitlines()]
-    world_from_cam, center = np.array(rows[_ROTATION_LINES]), np.array(rows[_CENTER_LINE])
+    world_from_cam, center = nearest_rotation(rows[_ROTATION_LINES]), np.array(rows[_CENTER_LINE])
     return Rigid3(rotation=world_from_cam.T, translation=-world_from_cam.T @ center)
 
 
