@@ -394,11 +394,11 @@ def test_a_map_without_a_place_is_shown_in_its_own_frame_and_says_how_to_place_i
         seen.page.select_option("#place", label="random map 1, no place on Earth")
         seen.page.wait_for_selector("#own-frame:has-text('No place on Earth')")
         assert not seen.page.locator("#north").is_visible()
-        assert seen.page.locator("#scale-text").inner_text().endswith(" units")
+        seen.page.wait_for_selector("#scale-text:has-text(' units')")  # of the next frame that is drawn
         seen.only("points", "photos")
         assert coloured(seen.pixels()) > 500
         seen.page.locator("#canvas").hover(position={"x": 300, "y": 200})
-        assert seen.page.locator("#readout").inner_text().endswith("units, no place on Earth")
+        seen.page.wait_for_selector("#readout:has-text('units, no place on Earth')")
         seen.page.wait_for_timeout(300)  # longer than a spot on Earth would be asked for
         assert not [request for request in seen.requests if "/api/where" in request]
         seen.page.locator("#tree button[title=map-1]").click()

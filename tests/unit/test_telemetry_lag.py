@@ -33,6 +33,8 @@ def _motion(rng: np.random.Generator, steady: bool = False) -> Motion:
         time_s=times,
         step=step,
         broken=np.arange(len(times)) == 0,
+        cut=np.arange(len(times)) == 0,
+        kind=np.zeros(len(times), np.int8),
         sharpness=np.ones(len(times)),
     )
 

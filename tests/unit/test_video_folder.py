@@ -155,11 +155,11 @@ def test_a_folder_says_whose_lens_its_pictures_have(tmp_path: Path) -> None:
     assert (info.make, info.model) == ("Maker", "One")
     assert info.camera_key.startswith(f"maker|one|{WIDTH}x{HEIGHT}|f")
     assert info.focal_px == pytest.approx(np.hypot(WIDTH, HEIGHT) * 36 / 43.2666, rel=0.01)
-    known = _with_film(LocaliseRequest(), info)  # of the frames, which are smaller
+    known = _with_film(LocaliseRequest(), info, folder)  # of the frames, which are smaller
     assert known.camera_key == info.camera_key
     assert known.exif_focal_px == pytest.approx(info.focal_px * 80 / WIDTH)
-    assert _with_film(LocaliseRequest(exif_focal_px=7.0), info) == LocaliseRequest(exif_focal_px=7.0)
+    assert _with_film(LocaliseRequest(exif_focal_px=7.0), info, folder) == LocaliseRequest(exif_focal_px=7.0)
     write(2, "Two")
     with open_video(folder, VideoOptions(fps=1.0)) as video:
         assert (video.info.camera_key, video.info.focal_px) == ("", None)
-        assert _with_film(LocaliseRequest(), video.info) == LocaliseRequest()
+        assert _with_film(LocaliseRequest(), video.info, folder) == LocaliseRequest()
