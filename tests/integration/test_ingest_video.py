@@ -115,6 +115,7 @@ def test_the_lag_is_looked_for_and_what_was_found_is_said(film: Path, tmp_path: 
     assert any("lag" in note for note in stills.notes)
 
 
+@pytest.mark.evaluation
 def test_other_telemetry_and_other_names_are_made_anew(film: Path, tmp_path: Path) -> None:
     """The same file name with other positions; the same film under another name."""
     telemetry = read_telemetry(film.with_suffix(".srt"))
@@ -201,7 +202,7 @@ def _gpx(log: Path, path: Path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", ["csv", "gpx"])
+@pytest.mark.parametrize("kind", ["csv", pytest.param("gpx", marks=pytest.mark.evaluation)])
 def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: Path, kind: str) -> None:
     log = _log(tmp_path / "log.csv")
     telemetry = read_telemetry(log if kind == "csv" else _gpx(log, tmp_path / "log.gpx"))
