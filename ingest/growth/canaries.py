@@ -25,6 +25,7 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
+from ingest.growth.stored_photos import observed_features
 from reloc.localise import localise_features
 from reloc.localiser import Localiser
 from reloc.options import LocaliseOptions
@@ -240,18 +241,7 @@ def features_and_points(feature_map: FeatureMap, image: MapImage) -> tuple[Featu
     seen = feature_map.observations
     rows = np.flatnonzero((seen.image_id == image.image_id) & seen.has_descriptor)
     rows = rows[np.argsort(-seen.scale[rows], kind="stable")]
-    camera = feature_map.cameras[image.camera_id]
-    features = Features(
-        xy=seen.xy[rows],
-        scale=seen.scale[rows],
-        angle=seen.angle[rows],
-        response=np.linspace(1.0, 0.5, len(rows), dtype=np.float32),
-        descriptors=seen.descriptors[rows],
-        width=camera.width,
-        height=camera.height,
-        fingerprint=feature_map.extractor_fingerprint,
-    )
-    return features, seen.point_index[rows]
+    return observed_features(feature_map, image, rows), seen.point_index[rows]
 
 
 def _check_own(

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from featuredb.features.features import Features
 from featuredb.maps.feature_map import MapImage
-from featuredb.maps.unplaced_map import UnplacedMap
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.photo import Photo
@@ -47,7 +47,8 @@ def stored_photos(unplaced: UnplacedMap) -> StoredPhotos:
     for row, image in enumerate(unplaced.images):
         rows = np.flatnonzero(seen.image_id == image.image_id)
         rows = rows[np.lexsort((-seen.scale[rows], ~seen.has_descriptor[rows]))]
-        features.append(_features(unplaced, image, rows))
+        rgb = unplaced.points.rgb[unplaced.observations.point_index[rows]]
+        features.append(PhotoFeatures(features=observed_features(unplaced, image, rows), rgb=rgb))
         described.append(int(seen.has_descriptor[rows].sum()))
         point_of.append(seen.point_index[rows])
         photo_of.append(np.full(len(rows), row, dtype=np.int64))
@@ -72,9 +73,10 @@ def stored_photos(unplaced: UnplacedMap) -> StoredPhotos:
     )
 
 
-def _features(unplaced: UnplacedMap, image: MapImage, rows: NDArray[np.int64]) -> PhotoFeatures:
-    seen, camera = unplaced.observations, unplaced.cameras[image.camera_id]
-    features = Features(
+def observed_features(any_map: AnyMap, image: MapImage, rows: NDArray[np.int64]) -> Features:
+    """Rows (n,) of a map's observations, all of one image, as features of that photo, best first."""
+    seen, camera = any_map.observations, any_map.cameras[image.camera_id]
+    return Features(
         xy=seen.xy[rows],
         scale=seen.scale[rows],
         angle=seen.angle[rows],
@@ -82,9 +84,8 @@ def _features(unplaced: UnplacedMap, image: MapImage, rows: NDArray[np.int64]) -
         descriptors=seen.descriptors[rows],
         width=camera.width,
         height=camera.height,
-        fingerprint=unplaced.extractor_fingerprint,
+        fingerprint=any_map.extractor_fingerprint,
     )
-    return PhotoFeatures(features=features, rgb=unplaced.points.rgb[seen.point_index[rows]])
 
 
 def _photo(unplaced: UnplacedMap, image: MapImage) -> Photo:

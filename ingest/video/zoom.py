@@ -2,7 +2,8 @@
 
 What a focal length leaves over of the matches of two pictures (epipolar geometry, nothing reconstructed) is a
 likelihood of it. A single pair tells little, one of a camera that does not turn nothing; all pairs before a
-moment and all behind it together tell whether one focal length explains both, by an F-test. A camera that
+moment and all behind it together tell whether one focal length explains both, by the ratio of variances (its
+limit stands between what films with and without a zoom have shown, not at a rate of error). A camera that
 only turns while it zooms sees no parallax: there a rotation and a zoom explain all of the motion.
 """
 
