@@ -8,7 +8,7 @@ from scipy.special import gammaincinv
 
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.geometry.rotation import quaternion_from_matrix, skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
@@ -33,7 +33,7 @@ def make_answer(
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
-    covariance = on_earth(area, main, center, uncertainty.covariance)
+    covariance = on_earth(area, main, center, uncertainty.covariance, point_rows)
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(
         frame=area.frame,
@@ -84,15 +84,43 @@ def placement_covariance(area: Area, feature_map: FeatureMap, center: FloatArray
     return np.asarray(placed, dtype=np.float64)
 
 
-def on_earth(area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray) -> FloatArray:
-    """Measured covariance (6, 6) plus that of the map's placement, in true east-north-up at the camera.
+def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> FloatArray:
+    """What the map's adjustment adds to the covariance (6, 6) of a pose, in the area's axes.
+
+    The pose of the map's image that shares most points stands for the shape of the map there: what moved it
+    moves whoever is localised by those points.
+
+    Args:
+        center: (3,) camera centre in the area's frame. rows: of the area's points that gave the pose.
+    """
+    wanted = np.zeros(len(area.points), dtype=np.bool_)
+    wanted[rows] = True
+    shared = np.bincount(area.see_image[wanted[area.see_point]], minlength=len(area.image_map))
+    best = int(np.argmax(shared))
+    feature_map = area.maps[int(area.image_map[best])]
+    first = int(np.searchsorted(area.image_map, area.image_map[best]))
+    image = feature_map.images[best - first]
+    if image.covariance is None:
+        return np.zeros((6, 6))
+    turn = area.frame.enu_from(feature_map.frame).rotation @ image.cam_from_local.rotation.T
+    arm = np.eye(6)
+    arm[3:, :3] = -skew(center - area.image_center[best])
+    by_pose = arm @ np.kron(np.eye(2), -turn)
+    return np.asarray(by_pose @ image.covariance @ by_pose.T, dtype=np.float64)
+
+
+def on_earth(
+    area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray, rows: NDArray[np.int64]
+) -> FloatArray:
+    """Measured covariance (6, 6) plus those of the map and its placement, true east-north-up at the camera.
 
     Args:
         center: (3,) camera centre in the area's frame. measured: in the area's axes.
+        rows: of the area's points that gave the pose.
     """
-    placed = placement_covariance(area, main, center)
+    mapped = placement_covariance(area, main, center) + map_covariance(area, center, rows)
     to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
-    covariance = to_true @ (measured + placed) @ to_true.T
+    covariance = to_true @ (measured + mapped) @ to_true.T
     return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
 
 

@@ -72,7 +72,7 @@ class MapImage:
         sha256: hex digest of the file's bytes.
         camera_id: index into FeatureMap.cameras.
         cam_from_local: pose, local ENU frame of the map to camera (x right, y down, z forward), metres.
-        covariance: (6, 6) of cam_from_local's left perturbation, relative to the map's points, or None.
+        covariance: (6, 6) of cam_from_local's left perturbation, relative to the map's placement, or None.
         capture_time: as the photo says, timezone-aware where it says so, or None.
         gps: the photo's own position, or None.
         owner, licence: attribution, "" where unknown.

@@ -1,21 +1,13 @@
-"""A photogrammetric block: cameras, poses, points and their observations as plain arrays.
-
-What control points place and adjust. It is made of a reconstruction before there is a map, or of a map
-that has a place already; it goes back into either.
-"""
+"""Blocks of reconstructions before there is a map, and of maps that have a place; and the way back."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
@@ -27,45 +19,6 @@ from ingest.precision import (
     residual_variance,
     upper_triangle,
 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Block:
-    """Photos, points and observations in one frame, "block", of any scale and orientation.
-
-    Attributes:
-        names: of the k photos.
-        cameras: intrinsics; camera_of: (k,) index into them.
-        cam_from_block: k poses.
-        xyz: (n, 3) points.
-        point_of, photo_of: (m,) int64, what each observation sees, and in which photo.
-        xy: (m, 2) full-size pixels.
-    """
-
-    names: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    camera_of: NDArray[np.int64]
-    cam_from_block: tuple[Rigid3, ...]
-    xyz: FloatArray
-    point_of: NDArray[np.int64]
-    photo_of: NDArray[np.int64]
-    xy: FloatArray
-
-    def camera(self, photo: int) -> Camera:
-        """Intrinsics of a photo."""
-        return self.cameras[int(self.camera_of[photo])]
-
-    def centers(self) -> FloatArray:
-        """Camera centres (k, 3)."""
-        return np.array([pose.center for pose in self.cam_from_block]).reshape(-1, 3)
-
-    def moved(self, target_from_block: Sim3) -> "Block":
-        """The same block in another frame."""
-        return replace(
-            self,
-            cam_from_block=tuple(target_from_block.act_on_pose(pose) for pose in self.cam_from_block),
-            xyz=target_from_block.act(self.xyz),
-        )
 
 
 def block_of_model(model: Model, photos: Sequence[Photo], features: Sequence[PhotoFeatures]) -> Block:

@@ -95,7 +95,7 @@ class MapGround:
             epsg=main.epsg,
             height_datum=main.height_datum,
             map_id=main.map_id,
-            covariance=on_earth(area, main, center, measured),
+            covariance=on_earth(area, main, center, measured, rows),
         )
 
     def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.block import Block
 from ingest.register.control.control_file import ControlFile, Mark, parse_control_file
 from ingest.register.control.marks import Control, meet
 from tests.support.planar_map import view

@@ -15,7 +15,6 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from ingest.register.anchor.page import FramePicture, flick_page
 from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
-from ingest.register.anchor.placing import with_fuller_lens
 from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
 from ingest.register.anchor.proposals import ProposalOptions, propose_frames, small_camera
 from ingest.register.anchor.start import cam_from_grid
@@ -210,19 +209,6 @@ def test_small_cameras_keep_the_picture() -> None:
     assert small.params == pytest.approx((896.0, 896.0, 640.0, 360.0))
     tiny = Camera(model="PINHOLE", width=90, height=60, params=(80, 80, 45, 30))
     assert small_camera(tiny, 200) == tiny
-
-
-def test_a_fuller_lens_is_the_same_lens_at_first() -> None:
-    feature_map = random_map(1)
-    fuller = with_fuller_lens(feature_map)
-    assert [camera.model for camera in fuller.cameras] == ["OPENCV", "OPENCV"]
-    rays = np.random.default_rng(0).uniform([-0.5, -0.4, 1.0], [0.5, 0.4, 1.0], (50, 3))
-    for old, new in zip(feature_map.cameras, fuller.cameras, strict=True):
-        np.testing.assert_allclose(new.project(rays), old.project(rays), atol=1e-9)
-    assert with_fuller_lens(fuller) is fuller
-    radial = Camera(model="RADIAL", width=800, height=600, params=(700.0, 401.0, 299.0, 0.02, -0.01))
-    full = with_fuller_lens(replace(feature_map, cameras=(radial, radial))).cameras[0]
-    np.testing.assert_allclose(full.project(rays), radial.project(rays), atol=1e-9)
 
 
 def registration() -> FrameRegistration:

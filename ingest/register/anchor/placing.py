@@ -3,7 +3,6 @@
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import replace
 
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
@@ -13,13 +12,11 @@ from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.values import AnchorOptions, PlaceRound
 from ingest.register.structure.adjustment import (
-    LidarAdjustment,
     adjust_to_scan,
     adjusted_map,
 )
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import (
-    StructurePlacement,
     placed_map,
     project_structure,
 )
@@ -41,8 +38,8 @@ def place_in_rounds(
     of the way, and the next registration finds others. Each round places the map as it was.
     """
     placed: FeatureMap | None = None
+    adjusted: FeatureMap | None = None
     rounds: list[PlaceRound] = []
-    base = feature_map
     for number in range(options.lens_rounds):
         lens = (placed or feature_map).cameras
         registered = [with_lens(frame, lens) for frame in frames]
@@ -56,10 +53,10 @@ def place_in_rounds(
                 )
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
-        base, adjustment = _adjusted(base, structure, registered, cloud, options, choose=number == 0)
+        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, options.adjust, adjusted)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
-            placed = adjusted_map(base, adjustment, cloud)
+            placed = adjusted = adjusted_map(feature_map, adjustment, cloud)
         elif placed is None:
             placed = placed_map(feature_map, structure, cloud)
         rounds.append(
@@ -97,47 +94,6 @@ def place_in_rounds(
             break
         frames = kept
     return placed, rounds, ""
-
-
-def _adjusted(
-    base: FeatureMap,
-    structure: StructurePlacement,
-    registered: Sequence[RegisteredImage],
-    cloud: PointCloud,
-    options: AnchorOptions,
-    *,
-    choose: bool,
-) -> tuple[FeatureMap, LidarAdjustment]:
-    """The adjustment, and the map that it belongs to: with `choose` one with a fuller lens, if that pays."""
-    plain = adjust_to_scan(base, structure, registered, cloud, options.adjust)
-    richer = with_fuller_lens(base)
-    if not choose or richer is base or len(registered) < options.fuller_lens_frames:
-        return base, plain
-    fuller = adjust_to_scan(richer, structure, registered, cloud, options.adjust)
-    if not fuller.accepted:
-        return base, plain
-    if plain.accepted:
-        before, after = (a.figures["after"]["control_median_px"] for a in (plain, fuller))
-        if after > (1.0 - options.fuller_lens_gain) * before:
-            return base, plain
-    return richer, fuller
-
-
-def with_fuller_lens(feature_map: FeatureMap) -> FeatureMap:
-    """The same map whose radial cameras have tangential terms and two focal lengths, as yet without effect.
-
-    The map itself where no camera is radial.
-    """
-    cameras = tuple(_fuller(camera) for camera in feature_map.cameras)
-    return feature_map if cameras == feature_map.cameras else replace(feature_map, cameras=cameras)
-
-
-def _fuller(camera: Camera) -> Camera:
-    if camera.model not in ("SIMPLE_RADIAL", "RADIAL"):
-        return camera
-    f, cx, cy, *radial = camera.params
-    k1, k2 = (*radial, 0.0)[:2]
-    return replace(camera, model="OPENCV", params=(f, f, cx, cy, k1, k2, 0.0, 0.0))
 
 
 def with_lens(frame: TriedFrame, lens: Sequence[Camera]) -> RegisteredImage:

@@ -29,11 +29,6 @@ class AnchorOptions:
         frames: which frames, and how each is registered.
         agreement: of frames with each other.
         structure, adjust: of the placing.
-        fuller_lens_gain: share by which tangential terms must lower the median error of the frames'
-            correspondences with the scan, so that the map's lens gets them. Photos alone trade them against
-            tilt over flat ground (decision 0004); the scan knows the tilt. Thousands of correspondences gain
-            less than a percent by four parameters that are not there.
-        fuller_lens_frames: with fewer frames the lens stays as it is.
         min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
             verdict is good; two that were found independently and agree are hardly both wrong.
         max_placement_sigmas: how far the map may move in the plane and turn, in standard deviations of its
@@ -54,8 +49,6 @@ class AnchorOptions:
     agreement: AgreementOptions = field(default_factory=AgreementOptions)
     structure: StructureOptions = field(default_factory=StructureOptions)
     adjust: AdjustLidarOptions = field(default_factory=AdjustLidarOptions)
-    fuller_lens_gain: float = 0.05
-    fuller_lens_frames: int = 2
     min_agreeing: int = 2
     max_placement_sigmas: float = 6.0
     min_move_m: float = 2.0

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
-from ingest.register.block import Block
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.normal_system import (

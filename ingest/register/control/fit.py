@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.register.block import Block
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import intersect, mark_errors, on_ground
 from ingest.register.gps import similarity_closed_form

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.block import Block
 from ingest.register.control.fit import Vertical
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from ingest.register.block import Block
 from ingest.register.control.control_file import ControlFile, Mark
 
 

@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import Placement
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.photo import Photo
-from ingest.register.block import Block, block_of_model, model_of_block
+from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.evidence import gcp_evidence
 from ingest.register.control.marks import Control, control_frame, meet

@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.block import Block
 from ingest.register.control.adjust import Adjusted, AdjustOptions, adjust
 from ingest.register.control.fit import (
     ControlFit,

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from ingest.precision import linearise
-from ingest.register.block import Block
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near
 _MAX_DISTANCE_SHARE = 0.1  # of the photo's diagonal; further away the ground may be anything

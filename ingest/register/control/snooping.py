@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as f_distribution
 
+from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from ingest.precision import Linearised, linearise
-from ingest.register.block import Block
 from ingest.register.control.adjust import Adjusted
 from ingest.register.control.fit import ControlFit
 from ingest.register.control.marks import Control

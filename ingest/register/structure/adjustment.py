@@ -6,6 +6,7 @@ ground, and yet its cameras stand metres too high. What the registered frames se
 correspondences) and the scan's surface under all points of the map determine poses, lens and points together.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -14,18 +15,23 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block, whole_lens
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import LensWidths, Marks, Terms, lens_prior, surface_priors
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
-from ingest.precision import linearise
-from ingest.register.block import Block, block_of_map, map_of_block
+from ingest.precision import design_effect, linearise
+from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
-from ingest.register.structure.scan_block import Control, Planes, Sigmas, lens_covariance, solve
 from ingest.register.structure.similarity import similarities
 from ingest.register.structure.surface_fit import Surface, SurfaceOptions, plane_distances, surface_near
+
+_LOG = logging.getLogger(__name__)
+_FUNCTION_TOLERANCE = 1e-6  # of a round, relative
 
 AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
@@ -44,7 +50,8 @@ class AdjustLidarOptions:
         focal_rel: standard deviation of the focal length's prior: structure from motion over flat ground
             was 25 % off on `brighton`.
         center_rel: of the principal point's, as a share of the longer side: most lenses are centred to that.
-        distortion: of a distortion coefficient's.
+        aspect_rel: of the ratio of the two focal lengths: pixels are square.
+        radial, tangential: of a coefficient's.
         rounds: of looking up the scan's planes; it ends earlier when points move by less than `settled_m`.
         steps: of the solver in each round.
         settled_m: see above; far below a scan's noise.
@@ -62,9 +69,11 @@ class AdjustLidarOptions:
     min_surface_m: float = 0.03
     focal_rel: float = 0.3
     center_rel: float = 0.02
-    distortion: float = 0.1
+    aspect_rel: float = 0.002
+    radial: float = 0.1
+    tangential: float = 0.003
     rounds: int = 25
-    steps: int = 4
+    steps: int = 8
     settled_m: float = 1e-3
     reach_m: float = 1.0
     max_control_rel: float = 0.002
@@ -80,8 +89,8 @@ class LidarAdjustment:
     Attributes:
         reason: gate that refused it, or None; `message` says it for people.
         block: the map in the cloud's local frame, None when refused.
-        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity) and of what its
-            lens leaves open, or None.
+        covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
+        poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
         before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
         seconds: of the whole.
@@ -91,6 +100,7 @@ class LidarAdjustment:
     message: str
     block: Block | None
     covariance: FloatArray | None
+    poses: tuple[FloatArray, ...]
     before_m: FloatArray
     after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
@@ -107,6 +117,7 @@ def adjust_to_scan(
     registered: Sequence[RegisteredImage],
     cloud: PointCloud,
     options: AdjustLidarOptions | None = None,
+    begin: FeatureMap | None = None,
 ) -> LidarAdjustment:
     """Adjust a map that `structure` has placed, lens included.
 
@@ -115,12 +126,13 @@ def adjust_to_scan(
         registered: the frames with their correspondences, in the cloud's local frame. A frame without
             correspondences takes part by the pairs of structure projection, which know no better lens than
             the one it was registered with.
+        begin: the map as an earlier adjustment left it, from which the solver starts.
     """
     options = options or AdjustLidarOptions()
     started = time.perf_counter()
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
-    start = block_of_map(feature_map).moved(structure.new_from_old @ to_cloud)
+    start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
     control = control_of(feature_map, structure, registered)
     nothing = np.full(len(start.xyz), np.nan)
     if len(control.xyz) < options.min_control:
@@ -130,7 +142,10 @@ def adjust_to_scan(
     surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
     if surface is None:
         return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {}, started)
-    block = _iterate(start, control, surface, options)
+    first = start
+    if begin is not None:
+        first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
+    block = _iterate(first, start.cameras, control, surface, options)
     before = plane_distances(surface, start.xyz, options.reach_m)
     after = plane_distances(surface, block.xyz, options.reach_m)
     figures = {
@@ -147,7 +162,8 @@ def adjust_to_scan(
         reason=None,
         message="adjusted to the scan",
         block=block,
-        covariance=_placement_covariance(block, control, surface, structure, start, options),
+        covariance=structure.covariance,
+        poses=_pose_covariances(block, control, surface, structure, start, options),
         before_m=before,
         after_m=after,
         figures=figures,
@@ -173,12 +189,14 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
         residual_rms_m=float(adjustment.figures["after"]["surface_rms_m"]),
         evidence={"adjustment": adjustment.figures, "replaces": feature_map.placement.method},
     )
-    return map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+    placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
+    images = zip(placed.images, adjustment.poses, strict=True)
+    return replace(placed, images=tuple(replace(image, covariance=c) for image, c in images))
 
 
 def control_of(
     feature_map: FeatureMap, structure: StructurePlacement, registered: Sequence[RegisteredImage]
-) -> Control:
+) -> Marks:
     """Scan points that the registered frames see, by their correspondences or else by their pairs."""
     row_of_image = {image.image_id: row for row, image in enumerate(feature_map.images)}
     xyz, xy, photo_of = [], [], []
@@ -189,7 +207,7 @@ def control_of(
         xyz.append(points)
         xy.append(pixels)
         photo_of.append(np.full(len(points), row_of_image[item.image_id], dtype=np.int64))
-    return Control(
+    return Marks(
         xyz=np.concatenate(xyz).reshape(-1, 3),
         photo_of=np.concatenate(photo_of),
         xy=np.concatenate(xy).reshape(-1, 2),
@@ -208,73 +226,96 @@ def _pairs_as_control(
     return structure.pairs.target[rows], observations.xy[seen].astype(np.float64)
 
 
-def _iterate(start: Block, control: Control, surface: Surface, options: AdjustLidarOptions) -> Block:
+def _iterate(
+    start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface, options: AdjustLidarOptions
+) -> Block:
     """Rounds of planes, standard deviations and solving until the points settle."""
     block = start
     for _ in range(options.rounds):
-        planes = _planes(surface, block.xyz, options.reach_m)
-        sigmas = _sigmas(block, control, planes, options)
-        moved = solve(block, control, planes, start.cameras, sigmas, options.steps)
-        settled = np.median(np.linalg.norm(moved.xyz - block.xyz, axis=1)) < options.settled_m
-        settled &= np.linalg.norm(moved.centers() - block.centers(), axis=1).max() < 5 * options.settled_m
-        block = moved
-        if settled:
+        sigmas = _sigmas(block, control, _planes(surface, block.xyz, options.reach_m)[0], options)
+        problem = Problem(block, _terms(block, control, surface, lenses, sigmas, options))
+        problem.solve(options.steps, _FUNCTION_TOLERANCE)
+        moved = problem.block()
+        step_m, block = _step_m(block, moved), moved
+        _LOG.debug("sigmas %s, points moved %.4f m", sigmas, step_m)
+        if step_m < options.settled_m:
             break
     return block
 
 
-def _placement_covariance(
+def _step_m(before: Block, after: Block) -> float:
+    """How far points (median) or cameras (largest, a fifth of it) have moved."""
+    points = float(np.median(np.linalg.norm(after.xyz - before.xyz, axis=1)))
+    return max(points, float(np.linalg.norm(after.centers() - before.centers(), axis=1).max()) / 5.0)
+
+
+def _terms(
     block: Block,
-    control: Control,
+    control: Marks,
+    surface: Surface,
+    lenses: tuple[Camera, ...],
+    sigmas: "_Sigmas",
+    options: AdjustLidarOptions,
+) -> Terms:
+    widths = LensWidths(
+        focal_rel=options.focal_rel,
+        aspect_rel=options.aspect_rel,
+        center_rel=options.center_rel,
+        radial=options.radial,
+        tangential=options.tangential,
+    )
+    return Terms(
+        keypoint_px=sigmas.track_px,
+        lenses=tuple(lens_prior(camera, widths) for camera in lenses),
+        marks=replace(control, sigma_px=sigmas.control_px),
+        points=surface_priors(block.xyz, *_planes(surface, block.xyz, options.reach_m), sigmas.surface_m),
+    )
+
+
+def _pose_covariances(
+    block: Block,
+    control: Marks,
     surface: Surface,
     structure: StructurePlacement,
     start: Block,
     options: AdjustLidarOptions,
-) -> FloatArray:
-    """(7, 7): the similarity's, and what the lens leaves open for whoever is localised through it.
+) -> tuple[FloatArray, ...]:
+    """(6, 6) of each pose with all that points and lenses leave open.
 
-    A principal point that is wrong by a pixel moves a camera that looks down by a pixel on the ground, a
-    focal length that is wrong by a thousandth lifts it by a thousandth of the distance. Points do not move
-    so far: for them the covariance is on the safe side. Residuals count with their spread as it is, and as
-    neighbours err alike, by as much less as the pairs of structure projection do.
+    Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
+    or the pairs of structure projection do.
     """
-    assert structure.covariance is not None  # accepted
-    planes = _planes(surface, block.xyz, options.reach_m)
-    sigmas = _sigmas(block, control, planes, replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3))
-    lenses = lens_covariance(block, control, planes, start.cameras, sigmas)
-    distances = np.linalg.norm(block.xyz[block.point_of] - block.centers()[block.photo_of], axis=1)
-    distance = float(np.median(distances))
-    variances = []
-    for camera, lens in zip(block.cameras, lenses, strict=True):
-        template = camera.to_pycolmap()
-        focal, center = template.focal_length_idxs(), template.principal_point_idxs()
-        relative = np.diag(lens) * (distance / camera.focal_px) ** 2
-        variances.append([relative[center].max(), relative[center].max(), relative[focal].max()])
-    covariance = np.array(structure.covariance)
-    dilution = float(structure.figures["neighbours_factor"])
-    covariance[4:, 4:] += dilution * np.diag(np.max(variances, axis=0))
-    return covariance
+    as_is = replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3)
+    sigmas = _sigmas(block, control, _planes(surface, block.xyz, options.reach_m)[0], as_is)
+    found = Problem(block, _terms(block, control, surface, start.cameras, sigmas, options)).marginals()
+    shared = design_effect(_track_residuals(block), block.xy, block.photo_of, _longer_side(block))
+    dilution = max(float(structure.figures["neighbours_factor"]), shared)
+    return tuple(dilution * found.pose(k) for k in range(len(block.names)))
 
 
-def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> Planes:
+def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
+    """Signed distances (n,) from the scan's planes next to the points, NaN beyond reach; normals (n, 3)."""
     centred = np.ascontiguousarray(xyz - surface.middle)
     found, _ = surface.tree.batch_nearest_neighbor_search(centred)
-    return Planes(
-        offset=plane_distances(surface, xyz, reach_m),
-        normals=surface.normals[np.asarray(found).astype(np.int64)],
-    )
+    return plane_distances(surface, xyz, reach_m), surface.normals[np.asarray(found).astype(np.int64)]
 
 
-def _sigmas(block: Block, control: Control, planes: Planes, options: AdjustLidarOptions) -> Sigmas:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Sigmas:
+    """Standard deviations of one residual of each kind."""
+
+    track_px: float
+    control_px: float
+    surface_m: float
+
+
+def _sigmas(block: Block, control: Marks, offset: FloatArray, options: AdjustLidarOptions) -> _Sigmas:
     """Each kind of residual weighs by its own spread as it is now."""
     longer = _longer_side(block)
-    return Sigmas(
+    return _Sigmas(
         track_px=max(options.min_sigma_rel * longer, _spread(_track_residuals(block))),
         control_px=max(options.min_sigma_rel * longer, _spread(_control_residuals(block, control))),
-        surface_m=max(options.min_surface_m, _spread(planes.offset)),
-        focal_rel=options.focal_rel,
-        center_rel=options.center_rel,
-        distortion=options.distortion,
+        surface_m=max(options.min_surface_m, _spread(offset)),
     )
 
 
@@ -292,7 +333,7 @@ def _track_residuals(block: Block) -> FloatArray:
     return _residuals(block, block.xyz, block.point_of, block.photo_of, block.xy)
 
 
-def _control_residuals(block: Block, control: Control) -> FloatArray:
+def _control_residuals(block: Block, control: Marks) -> FloatArray:
     return _residuals(block, control.xyz, np.arange(len(control.xyz)), control.photo_of, control.xy)
 
 
@@ -309,7 +350,7 @@ def _residuals(
     ).residual
 
 
-def _state(block: Block, control: Control, distances: FloatArray) -> dict[str, Any]:
+def _state(block: Block, control: Marks, distances: FloatArray) -> dict[str, Any]:
     tracks = np.linalg.norm(_track_residuals(block), axis=1)
     seen = np.linalg.norm(_control_residuals(block, control), axis=1)
     near = np.abs(distances[np.isfinite(distances)])
@@ -344,7 +385,7 @@ def _gate(
             f"the scan would raise the median reprojection error from {before['reprojection_median_px']:.2f} "
             f"to {after['reprojection_median_px']:.2f} pixels"
         )
-    if after["surface_median_m"] is None or after["surface_median_m"] > before["surface_median_m"]:
+    if after["surface_median_m"] is None or _further(before, after):
         return "SURFACE", "the adjustment brings the map no closer to the scan"
     return None, ""
 
@@ -368,6 +409,14 @@ def _nearest_similarity(source: FloatArray, target: FloatArray) -> Sim3:
     return Sim3(scale=float(scale[0]), rotation=rotation[0], translation=translation[0])
 
 
+def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
+    """Whether the median distance grew by more than three standard errors of two normal medians."""
+    if before["surface_median_m"] is None:
+        return False
+    errors = [1.858 * s["surface_median_m"] / np.sqrt(s["surface_points"]) for s in (before, after)]
+    return bool(after["surface_median_m"] - before["surface_median_m"] > 3.0 * np.hypot(*errors))
+
+
 def _refused(
     reason: AdjustReason,
     message: str,
@@ -381,6 +430,7 @@ def _refused(
         message=message,
         block=None,
         covariance=None,
+        poses=(),
         before_m=before,
         after_m=after,
         figures=figures,

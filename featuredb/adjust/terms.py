@@ -1,0 +1,144 @@
+"""What is known beside the observations: the terms of an adjustment."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensWidths:
+    """Standard deviations of a lens around what is known of it.
+
+    Attributes:
+        focal_rel: of the focal length, relative.
+        aspect_rel: of the ratio of two focal lengths.
+        center_rel: of the principal point, as a share of the longer side.
+        radial: of the first radial coefficient; higher ones are as wide.
+        tangential: of a tangential coefficient.
+    """
+
+    focal_rel: float
+    aspect_rel: float
+    center_rel: float
+    radial: float
+    tangential: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LensPrior:
+    """A lens as it is known beforehand.
+
+    Attributes:
+        mean: expected intrinsics, of the block's model and size.
+        covariance: (p, p) of its parameters.
+    """
+
+    mean: Camera
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Marks:
+    """Points of known position that photos show, such as a scan's: they stay where they are.
+
+    Attributes:
+        xyz: (c, 3) in the block's frame. photo_of: (c,) the block's photo. xy: (c, 2) full-size pixels.
+        sigma_px: of a pixel coordinate.
+    """
+
+    xyz: FloatArray
+    photo_of: NDArray[np.int64]
+    xy: FloatArray
+    sigma_px: float = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PointPriors:
+    """Where points of the block are expected.
+
+    Attributes:
+        point_of: (c,) rows of the block's points. xyz: (c, 3). covariance: (c, 3, 3).
+    """
+
+    point_of: NDArray[np.int64]
+    xyz: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CenterPriors:
+    """Measured positions of cameras.
+
+    Attributes:
+        photo_of: (c,) rows of the block's photos. xyz: (c, 3) in the block's frame. covariance: (c, 3, 3).
+    """
+
+    photo_of: NDArray[np.int64]
+    xyz: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Terms:
+    """All that an adjustment is made of beside the block.
+
+    Everything but the lenses counts with a Cauchy loss on its whitened residual.
+
+    Attributes:
+        keypoint_px: standard deviation of a keypoint's coordinate.
+        lenses: prior of each camera; a camera without one is held.
+        marks, points, centers: see there.
+        held_photos: rows of photos whose poses stay.
+    """
+
+    keypoint_px: float
+    lenses: tuple[LensPrior | None, ...]
+    marks: Marks | None = None
+    points: PointPriors | None = None
+    centers: CenterPriors | None = None
+    held_photos: tuple[int, ...] = field(default=())
+
+
+def lens_prior(mean: Camera, widths: LensWidths) -> LensPrior:
+    """The prior of a lens of any model."""
+    template = mean.to_pycolmap()
+    names = [name.strip() for name in template.params_info.split(",")]
+    sigma = np.zeros(len(names))
+    for k, name in enumerate(names):
+        if k in template.focal_length_idxs():
+            sigma[k] = widths.aspect_rel * mean.focal_px
+        elif k in template.principal_point_idxs():
+            sigma[k] = widths.center_rel * max(mean.width, mean.height)
+        else:
+            sigma[k] = widths.tangential if name.startswith("p") else widths.radial
+    covariance = np.diag(sigma**2)
+    focal = list(template.focal_length_idxs())
+    if len(focal) == 1:
+        covariance[focal[0], focal[0]] = 0.0
+    covariance[np.ix_(focal, focal)] += (widths.focal_rel * mean.focal_px) ** 2
+    return LensPrior(mean=mean, covariance=covariance)
+
+
+def surface_priors(xyz: FloatArray, offset: FloatArray, normals: FloatArray, sigma_m: float) -> PointPriors:
+    """Points on the planes next to them: tight along the normal, loose across it.
+
+    Args:
+        xyz: (n, 3) the block's points. offset: (n,) their signed distances from the planes, NaN for none.
+        normals: (n, 3) unit.
+    """
+    near = np.flatnonzero(np.isfinite(offset))
+    normal = normals[near]
+    along = normal[:, :, None] * normal[:, None, :]
+    across = np.eye(3) - along
+    return PointPriors(
+        point_of=near,
+        xyz=xyz[near] - offset[near, None] * normal,
+        covariance=sigma_m**2 * (along + _LOOSE**2 * across),
+    )
+
+
+_LOOSE = 1e4  # times the sigma along the normal
