@@ -269,6 +269,15 @@ def model_of(reconstruction: Any) -> Model:
     Raises:
         InvalidValueError: a lens that maps do not have.
     """
+    return without_impossible(whole_model_of(reconstruction))
+
+
+def whole_model_of(reconstruction: Any) -> Model:
+    """The same with every observation; points in the order of their ids.
+
+    Raises:
+        InvalidValueError: a lens that maps do not have.
+    """
     image_ids = sorted(reconstruction.reg_image_ids())
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
     index_of_image = {image_id: k for k, image_id in enumerate(image_ids)}
@@ -283,7 +292,7 @@ def model_of(reconstruction: Any) -> Model:
         photo_of.extend(e[0] for e in elements)
         keypoint_of.extend(e[1] for e in elements)
         xyz.append(point.xyz)
-    model = Model(
+    return Model(
         cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c)) for c in camera_ids),
         rows=np.array(image_ids, dtype=np.int64) - 1,
         camera_of=np.array([camera_ids.index(reconstruction.image(i).camera_id) for i in image_ids]),
@@ -293,7 +302,6 @@ def model_of(reconstruction: Any) -> Model:
         photo_of=np.array(photo_of, dtype=np.int64),
         keypoint_of=np.array(keypoint_of, dtype=np.int64),
     )
-    return without_impossible(model)
 
 
 def without_impossible(model: Model) -> Model:

@@ -29,12 +29,6 @@ def center_shift_rel(camera: Camera) -> float:
     return float(offset / max(camera.width, camera.height))
 
 
-def aspect_rel(camera: Camera) -> float:
-    """By how much the two focal lengths of an OPENCV lens differ, as a share of the smaller one."""
-    across, down = (abs(focal) for focal in camera.params[:2])
-    return float(max(across, down) / max(min(across, down), 1e-9) - 1.0)
-
-
 def information_gain(before: FloatArray, after: FloatArray, more_parameters: int) -> float:
     """Drop of twice the negative log-likelihood, over the criterion's penalty for the parameters.
 

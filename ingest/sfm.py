@@ -24,6 +24,7 @@ from ingest.workspace import atomic_folder
 logger = logging.getLogger(__name__)
 
 PriorUse = Literal["none", "bundle"]
+_MANY_PHOTOS = 8  # of one lens: a film's keyframes, not a visitor's photos
 _MOSTLY = 0.5  # of the photos; fewer with a lens that people have, and the start is to blame
 
 
@@ -125,7 +126,7 @@ class SfmTask:
         """Whether lenses that nobody knows took many photos each, as those of films do."""
         unknown = {row for row, (_, known) in enumerate(self.cameras) if not known}
         photos = sum(view.camera_row in unknown for view in self.views)
-        return bool(unknown) and photos >= self.options.adjust.min_photos_of_camera * len(unknown)
+        return bool(unknown) and photos >= _MANY_PHOTOS * len(unknown)
 
     def key(self) -> str:
         """Digest (24 characters) of the content: equal keys give equal models."""

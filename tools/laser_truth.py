@@ -3,10 +3,11 @@
     python -m tools.laser_truth FOLDER [--json FILE]
 
 FOLDER has images/ and cameras/, a `NAME.camera` for each photo: calibration, camera-to-world rotation and
-centre in metres. The photos are ingested into a new database, which knows nothing of any place; the map's
-camera centres are moved onto the true ones by the similarity that fits them best. Prints photos in the map,
-medians and largest of what is left: of positions in millimetres, of orientations in degrees, and the scale
-of the set, its largest distance between two cameras. Exit code 0 if there is one map of all photos.
+centre in metres, size. Copies of the photos with the EXIF of one camera (maker, model, focal length in
+whole millimetres of 35 mm film) are ingested into a new database, which knows of no place; the map's camera
+centres are moved onto the true ones by the similarity that fits them best. Prints photos in the map, medians
+and largest of what is left: of positions in millimetres, of orientations in degrees, and the scale of the
+set, its largest distance between two cameras. Exit code 0 if there is one map of all photos.
 """
 
 import argparse
@@ -17,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from PIL import ExifTags, Image
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
@@ -26,7 +28,7 @@ from featuredb.maps.unplaced_map import AnyMap
 from tools.figures import add_json_option, write_figures
 from tools.made_maps import all_maps, make, photo_names
 
-_ROTATION_LINES, _CENTER_LINE = slice(4, 7), 7
+_ROTATION_LINES, _CENTER_LINE, _SIZE_LINE = slice(4, 7), 7, 8
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -36,7 +38,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     truth = {name: true_pose(camera_file(args.folder / "cameras", name)) for name in names}
     with tempfile.TemporaryDirectory() as scratch:
         work = args.work or Path(scratch)
-        made = make(work / "db", "photos", photos, len(names))
+        lens = true_lens(camera_file(args.folder / "cameras", names[0]))
+        shown = with_exif(photos, names, lens, work / "photos")
+        made = make(work / "db", "photos", shown, len(names))
         found = all_maps(work / "db")
     figures: dict[str, object] = {"photos": len(names), "maps": made.maps, "largest": made.largest}
     if found:
@@ -76,6 +80,32 @@ def best_similarity(source: FloatArray, target: FloatArray) -> Sim3:
         rotation=np.array(found.rotation.matrix()),
         translation=np.array(found.translation),
     )
+
+
+def with_exif(photos: Path, names: Sequence[str], focal_rel: float, folder: Path) -> Path:
+    """Copies of JPEG files with EXIF of one camera.
+
+    Args:
+        focal_rel: focal length as a share of the longer side; photos are in 3:2, as film is.
+    """
+    exif = Image.Exif()
+    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Strecha", "laser truth"
+    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = round(36.0 * focal_rel)
+    content = exif.tobytes()
+    segment = b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        data = (photos / name).read_bytes()
+        if data[:2] != b"\xff\xd8":
+            raise SystemExit(f"{photos / name}: expected a JPEG file")
+        (folder / name).write_bytes(data[:2] + segment + data[2:])
+    return folder
+
+
+def true_lens(path: Path) -> float:
+    """Focal length over the longer side, in a file of Strecha's."""
+    rows = [[float(word) for word in line.split()] for line in path.read_text(encoding="utf-8").splitlines()]
+    return rows[0][0] / max(rows[_SIZE_LINE])
 
 
 def camera_file(folder: Path, photo: str) -> Path:

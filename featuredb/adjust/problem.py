@@ -116,7 +116,7 @@ class Problem:
         )
 
     def _add_lenses(self, priors: tuple[LensPrior | None, ...]) -> None:
-        unit = 1.0 / self._terms.keypoint_px**2
+        unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
         for params, prior in zip(self._lenses, priors, strict=True):
             if prior is not None and self._ceres.has_parameter_block(params):
                 cost = pyceres.factors.NormalPrior(np.array(prior.mean.params), unit * prior.covariance)

@@ -90,6 +90,8 @@ class Terms:
 
     Attributes:
         keypoint_px: standard deviation of a keypoint's coordinate.
+        dilution: so many observations count as one against priors of lenses: what a lens model leaves over
+            is common to whole photos.
         lenses: prior of each camera; a camera without one is held.
         marks, points, centers: see there.
         held_photos: rows of photos whose poses stay.
@@ -97,6 +99,7 @@ class Terms:
 
     keypoint_px: float
     lenses: tuple[LensPrior | None, ...]
+    dilution: float = 1.0
     marks: Marks | None = None
     points: PointPriors | None = None
     centers: CenterPriors | None = None

@@ -136,7 +136,7 @@ def reconstruct_clusters(
     """
     tasks_of = _Tasks(cameras, views, matches)
     whole = [tasks_of.make(c.rows, options) for c in clusters]
-    rough = replace(options, adjust=replace(options.adjust, fuller_lens=False))
+    rough = replace(options, adjust=replace(options.adjust, whole_lens=False))
     block_tasks: list[list[_BlockTask]] = []
     for cluster, task in zip(clusters, whole, strict=True):
         # Of several blocks the lens is for the whole cluster to tell.

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import AdjustOptions
 from ingest.colmap_anchored import Anchored, AnchoredOptions, FixedPoints, adjust_anchored
 from ingest.colmap_bridge import Model
 from ingest.growth.refine import Lenses, with_cameras
@@ -48,7 +47,7 @@ class OwnLensOptions:
     evidence: float = 75.0
     same_focal_rel: float = 0.001
     same_focal_evidence: float = 10.0
-    max_center_shift_rel: float = AdjustOptions().max_center_shift_rel
+    max_center_shift_rel: float = 0.03
     least_held: int = 100
 
 
