@@ -22,12 +22,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_bridge import SfmPhoto, quiet, whole_model_of
+from ingest.precision import linearise, shared_variance_px2
 
 # COLMAP's own gates of mapping: 4 px at keypoints good to half a pixel, 1.5 degrees, 15 observations.
 _MAX_ERROR_OVER_SCALE = 8.0
 _MIN_ANGLE_DEG = 1.5
 _FOCAL_OVER_SIDE, _MAX_DISTORTION = (0.1, 10.0), 1.0  # COLMAP's own for bogus lenses
 _MIN_OBSERVATIONS = 15
+_LEAST_PX2 = 1e-6  # of a variance: exact observations
 _FUNCTION_TOLERANCE = 1e-6  # relative; what is left is below micrometres
 
 
@@ -41,9 +43,10 @@ class AdjustOptions:
         exif_focal_rel: of a focal length of EXIF. 35 mm equivalents are rounded to whole millimetres (1 % at
             28 mm), nominal focal lengths are met within 1 to 2 %.
         lens: of what is not known of any camera; its focal length is COLMAP's, from the photos.
-        dilution: so many observations count as one against these priors. On `brighton`, from above, EXIF's
-            focal length of 2311 px comes to 2602 with 1, 2357 with 10, 2322 with 50, where its scan says
-            2296; on `fountain-P11` and `entry-P10` every dilution from 1 to 50 gives the same cameras.
+        dilution: so many observations of the size that residuals have with what neighbours share
+            (`ingest.precision.shared_variance_px2`) count as one against these priors: a lens model's faults
+            are common to whole photos too. On `brighton`, from above, EXIF's focal length of 2311 px comes to
+            2602 with 1, 2357 with 10, 2322 with 50, where its scan says 2296.
         use_positions: GPS positions take part, robustly, each with its own sigma.
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.
@@ -188,7 +191,7 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     ]
     terms = Terms(
         keypoint_px=loss_scale_px,
-        dilution=options.dilution,
+        dilution=options.dilution * _shared_variance_px2(block) / loss_scale_px**2,
         lenses=tuple(lenses) if options.refine_focal else (None,) * len(lenses),
         centers=centers,
         held_photos=() if centers is not None else (0,),
@@ -206,6 +209,22 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     for point_id, xyz in zip(point_ids, adjusted.xyz, strict=True):
         reconstruction.point3D(point_id).xyz = xyz
     reconstruction.update_point_3d_errors()
+
+
+def _shared_variance_px2(block: Block) -> float:
+    """Of the block's residuals; points that their camera cannot see say nothing."""
+    residuals = linearise(
+        block.cameras,
+        block.camera_of,
+        block.cam_from_block,
+        block.xyz,
+        block.point_of,
+        block.photo_of,
+        block.xy,
+    ).residual
+    seen = np.isfinite(residuals).all(axis=1)
+    side = max(max(camera.width, camera.height) for camera in block.cameras)
+    return max(shared_variance_px2(residuals[seen], block.xy[seen], block.photo_of[seen], side), _LEAST_PX2)
 
 
 def _lens_prior(camera: Camera, exif_px: float | None, options: AdjustOptions) -> LensPrior:
