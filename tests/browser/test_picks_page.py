@@ -51,7 +51,7 @@ def url(session: PickSession) -> Iterator[str]:
     with listen(0) as bound:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]})
         thread.start()
-        end = time.monotonic() + 20.0
+        end = time.monotonic() + 90.0  # a busy machine draws the overlay late
         while not server.started:
             assert time.monotonic() < end, "the page did not start in time"
             time.sleep(0.01)
@@ -68,7 +68,7 @@ def click(page: Page, side: str, at: list[float]) -> None:
 
 def until(page: Page, condition: str) -> None:
     """Wait for what holds in the page; its policy lets nothing be evaluated from a string inside it."""
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 90.0  # a busy machine draws the overlay late
     while not page.evaluate(f"window.featuredb.then((p) => {condition})"):
         assert time.monotonic() < end, condition
         page.wait_for_timeout(50)
