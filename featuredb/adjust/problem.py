@@ -1,5 +1,6 @@
 """A block and its terms as COLMAP's bundle adjustment, to whose Ceres problem pyceres adds the terms."""
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +16,9 @@ from featuredb.adjust.terms import CenterPriors, LensPrior, Marks, PointPriors, 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 
+_LOG = logging.getLogger(__name__)
 _MAX_RADIUS = 1e10  # of Levenberg-Marquardt; without any damping what nothing determines is singular
+_LETS_GO = 2.0  # sigmas beyond which a lens prior loses to photos that know: EXIF of a cropped photo
 _DENSE_SIZE = 1500  # shared parameters; above, the reduced system is factorised sparsely
 
 
@@ -77,6 +80,8 @@ class Problem:
         )
         summary = pyceres.SolverSummary()
         pyceres.solve(options, self._ceres, summary)
+        if not summary.IsSolutionUsable():
+            _LOG.warning("the adjustment failed, everything stays as it was: %s", summary.BriefReport())
         return summary
 
     def block(self) -> Block:
@@ -117,10 +122,11 @@ class Problem:
 
     def _add_lenses(self, priors: tuple[LensPrior | None, ...]) -> None:
         unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
+        loss = pyceres.CauchyLoss(_LETS_GO / np.sqrt(unit))
         for params, prior in zip(self._lenses, priors, strict=True):
             if prior is not None and self._ceres.has_parameter_block(params):
                 cost = pyceres.factors.NormalPrior(np.array(prior.mean.params), unit * prior.covariance)
-                self._ceres.add_residual_block(cost, None, [params])
+                self._ceres.add_residual_block(cost, loss, [params])
 
     def _add_points(self, priors: PointPriors) -> None:
         unit = 1.0 / self._terms.keypoint_px**2

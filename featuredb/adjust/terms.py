@@ -86,7 +86,7 @@ class CenterPriors:
 class Terms:
     """All that an adjustment is made of beside the block.
 
-    Everything but the lenses counts with a Cauchy loss on its whitened residual.
+    Everything counts with a Cauchy loss on its whitened residual, of one sigma, for lenses of two.
 
     Attributes:
         keypoint_px: standard deviation of a keypoint's coordinate.

@@ -135,6 +135,15 @@ def test_the_whole_lens_is_found_through_a_plain_prior() -> None:
     assert np.abs(off[:4]).max() < 3.0
 
 
+def test_a_focal_length_that_is_far_off_loses_to_photos_that_know() -> None:
+    """EXIF of a cropped photo: 30 % off, 15 of its sigmas."""
+    block = _block(points=200, noise_px=0.2)
+    wrong = replace(TRUE, params=(1300.0, 1300.0, *TRUE.params[2:]))
+    problem = Problem(block, replace(_terms(block, wrong, 0.2), dilution=50.0))
+    problem.solve(50, 1e-12)
+    assert problem.block().cameras[0].focal_px == pytest.approx(TRUE.focal_px, rel=0.01)
+
+
 def test_covariances_hold_what_draws_scatter() -> None:
     """Sixty draws of all measurements: errors of pose and lens over their covariance are chi-square."""
     squares: list[tuple[float, float]] = []
