@@ -14,6 +14,7 @@ from typing import Any
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HEIGHT_DATUMS
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
+from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
@@ -24,9 +25,8 @@ from ingest.photo_table import is_table, read_table
 from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, reconstruct_photos
 from ingest.register.control.model import Survey
-from ingest.report import IngestReport, MapOutcome, PhotoOutcome
+from ingest.report import IngestReport, MapOutcome, PhotoOutcome, StageTiming
 from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder, scan_table
-from ingest.stage_clock import StageClock
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
 logger = logging.getLogger(__name__)
@@ -141,7 +141,7 @@ def ingest_photos(
         versions=library_versions(),
         pairs=len(result.pairs),
         verified_pairs=len(result.inliers),
-        stages=clock.timings,
+        stages=tuple(StageTiming(name=n, seconds=s, **clock.counts[n]) for n, s in clock.seconds.items()),
         photos=photo_outcomes(scanned.photos, result, registered, options.stop_after),
         maps=outcomes,
         warnings=(

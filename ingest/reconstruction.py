@@ -18,6 +18,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
+from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
@@ -33,7 +34,6 @@ from ingest.photo_cameras import CameraSharing, photo_cameras
 from ingest.register.gps import GpsOptions
 from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm import SfmOptions, SfmView
-from ingest.stage_clock import StageClock
 from ingest.tagged_elsewhere import ElsewhereOptions
 from ingest.workspace import Workspace
 

@@ -195,15 +195,15 @@ def _query(args: argparse.Namespace) -> int:
 
 
 def _localise(args: argparse.Namespace) -> int:
-    import time
     import uuid
 
     from featuredb.cli.common import open_database
     from featuredb.features.decode import DecodeLimits
+    from featuredb.stage_clock import StageClock
     from reloc.localiser import Localiser
     from reloc.overlay import map_points_in_view
     from reloc.query_arguments import parse_camera, parse_prior
-    from reloc.service.handler import StageClock, answer_query
+    from reloc.service.handler import answer_query
     from reloc.wire import LocaliseWireRequest, RequestOptions
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
@@ -225,7 +225,7 @@ def _localise(args: argparse.Namespace) -> int:
             localiser,
             limits=DecodeLimits(),
             request_id=uuid.uuid4().hex,
-            clock=StageClock(last=time.perf_counter()),
+            clock=StageClock(),
         )
 
     return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))

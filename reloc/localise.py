@@ -5,7 +5,7 @@ cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
+from featuredb.stage_clock import StageClock
 from reloc.acceptance import confidence, prior_tells, verdict
 from reloc.answer import make_answer
 from reloc.candidates import IndexedArea
@@ -22,7 +23,6 @@ from reloc.prior import contradicts_prior
 from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
 from reloc.rivals import runner_up
 from reloc.search import Candidate, Search, pairs, search
-from reloc.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -60,10 +60,10 @@ def localise(
     """
     options = options or LocaliseOptions()
     check_extractor(areas, options)
-    watch = Stopwatch()
+    clock = StageClock()
     features = extract(gray, options.extractor)
-    watch.split("features")
-    return _localised(features, request, areas, options, snapshot, watch).result
+    clock.lap("features")
+    return _localised(features, request, areas, options, snapshot, clock).result
 
 
 def localise_features(
@@ -81,7 +81,7 @@ def localise_features(
     """
     options = options or LocaliseOptions()
     check_extractor(areas, options)
-    return _localised(features, request, areas, options, snapshot, Stopwatch())
+    return _localised(features, request, areas, options, snapshot, StageClock())
 
 
 def _localised(
@@ -90,12 +90,12 @@ def _localised(
     areas: Sequence[IndexedArea],
     options: LocaliseOptions,
     snapshot: int,
-    watch: Stopwatch,
+    clock: StageClock,
 ) -> Localised:
-    found = search(features, request, areas, options, watch)
-    localised = _decide(found, features, request, options, snapshot, watch)
-    watch.split("answer")
-    return localised
+    found = search(features, request, areas, options, clock)
+    localised = _decide(found, features, request, options, snapshot)
+    clock.lap("answer")
+    return replace(localised, result=replace(localised.result, timings_ms=clock.milliseconds()))
 
 
 def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:
@@ -115,7 +115,6 @@ def _decide(
     request: LocaliseRequest,
     options: LocaliseOptions,
     snapshot: int,
-    watch: Stopwatch,
 ) -> Localised:
     def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
         result = LocaliseResult(
@@ -129,7 +128,6 @@ def _decide(
             runner_up=rival,
             snapshot=snapshot,
             evidence=found.candidates[0].evidence if found.candidates else None,
-            timings_ms=watch.timings_ms,
         )
         return Localised(result=result)
 
@@ -167,6 +165,5 @@ def _decide(
         runner_up=rival,
         snapshot=snapshot,
         evidence=best.evidence,
-        timings_ms=watch.timings_ms,
     )
     return Localised(result=result, best=best, uncertainty=uncertainty)

@@ -222,7 +222,7 @@ class LocaliseResult:
         runner_up: the best other hypothesis, or None.
         snapshot: version of the database that answered.
         evidence: for the best pose, believed or not; None where no pose was found at all.
-        timings_ms: stage name -> milliseconds, in the order they ran.
+        timings_ms: stage name -> milliseconds, in the order they ran, and their `total`.
     """
 
     reason: Reason | None

@@ -12,6 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.stage_clock import StageClock
 from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa, spread
 from reloc.candidates import Cluster, IndexedArea, find_clusters
 from reloc.matching import (
@@ -31,7 +32,6 @@ from reloc.pose import (
     reprojection_errors,
 )
 from reloc.result import Evidence, LocaliseRequest, Reason
-from reloc.stopwatch import Stopwatch
 
 _MORE_BY_REFINING = 2  # times RANSAC's inliers
 _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
@@ -69,14 +69,14 @@ def search(
     request: LocaliseRequest,
     areas: Sequence[IndexedArea],
     options: LocaliseOptions,
-    watch: Stopwatch,
+    clock: StageClock,
 ) -> Search:
     if len(features) < options.acceptance.min_inliers:
         return _nothing(
             "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
         )
     clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
-    watch.split("candidates")
+    clock.lap("candidates")
     if not clusters:
         return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
     tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
@@ -84,13 +84,13 @@ def search(
     most = 0
     while tries:
         matcher, *tries = tries
-        found, count = _try_cluster(features, matcher, request, options, watch)
+        found, count = _try_cluster(features, matcher, request, options, clock)
         most = max(most, count)
         candidates.extend(found)
         if candidates and _settled(candidates, matcher.cluster, [t.cluster for t in tries], options):
             break
         tries = most_matched(tries, options)
-        watch.split("matching")
+        clock.lap("matching")
     candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
     if not candidates and most < options.pose.min_matches:
         return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
@@ -112,7 +112,7 @@ def _try_cluster(
     matcher: ClusterMatcher,
     request: LocaliseRequest,
     options: LocaliseOptions,
-    watch: Stopwatch,
+    clock: StageClock,
 ) -> tuple[list[Candidate], int]:
     """Poses of one cluster and the number of matches behind them.
 
@@ -122,8 +122,8 @@ def _try_cluster(
     first = options.matching.first_features
     for count in (first, len(features)) if first < len(features) else (len(features),):
         matches = matcher.matches(count)
-        watch.split("matching")
-        found = _poses(features, matcher.cluster, matches, request, options, watch)
+        clock.lap("matching")
+        found = _poses(features, matcher.cluster, matches, request, options, clock)
         if any(c.evidence.log_nfa > options.acceptance.settled_log_nfa for c in found):
             break
     return found, len(matches)
@@ -158,7 +158,7 @@ def _poses(
     matches: Matches,
     request: LocaliseRequest,
     options: LocaliseOptions,
-    watch: Stopwatch,
+    clock: StageClock,
 ) -> list[Candidate]:
     """The cluster's best pose, and the best one among the matches that it leaves over."""
     pose = _best_pose(
@@ -166,24 +166,24 @@ def _poses(
     )
     if pose is not None:
         pose = replace(pose, lens_prior=request.camera_prior)
-    watch.split("pose")
+    clock.lap("pose")
     if pose is None or pose.count < 4:
         return []
     if _is_hopeless(len(matches), pose, options):
         return [_with_evidence(features, cluster, pose, matches, matches, options)]
     best = _refined(features, cluster, matches, pose, options)
-    watch.split("guided")
+    clock.lap("guided")
     taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
     left = Matches(
         feature=matches.feature[~taken], point=matches.point[~taken], distance=matches.distance[~taken]
     )
     # A photo has one lens, which the first pose has estimated.
     rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
-    watch.split("pose")
+    clock.lap("pose")
     if rival is None or rival.count < 4:
         return [best]
     second = _refined(features, cluster, left, rival, options)
-    watch.split("guided")
+    clock.lap("guided")
     source, focal_px = best.pose.camera_source, best.pose.prior_focal_px
     return [
         best,

@@ -38,12 +38,13 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
 from reloc.localiser import Localiser
 from reloc.options import LocaliseOptions
 from reloc.search import camera_hypotheses
-from reloc.service.handler import StageClock, answer_query, localise_request
+from reloc.service.handler import answer_query, localise_request
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.service.threads import capped_process
@@ -136,7 +137,7 @@ def run_direct(localiser: Localiser, images: Sequence[Path], repeat: int) -> lis
             localiser,
             limits=DEFAULT_LIMITS,
             request_id="",
-            clock=StageClock(last=time.perf_counter()),
+            clock=StageClock(),
         )
 
     return _rounds(ask, images, repeat)

@@ -1,6 +1,5 @@
 """Draws a point cloud as a camera with distortion sees it."""
 
-import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +14,7 @@ from featuredb.render.rendering import Rendering
 from featuredb.render.splats import BlockPlanes, SplatOptions, draw_splats, project_points
 from featuredb.render.surfaces import SurfaceOptions, apart_px, block_planes, close_holes, surfaces_of
 from featuredb.render.threads import over_rows, thread_count
+from featuredb.stage_clock import StageClock
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
 _WORTH_REDRAWING_PX = 2.5
@@ -35,26 +35,12 @@ class RenderOptions:
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
 
-@dataclass(slots=True, kw_only=True)
-class RenderClock:
-    """Where the time of one picture went: `seconds` by stage, in order."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    _last: float = field(default_factory=time.perf_counter)
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
-        self._last = now
-
-
 def render(
     cloud: PointCloud,
     camera: Camera,
     cam_from_local: Rigid3,
     options: RenderOptions | None = None,
-    clock: RenderClock | None = None,
+    clock: StageClock | None = None,
 ) -> Rendering:
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
@@ -66,7 +52,7 @@ def render(
     Raises:
         MissingExtraError: numba is not installed.
     """
-    options, clock = options or RenderOptions(), clock or RenderClock()
+    options, clock = options or RenderOptions(), clock or StageClock()
     threads = thread_count(options.threads)
     near_m, finest_px = options.splats.near_m, options.splats.finest_px
     rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)

@@ -1,9 +1,6 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
-import math
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +18,7 @@ from featuredb.features.exif import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
+from featuredb.stage_clock import StageClock
 from reloc.lens_prior import LensPrior, known_within
 from reloc.reply import reply_from_result
 from reloc.result import LocaliseRequest
@@ -33,38 +31,6 @@ from reloc.wire import (
     PriorRequest,
     RequestError,
 )
-
-
-@dataclass(slots=True)
-class StageClock:
-    """Milliseconds of consecutive stages.
-
-    Attributes:
-        last: `time.perf_counter` at the end of the latest stage.
-        timings_ms: stage name -> milliseconds.
-    """
-
-    last: float
-    timings_ms: dict[str, float] = field(default_factory=dict)
-
-    def end(self, stage: str) -> None:
-        """The stage that began at the end of the one before ends now."""
-        now = time.perf_counter()
-        self.timings_ms[stage] = (now - self.last) * 1e3
-        self.last = now
-
-    def split(self, stages: dict[str, float], rest: str) -> None:
-        """The time since the latest stage consists of these, and of what they do not account for."""
-        parts = {name: ms for name, ms in stages.items() if name != "total"}
-        now = time.perf_counter()
-        self.timings_ms.update(parts)
-        self.timings_ms[rest] = max(0.0, (now - self.last) * 1e3 - math.fsum(parts.values()))
-        self.last = now
-
-    def finished(self) -> dict[str, float]:
-        """All stages and their sum as `total`, rounded to microseconds."""
-        rounded = {name: round(ms, 3) for name, ms in self.timings_ms.items()}
-        return {**rounded, "total": round(math.fsum(rounded.values()), 3)}
 
 
 def answer_query(
@@ -92,9 +58,9 @@ def answer_query(
         RequestError: bad image, bad request, too large, or maps of another extractor.
     """
     gray = _decode(data, limits)
-    clock.end("decode")
+    clock.lap("decode")
     request = localise_request(wire_request, data, gray)
-    clock.end("exif")
+    clock.lap("exif")
     before_localising()
     try:
         result = localiser.localise(gray, request)
@@ -104,10 +70,10 @@ def answer_query(
         raise RequestError(ErrorCode.BAD_REQUEST, f"options.maps: {error}") from error
     except ImageError as error:
         raise RequestError(ErrorCode.BAD_IMAGE, f"image: {error}") from error
-    clock.split(result.timings_ms, "localise_rest")
+    clock.lap("localise_rest", result.timings_ms)
     reply = reply_from_result(result, request_id=request_id, timings_ms={})
-    clock.end("reply")
-    return reply.model_copy(update={"timings_ms": clock.finished()})
+    clock.lap("reply")
+    return reply.model_copy(update={"timings_ms": clock.milliseconds()})
 
 
 def localise_request(

@@ -8,9 +8,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from datetime import UTC, datetime
 
+from featuredb.stage_clock import StageClock
 from featuredb.store.candidate_states import candidate_id_of
 from reloc.service.database_inbox import contribution_of
-from reloc.service.handler import StageClock, answer_query
+from reloc.service.handler import answer_query
 from reloc.service.inbox import Inbox, InboxRefusal
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
@@ -103,8 +104,8 @@ class WorkerPool:
             )
 
     def _localise(self, item: PendingQuery) -> None:
-        clock = StageClock(last=item.received)
-        clock.end("queue")
+        clock = StageClock(start=item.received)
+        clock.lap("queue")
         request = parse_request(item.attachment())
         item.request_id = request.request_id or item.request_id
         if request.contribute and self._inbox is None:
@@ -120,7 +121,7 @@ class WorkerPool:
                 self._watch.add(item)
         _check_deadline(item)
         data = item.payload()
-        clock.end("request")
+        clock.lap("request")
         if item.answered:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
@@ -170,8 +171,8 @@ def _answer_and_keep(
 
 
 def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:
-    clock.end("contribution")
-    return reply.model_copy(update={"contribution": said, "timings_ms": clock.finished()})
+    clock.lap("contribution")
+    return reply.model_copy(update={"contribution": said, "timings_ms": clock.milliseconds()})
 
 
 def _check_deadline(item: PendingQuery) -> None:

@@ -2,7 +2,6 @@
 
 import base64
 import threading
-import time
 import uuid
 from typing import Any
 
@@ -13,10 +12,11 @@ from featuredb.geo.geopose import GeoPose
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import matrix_from_quaternion
+from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.overlay import draw_overlay, map_points_in_view
-from reloc.service.handler import StageClock, answer_query
+from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, jpeg_of
 from reloc.viewer.poses import drawn_pose, worded_sigmas
 from reloc.viewer.scene import Scene
@@ -59,7 +59,7 @@ class Queries:
                 localiser,
                 limits=LIMITS,
                 request_id=uuid.uuid4().hex,
-                clock=StageClock(last=time.perf_counter()),
+                clock=StageClock(),
             )
         answer: dict[str, Any] = {"reply": reply.model_dump(mode="json")}
         if reply.status != "localised":

@@ -24,9 +24,10 @@ from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
 from featuredb.features.decode import DecodeLimits
+from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.localiser import Localiser
-from reloc.service.handler import StageClock, answer_query
+from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
@@ -190,7 +191,7 @@ def test_a_query_is_answered_as_by_the_server(url: str, world: ViewerWorld) -> N
         Localiser.open(world.database),
         limits=DecodeLimits(),
         request_id="q",
-        clock=StageClock(last=0.0),
+        clock=StageClock(start=0.0),
     )
     assert wanted.utm is not None
     assert reply["utm"]["easting"] == pytest.approx(wanted.utm.easting, abs=1e-6)

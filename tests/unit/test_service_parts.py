@@ -10,9 +10,9 @@ from threadpoolctl import threadpool_info
 from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
+from featuredb.stage_clock import StageClock
 from reloc.reply import reply_from_result
 from reloc.result import REASONS
-from reloc.service.handler import StageClock
 from reloc.service.metrics import Metrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.session import Keys, bind_free_port
@@ -71,13 +71,13 @@ def test_port_zero_becomes_a_free_port_and_others_stay():
 
 def test_stages_sum_to_the_total_and_to_the_wall_time():
     start = time.perf_counter()
-    clock = StageClock(last=start)
+    clock = StageClock(start=start)
     time.sleep(0.002)
-    clock.end("queue")
+    clock.lap("queue")
     time.sleep(0.004)
-    clock.split({"features": 1.0, "total": 3.0, "matching": 2.0}, "rest")
+    clock.lap("rest", {"features": 1.0, "total": 3.0, "matching": 2.0})
     wall_ms = (time.perf_counter() - start) * 1e3
-    timings = clock.finished()
+    timings = clock.milliseconds()
     assert list(timings) == ["queue", "features", "matching", "rest", "total"]
     assert timings["total"] == pytest.approx(sum(list(timings.values())[:-1]), abs=1e-3)
     assert timings["total"] == pytest.approx(wall_ms, abs=0.5)

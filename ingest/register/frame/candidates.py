@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 from featuredb.render.cloud import PointCloud
-from ingest.register.frame.clock import StageClock
+from featuredb.stage_clock import StageClock
 from ingest.register.frame.confirmation import Confirmation
 from ingest.register.frame.dense import (
     confirmed,

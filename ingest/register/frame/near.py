@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
+from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import by_agreement, polished
-from ingest.register.frame.clock import StageClock
 from ingest.register.frame.matching import joined
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened

@@ -10,8 +10,8 @@ from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
+from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import Judged, best_candidate
-from ingest.register.frame.clock import StageClock
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened, prior_sigmas

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError, IncompatibleExtractorError, InvalidValueError
 from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
+from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
 from reloc.result import LocaliseRequest
-from reloc.service.handler import StageClock, geo_prior
+from reloc.service.handler import geo_prior
 from reloc.service.live.latest import Arrival
 from reloc.service.live.options import LiveOptions
 from reloc.service.source import ServedArea
@@ -95,12 +96,12 @@ class FrameAnswerer:
             FrameError: a header that is none or goes back, too many bytes or pixels, a broken image, one of
                 another size than those before, or that the session's camera does not fit.
         """
-        clock = StageClock(last=arrival.received)
-        clock.end("queue")
+        clock = StageClock(start=arrival.received)
+        clock.lap("queue")
         header = self._header(arrival)
         try:
             gray = self._decoded(arrival)
-            clock.end("decode")
+            clock.lap("decode")
             tracker = self._tracker_for(gray)
         except RequestError as error:
             raise FrameError(ErrorCode(error.code), error.message, header.sequence) from error
@@ -108,10 +109,10 @@ class FrameAnswerer:
         self._adopt()
         height, width = gray.shape
         tracked = tracker.track(_smaller(gray, self._options.max_side_px), header.time_s)
-        clock.end("track")
+        clock.lap("track")
         point = point_of(tracked)
         camera = None if tracked.camera is None else tracked.camera.scaled_to(width, height)
-        clock.end("reply")
+        clock.lap("reply")
         return pose_message(
             point,
             camera,
@@ -121,7 +122,7 @@ class FrameAnswerer:
             dropped=header.sequence + 1 - self._looked_at,
             received_at=arrival.received_at.isoformat(),
             answered_at=datetime.now(UTC).isoformat(),
-            timings_ms=clock.finished(),
+            timings_ms=clock.milliseconds(),
         )
 
     def _header(self, arrival: Arrival) -> TrackFrame:
