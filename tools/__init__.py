@@ -1,1 +1,1 @@
-"""The scoreboard, the programs that its rows run, and checks. Nothing imports them."""
+"""The scoreboard, the programs that its rows run, and checks. None of the packages imports them; tests do."""

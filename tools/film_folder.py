@@ -16,14 +16,14 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.film_frame import Exposure, draw_frame
-from featuredb.simworld.flight_path import FlightPath
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.texture import Image8
 from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.world import WorldOptions
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from tools.film_scripts import HEIGHT, RATE_HZ, WIDTH, Kind, Piece, Script
+from tools.worlds.film_frame import Exposure, draw_frame
+from tools.worlds.flight_path import FlightPath
 
 _FORMAT = 1  # raised when the same scripts give other films
 _OTHER_SEED = 1000

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.flight_path import PathOptions
+from tools.worlds.flight_path import PathOptions
 
 Kind = Literal["place", "other", "title", "black"]
 WIDTH, HEIGHT, RATE_HZ = 960, 540, 25.0

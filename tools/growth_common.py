@@ -20,7 +20,6 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import rotation_angle, so3_log
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.album_files import TABLE_FILES, AlbumFact, read_facts
 from featuredb.simworld.truth import Truth, read_truth
 from featuredb.store import Database
 from featuredb.store.candidate_states import Contribution, candidate_id_of
@@ -33,6 +32,7 @@ from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from tools.figures import write_figures
+from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
 
 mpl.use("Agg")  # no display is needed
 

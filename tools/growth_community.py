@@ -2,7 +2,7 @@
 
     python -m tools.growth_community --out DIR [--size full] [--seed 1] [--survey 9 13 100 14] [--alike 30]
 
-The world is that of `featuredb.simworld.community`: geotags with 30 m of error per axis, a tenth of them
+The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
@@ -30,8 +30,6 @@ from scipy.spatial import cKDTree
 
 from featuredb.lidar.add import add_scan
 from featuredb.simworld.airborne import scan_town
-from featuredb.simworld.album_files import AlbumFact
-from featuredb.simworld.community import CommunityOptions, write_community
 from featuredb.simworld.photograph import render_depth
 from featuredb.simworld.scan_file import write_scan
 from featuredb.store import Database
@@ -55,6 +53,8 @@ from tools.growth_common import (
     table,
     tell,
 )
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.community import CommunityOptions, write_community
 
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")

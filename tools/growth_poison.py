@@ -2,7 +2,7 @@
 
     python -m tools.growth_poison --out DIR [--size full] [--seed 4]
 
-The world is that of `featuredb.simworld.poison_world`. The survey is ingested, honest photos are grown, and
+The world is that of `tools.worlds.poison_world`. The survey is ingested, honest photos are grown, and
 held-out photos become canaries with their true poses. Then for each kind of poison, and for all together, a
 copy of that database gets the poison, grows, gets honest photos that come later, and grows again. Whatever is
 active then is compared with the truth:
@@ -35,7 +35,6 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
 from featuredb.simworld.photograph import render_depth
-from featuredb.simworld.poison_world import POISONS, PoisonOptions, write_poison
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growing import GrowingOptions, grow_candidates
@@ -61,6 +60,7 @@ from tools.growth_common import (
     table,
     tell,
 )
+from tools.worlds.poison_world import POISONS, PoisonOptions, write_poison
 
 _OFF_M, _OFF_SHARE = 1.0, 0.02
 _MOVE_M = 3.0

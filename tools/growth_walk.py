@@ -2,7 +2,7 @@
 
     python -m tools.growth_walk --out DIR [--size full] [--seed 2] [--budget 0.5]
 
-The world is that of `featuredb.simworld.walk_world`. Step by step the photos of three people are contributed
+The world is that of `tools.worlds.walk_world`. Step by step the photos of three people are contributed
 and `featuredb grow` runs once. After each step photos that nobody contributes (probes) of all steps so far
 ask where they were taken, and the new maps are compared with the truth. When everything has arrived, the
 survey at the far end is ingested and growth runs again.
@@ -33,8 +33,6 @@ import numpy as np
 from scipy.stats import chi2
 
 from featuredb.features.decode import decode_gray
-from featuredb.simworld.album_files import AlbumFact
-from featuredb.simworld.walk_world import WalkOptions, write_walk
 from featuredb.store import Database
 from ingest.growing import GrowingOptions, grow_candidates
 from reloc.localiser import Localiser
@@ -59,6 +57,8 @@ from tools.growth_common import (
     table,
     tell,
 )
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.walk_world import WalkOptions, write_walk
 
 _WALK_M = 600.0
 _AFTER_M = 0.3

@@ -33,8 +33,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
-from featuredb.simworld.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
-from featuredb.simworld.flight_path import PathOptions
 from featuredb.simworld.scan_world import make_scan_world
 from featuredb.simworld.scoring import pose_difference
 from featuredb.simworld.world import WorldOptions
@@ -51,6 +49,8 @@ from reloc.tracking.trajectory import Trajectory
 from reloc.tracking.trajectory_plot import plot_png
 from tools.anchor_simworld import anchored, featuredb
 from tools.growth_common import Verdict, conclude, say, table
+from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
+from tools.worlds.flight_path import PathOptions
 
 _FILMS = ("smooth", "jerky", "cut")
 _MEAN_M, _P95_M, _MEAN_DEG, _DRIFT = 0.10, 0.25, 0.10, 1.3

@@ -23,7 +23,6 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 from featuredb.simworld.scan_world import make_scan_world
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
@@ -32,6 +31,7 @@ from tools.anchor_simworld import featuredb
 from tools.asked_photos import Answered, ask
 from tools.growth_common import Verdict, conclude, say
 from tools.track_evaluation import film_options
+from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
 
 _KEYFRAMES, _SECONDS = 60, 300.0
 _NEAR_M, _SHARE, _WRONG_M = 0.3, 0.9, 2.0

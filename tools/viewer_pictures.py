@@ -18,8 +18,6 @@ from playwright.sync_api import Page
 
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import OrthoChoice
-from featuredb.simworld.film_world import FILM_FILE, FilmOptions, write_film
-from featuredb.simworld.flight_path import PathOptions
 from featuredb.simworld.scan_world import ORTHO_FILE, SCAN_FILE, ScanWorldOptions, write_lidar
 from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
@@ -29,6 +27,8 @@ from reloc.tracking.trajectory_files import write_trajectory
 from reloc.tracking.trajectory_read import read_trajectory_csv
 from reloc.viewer.scene import build_scene
 from tools.viewer_page import open_page, settled
+from tools.worlds.film_world import FILM_FILE, FilmOptions, write_film
+from tools.worlds.flight_path import PathOptions
 
 _QUALITY = 80
 # Twelve seconds; two of them show another town, which no map has.

@@ -12,14 +12,14 @@ import pytest
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.album_files import TABLE_FILES, read_facts
-from featuredb.simworld.community import CommunityOptions, write_community
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.photograph import render_view
-from featuredb.simworld.poison_world import POISONS, PoisonOptions, plan_poison, poison_places
 from featuredb.simworld.truth import read_truth
-from featuredb.simworld.walk_world import WalkOptions, plan_walk
 from ingest.photo_table import read_table
+from tools.worlds.album_files import TABLE_FILES, read_facts
+from tools.worlds.community import CommunityOptions, write_community
+from tools.worlds.poison_world import POISONS, PoisonOptions, plan_poison, poison_places
+from tools.worlds.walk_world import WalkOptions, plan_walk
 
 FLIGHT = FlightOptions(lines=1, per_line=2, oblique=0, width=320, gps_error="rtk")
 TINY = CommunityOptions(

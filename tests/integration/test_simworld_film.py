@@ -9,7 +9,11 @@ import numpy as np
 import pytest
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.film_world import (
+from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.video.frames import VideoOptions, open_video
+from featuredb.video.telemetry.read import read_telemetry
+from tools.worlds.film_world import (
     FILM_FILE,
     TELEMETRY_FILE,
     FilmOptions,
@@ -17,11 +21,7 @@ from featuredb.simworld.film_world import (
     read_film_truth,
     write_film,
 )
-from featuredb.simworld.flight_path import FlightPath, PathOptions
-from featuredb.simworld.photograph import render_depth
-from featuredb.simworld.world import WorldOptions, town_of
-from featuredb.video.frames import VideoOptions, open_video
-from featuredb.video.telemetry.read import read_telemetry
+from tools.worlds.flight_path import FlightPath, PathOptions
 
 _WORLD = WorldOptions.short(1)
 _OPTIONS = FilmOptions(

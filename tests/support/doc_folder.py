@@ -24,14 +24,14 @@ from PIL import Image
 
 from featuredb.cli.main import main
 from featuredb.simworld.airborne import AirborneScan, ScanOptions, scan_town
-from featuredb.simworld.film_world import FilmOptions, write_film
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.flight_path import PathOptions
 from featuredb.simworld.scan_file import write_scan
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.world import World, WorldOptions, town_of, write_world
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
+from tools.worlds.film_world import FilmOptions, write_film
+from tools.worlds.flight_path import PathOptions
 
 _LICENCE = "CC-BY-4.0"
 _TOWN = WorldOptions(

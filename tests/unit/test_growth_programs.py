@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.truth import Truth
-from featuredb.simworld.walk_world import WalkOptions
 from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict
 from tools.growth_poison import Outcome
 from tools.growth_walk import Probe, Step, worst_map
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.walk_world import WalkOptions
 
 
 def fact(i: int, kind: str = "drone") -> AlbumFact:

@@ -9,18 +9,18 @@ import pytest
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.community import CommunityOptions, plan_community
-from featuredb.simworld.edits import Edit, edited, edited_camera
 from featuredb.simworld.flight import FlightOptions, received_positions, survey
-from featuredb.simworld.geotags import GeotagOptions, Tagging, geotag_at, give_geotags
-from featuredb.simworld.lookalike import Rect, blocks_of, forged, with_copied_block
-from featuredb.simworld.people import community, stored_upright, zoomed
 from featuredb.simworld.photograph import render_depth, render_view
 from featuredb.simworld.raster import render
 from featuredb.simworld.scene import Ellipsoids, Scene
-from featuredb.simworld.sights import Surroundings, find_sights, look_at
-from featuredb.simworld.surveyed import day_key, day_scene
 from featuredb.simworld.town import make_town
+from tools.worlds.community import CommunityOptions, plan_community
+from tools.worlds.edits import Edit, edited, edited_camera
+from tools.worlds.geotags import GeotagOptions, Tagging, geotag_at, give_geotags
+from tools.worlds.lookalike import Rect, blocks_of, forged, with_copied_block
+from tools.worlds.people import community, stored_upright, zoomed
+from tools.worlds.sights import Surroundings, find_sights, look_at
+from tools.worlds.surveyed import day_key, day_scene
 
 SIZE = (200.0, 180.0)
 TINY = CommunityOptions(

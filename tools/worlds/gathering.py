@@ -7,16 +7,16 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.album import PlannedPhoto
-from featuredb.simworld.album_files import AlbumFact
-from featuredb.simworld.edits import Edit
-from featuredb.simworld.geotags import GeotagOptions, Tagging, give_geotags
-from featuredb.simworld.people import Person
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import Shot
-from featuredb.simworld.sights import Sight, Surroundings
-from featuredb.simworld.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
-from featuredb.simworld.visits import drone_visit, ground_visit
+from tools.worlds.album import PlannedPhoto
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.edits import Edit
+from tools.worlds.geotags import GeotagOptions, Tagging, give_geotags
+from tools.worlds.people import Person
+from tools.worlds.sights import Sight, Surroundings
+from tools.worlds.surveyed import DAYS, day_key, moment, photo_ids, shot_seed
+from tools.worlds.visits import drone_visit, ground_visit
 
 _AHEAD = 15  # photos that somebody may be ahead of his share: two visits
 _VISIT_TRIES = 4  # visits per wanted photo: then the sights cannot be photographed by these people

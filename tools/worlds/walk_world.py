@@ -14,16 +14,16 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.album import PlannedPhoto, Progress, album_is_complete, write_album
-from featuredb.simworld.album_files import AlbumFact
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.geotags import geotag_at
-from featuredb.simworld.people import Person, community
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import Shot
-from featuredb.simworld.sights import Surroundings, look_at
-from featuredb.simworld.surveyed import day_key, day_scene, moment, photo_ids, shot_seed, survey_photos
 from featuredb.simworld.town import make_town
+from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.geotags import geotag_at
+from tools.worlds.people import Person, community
+from tools.worlds.sights import Surroundings, look_at
+from tools.worlds.surveyed import day_key, day_scene, moment, photo_ids, shot_seed, survey_photos
 
 _PROBE = "probe"
 _TRIES = 8
@@ -120,7 +120,7 @@ def _base(options: WalkOptions) -> Scene:
 def write_walk(
     folder: Path, options: WalkOptions, workers: int = 0, progress: Progress | None = None
 ) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
 
     Raises:
         OSError: the folder cannot be written.

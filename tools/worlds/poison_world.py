@@ -23,18 +23,18 @@ from typing import NamedTuple
 import numpy as np
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.album import PlannedPhoto, Progress, album_is_complete, write_album
-from featuredb.simworld.album_files import Geotag
-from featuredb.simworld.edits import Edit
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
-from featuredb.simworld.gathering import named, plan_visits, tagged
-from featuredb.simworld.geotags import GeotagOptions, geotag_at
-from featuredb.simworld.lookalike import Rect, blocks_of, forged, with_copied_block
-from featuredb.simworld.people import Person, community
 from featuredb.simworld.scene import Scene
-from featuredb.simworld.sights import Sight, find_sights
-from featuredb.simworld.surveyed import day_scene, survey_photos
 from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
+from tools.worlds.album_files import Geotag
+from tools.worlds.edits import Edit
+from tools.worlds.gathering import named, plan_visits, tagged
+from tools.worlds.geotags import GeotagOptions, geotag_at
+from tools.worlds.lookalike import Rect, blocks_of, forged, with_copied_block
+from tools.worlds.people import Person, community
+from tools.worlds.sights import Sight, find_sights
+from tools.worlds.surveyed import day_scene, survey_photos
 
 POISONS = ("lookalike", "mirrored", "mirror_block", "liar", "liar_other", "altered", "forged")
 _OTHER_SEED = 1000
@@ -190,7 +190,7 @@ def _covers(outer: Rect, block: Rect) -> bool:
 def write_poison(
     folder: Path, options: PoisonOptions, workers: int = 0, progress: Progress | None = None
 ) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
 
     Raises:
         OSError: the folder cannot be written.

@@ -6,11 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from featuredb.simworld.album import PlannedPhoto
-from featuredb.simworld.album_files import AlbumFact, Geotag
 from featuredb.simworld.days import DayOptions, another_day
 from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.scene import Scene
+from tools.worlds.album import PlannedPhoto
+from tools.worlds.album_files import AlbumFact, Geotag
 
 # Suns by the hour, town axes; index 0 is the scene's own.
 _SUNS = (None, (0.62, -0.42, 0.62), (0.10, -0.55, 0.83), (-0.66, -0.30, 0.55))

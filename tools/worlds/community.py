@@ -13,24 +13,24 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
-from featuredb.simworld.album_files import AlbumFact
-from featuredb.simworld.edits import Edit
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.gathering import named, plan_visits, tagged
-from featuredb.simworld.geotags import GeotagOptions, geotag_at
-from featuredb.simworld.people import Person, community
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.shot import Shot, look_pose
-from featuredb.simworld.sights import find_sights
-from featuredb.simworld.surveyed import (
+from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from tools.worlds.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
+from tools.worlds.album_files import AlbumFact
+from tools.worlds.edits import Edit
+from tools.worlds.gathering import named, plan_visits, tagged
+from tools.worlds.geotags import GeotagOptions, geotag_at
+from tools.worlds.people import Person, community
+from tools.worlds.sights import find_sights
+from tools.worlds.surveyed import (
     DAYS,
     day_scene,
     moment,
     shot_seed,
     survey_photos,
 )
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
 
 _OTHER_SEED = 1000
 _TAGGED_HERE, _TAGGED_THERE = (
@@ -125,7 +125,7 @@ def _base(options: CommunityOptions, town: str) -> Scene:
 def write_community(
     folder: Path, options: CommunityOptions, workers: int = 0, progress: Progress | None = None
 ) -> Path:
-    """Write the album into `folder`, or what of it is missing there (see `featuredb.simworld.album`).
+    """Write the album into `folder`, or what of it is missing there (see `tools.worlds.album`).
 
     Raises:
         OSError: the folder cannot be written.

@@ -26,14 +26,14 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.film_frame import Exposure, draw_frame
-from featuredb.simworld.flight_path import FlightPath, PathOptions
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.sensor import SensorOptions
 from featuredb.simworld.texture import Image8
 from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
+from tools.worlds.film_frame import Exposure, draw_frame
+from tools.worlds.flight_path import FlightPath, PathOptions
 
 Progress = Callable[[int, int], None]
 

@@ -20,16 +20,16 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.album_files import AlbumFact, Geotag, write_facts, write_tables
-from featuredb.simworld.edits import Edit, edited, edited_camera
 from featuredb.simworld.exif import exif_of
-from featuredb.simworld.indoors import indoor_photo, portrait_photo
 from featuredb.simworld.photograph import take_photo
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.sensor import SensorOptions, jpeg_bytes
 from featuredb.simworld.shot import Shot
 from featuredb.simworld.texture import Image8
 from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
+from tools.worlds.album_files import AlbumFact, Geotag, write_facts, write_tables
+from tools.worlds.edits import Edit, edited, edited_camera
+from tools.worlds.indoors import indoor_photo, portrait_photo
 
 Progress = Callable[[int, int], None]
 Subject = Literal["town", "indoor", "portrait"]

@@ -5,10 +5,10 @@ from typing import Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.album import ExifPolicy
-from featuredb.simworld.edits import Edit
 from featuredb.simworld.sensor import SensorOptions
 from featuredb.simworld.shot import Device
+from tools.worlds.album import ExifPolicy
+from tools.worlds.edits import Edit
 
 Upright = Literal["never", "tagged", "stored"]
 

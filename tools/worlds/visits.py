@@ -7,9 +7,9 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.people import Person, stored_upright, zoomed
 from featuredb.simworld.shot import Device
-from featuredb.simworld.sights import Sight, Surroundings, look_at
+from tools.worlds.people import Person, stored_upright, zoomed
+from tools.worlds.sights import Sight, Surroundings, look_at
 
 _NEAREST_DRONE_M, _NEAREST_GROUND_M = 4.0, 2.5
 _TRIES = 6  # a photographer who sees nothing but a wall takes a step and tries again
