@@ -16,7 +16,6 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from ingest.register.frame.confirmation import confirm_pose
-from ingest.register.frame.dense_templates import dense_matches
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame.options import FrameOptions
@@ -169,14 +168,3 @@ def test_refinement_keeps_the_start_where_there_is_nothing_to_compare() -> None:
     assert refined.covariance is None
     assert refined.cam_from_local is away
     assert "scan points" in refined.message
-
-
-def test_matches_of_a_render_lie_where_the_truth_projects_them() -> None:
-    near = Rigid3.exp([0.003, 0.004, -0.01, 0.3, -0.4, 0.2]) @ TRUTH
-    rendering = render(_ground(0)[0], CAMERA, near)
-    matches = dense_matches(_photo(0), CAMERA, rendering, search_px=12)
-    assert len(matches) >= 30
-    truth = CAMERA.project(TRUTH.act(matches.points_local))
-    off = np.linalg.norm(matches.pixels - truth, axis=1)
-    assert np.median(off) < 1.0
-    assert (off < 3.0).mean() > 0.85

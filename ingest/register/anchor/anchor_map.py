@@ -15,49 +15,14 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.agreement import FrameAgreement, LoneFrame, frames_that_agree
-from ingest.register.anchor.frames import TriedFrame, TriedFrames, try_frames
+from ingest.register.anchor.frames import TriedFrame, TriedFrames
 from ingest.register.anchor.gates import judged
 from ingest.register.anchor.placing import place_in_rounds, with_lens
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.anchor.values import AnchorOptions, AnchorResult
-from ingest.register.frame_registration import FramePrior
 from ingest.register.structure.projection import (
     project_structure,
 )
-
-
-def anchor_map(
-    feature_map: FeatureMap,
-    cloud: PointCloud,
-    read_gray: PhotoReader,
-    options: AnchorOptions | None = None,
-    *,
-    starts: Mapping[int, FramePrior] | None = None,
-    readable: Sequence[int] | None = None,
-    progress: Progress = no_progress,
-) -> tuple[TriedFrames, AnchorResult]:
-    """Register frames and place the map by them, without a person's word.
-
-    Args:
-        cloud: the scan around the map, in the map's local frame.
-        read_gray: grey pixels (h, w) uint8 of an image of the map.
-        starts: priors by a person, by image id.
-        readable: ids of images whose photos are there; None for all.
-    """
-    options = options or AnchorOptions()
-    tried = try_frames(
-        feature_map,
-        cloud,
-        read_gray,
-        options.frames,
-        starts=starts,
-        readable=readable,
-        progress=progress,
-    )
-    result = place_map(
-        feature_map, cloud, tried, read_gray, options, supervised=bool(starts), progress=progress
-    )
-    return tried, result
 
 
 def place_map(

@@ -19,7 +19,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense_templates import peaks
 from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
 from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
 from ingest.register.frame.scan_resolution import finest_side_px
@@ -27,6 +26,7 @@ from ingest.register.frame.score_maps import (
     ScoreMaps,
     TemplateOptions,
     cut_templates,
+    peaks,
     scores_at,
     search_around,
 )
@@ -141,7 +141,7 @@ def confirm_pose(
             local_maximum=False,
             message=f"only {n} pieces of the picture have structure, {options.min_pieces} are needed",
         )
-    places, _, _ = peaks(maps.maps, 4)
+    places, _ = peaks(maps.maps)
     off = places - options.search_px
     near = np.linalg.norm(off, axis=1) <= options.near_px
     chance = np.pi * (options.near_px + 0.5) ** 2 / (2 * options.search_px + 1) ** 2

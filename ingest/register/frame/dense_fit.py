@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense_templates import peaks
 from ingest.register.frame.matching import FrameMatches
 from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.score_maps import TemplateOptions, cut_templates, search_around
+from ingest.register.frame.score_maps import TemplateOptions, cut_templates, peaks, search_around
 from ingest.register.frame.source_pictures import source_picture
 from ingest.register.frame_registration import RenderSource
 
@@ -77,7 +76,7 @@ def near_places(
         return FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
     cut = options.window_px - near_px
     inner = np.ascontiguousarray(maps.maps[:, cut : maps.maps.shape[1] - cut, cut : maps.maps.shape[2] - cut])
-    places, scores, _ = peaks(inner, rival_px=3)
+    places, scores = peaks(inner)
     # A place on the rim has its top outside: the piece saw nothing here.
     good = (scores >= options.min_score) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
     scale = np.array([camera.width / size[0], camera.height / size[1]])

@@ -85,13 +85,11 @@ class DensePose:
     Attributes:
         score: sum of the pieces' scores over the root of their number; a random pose has about N(0, 1) times
             the root of how many neighbouring pieces overlap.
-        mean_score: per piece.
         pieces: how many the photo shows at this pose.
     """
 
     cam_from_local: Rigid3
     score: float
-    mean_score: float
     pieces: int
 
 
@@ -190,7 +188,7 @@ def _vote(
                 turned = Rigid3(rotation=pans[best], translation=np.zeros(3)) @ moved
                 found.append((float(scores[best]), turned))
     found.sort(key=lambda item: -item[0])
-    poses = [DensePose(cam_from_local=p, score=s, mean_score=0.0, pieces=0) for s, p in found]
+    poses = [DensePose(cam_from_local=p, score=s, pieces=0) for s, p in found]
     distinct = _distinct(poses, view.camera, prior, options)
     return [p.cam_from_local for p in distinct]
 
@@ -307,7 +305,6 @@ def _refined(
     return DensePose(
         cam_from_local=moved,
         score=total / float(np.sqrt(max(pieces, _MIN_PIECES))),
-        mean_score=total / max(pieces, 1),
         pieces=pieces,
     )
 

@@ -32,13 +32,11 @@ class NearFit:
     Attributes:
         pose: with the camera. source: what was rendered.
         covariance: (6, 6) of the left perturbation of cam_from_local.
-        agreeing_share: of the pieces of the frame, that show the scan where the pose has it.
     """
 
     pose: PoseHypothesis
     source: RenderSource
     covariance: FloatArray
-    agreeing_share: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,7 +45,6 @@ class NoNearFit:
 
     reason: FrameReason
     message: str
-    agreeing_share: float = 0.0
 
 
 def fit_near(
@@ -93,14 +90,11 @@ def fit_near(
         judged = polished(views, loose, other.found, StageClock())
     found, confirmation = judged.found, judged.confirmation
     if not confirmation.confirmed:
-        return NoNearFit(
-            reason="NOT_CONFIRMED", message=confirmation.message, agreeing_share=confirmation.share
-        )
+        return NoNearFit(reason="NOT_CONFIRMED", message=confirmation.message)
     if len(found.inliers) < _MIN_INLIERS:
         return NoNearFit(
             reason="TOO_FEW_MATCHES",
             message=f"{len(found.inliers)} independent inliers, {_MIN_INLIERS} needed",
-            agreeing_share=confirmation.share,
         )
     covariance = frame_covariance(
         found.inliers.pixels,
@@ -113,6 +107,4 @@ def fit_near(
         options.shared_point_share,
         loose,
     )
-    return NearFit(
-        pose=found.pose, source=found.source, covariance=covariance, agreeing_share=confirmation.share
-    )
+    return NearFit(pose=found.pose, source=found.source, covariance=covariance)

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 
 
@@ -18,18 +17,11 @@ class PinholeView:
         image: (h, w) uint8.
         valid: (h, w) bool, what the photo shows.
         camera: SIMPLE_PINHOLE of the view, principal point in the middle.
-        photo_camera: of the photo at full size.
     """
 
     image: NDArray[np.uint8]
     valid: NDArray[np.bool_]
     camera: Camera
-    photo_camera: Camera
-
-    def photo_pixels(self, pixels: FloatArray) -> FloatArray:
-        """Full-size photo pixels (n, 2) of pixels (n, 2) of this view."""
-        rays = self.camera.unproject(pixels)
-        return self.photo_camera.project(np.column_stack([rays, np.ones(len(rays))]))
 
 
 def pinhole_view(photo_gray: NDArray[np.uint8], camera: Camera, longer_side_px: int) -> PinholeView:
@@ -54,9 +46,7 @@ def pinhole_view(photo_gray: NDArray[np.uint8], camera: Camera, longer_side_px: 
         small, pixels[..., 0], pixels[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
     valid = ((pixels > -0.6) & (pixels < (width - 0.4, height - 0.4))).all(axis=-1)
-    return PinholeView(
-        image=np.asarray(image), valid=np.asarray(valid), camera=view_camera, photo_camera=camera
-    )
+    return PinholeView(image=np.asarray(image), valid=np.asarray(valid), camera=view_camera)
 
 
 def with_margin(camera: Camera, margin_px: int) -> Camera:

@@ -199,3 +199,22 @@ def _centre_points(
     points_cam = np.column_stack([rays, np.ones(len(rays))]) * depth[:, None]
     known: NDArray[np.bool_] = np.asarray(np.isfinite(points_cam).all(axis=1))
     return rendering.cam_from_local.inverse().act(points_cam), known
+
+
+def peaks(maps: FloatImage) -> tuple[FloatArray, FloatArray]:
+    """Highest cells of maps (n, h, w): positions (n, 2) as (x, y) to a fraction of one, heights (n,)."""
+    n, height, width = maps.shape
+    best = maps.reshape(n, -1).argmax(axis=1)
+    rows, columns = np.divmod(best, width)
+    values = maps.reshape(n, -1)[np.arange(n), best].astype(np.float64)
+    # A peak on the border has its true top outside.
+    r, c = np.clip(rows, 1, height - 2), np.clip(columns, 1, width - 2)
+    index = np.arange(n)
+    dx = _parabola(maps[index, r, c - 1], maps[index, r, c], maps[index, r, c + 1])
+    dy = _parabola(maps[index, r - 1, c], maps[index, r, c], maps[index, r + 1, c])
+    return np.stack([columns + dx, rows + dy], axis=1), values
+
+
+def _parabola(left: FloatImage, middle: FloatImage, right: FloatImage) -> FloatArray:
+    curvature = np.maximum(2.0 * middle - left - right, 1e-6)
+    return np.asarray(np.clip(0.5 * (right - left) / curvature, -0.5, 0.5), dtype=np.float64)
