@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import MissingExtraError, ScanFileError
+from featuredb.errors import ScanFileError
+from featuredb.extras import require
 from featuredb.file_digest import file_sha256
 from featuredb.geo.geotiff_keys import GeoKeys
 from featuredb.geometry.arrays import FloatArray
@@ -161,14 +162,9 @@ def read_points(path: Path, chunk_points: int) -> Iterator[RawPoints]:
 
 
 def _laspy() -> ModuleType:
-    try:
-        import laspy
-        import lazrs  # noqa: F401  # laspy's reader of LAZ
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"Reading scans needs the package {error.name}, which is not installed: "
-            "pip install 'featuredb[lidar]'"
-        ) from error
+    require("lidar", "Reading scans", "laspy", "lazrs")
+    import laspy
+
     module: ModuleType = laspy
     return module
 

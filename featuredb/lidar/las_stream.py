@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from featuredb.errors import InvalidValueError, MissingExtraError
+from featuredb.errors import InvalidValueError
+from featuredb.extras import require
 from featuredb.geometry.arrays import FloatArray
 
 _WITH_RGB, _WITHOUT_RGB = 7, 6  # LAS 1.4's point formats
@@ -103,12 +104,7 @@ class LasStream(AbstractContextManager["LasStream"]):
 
 
 def _laspy() -> Any:
-    try:
-        import laspy
-        import lazrs  # noqa: F401  # laspy's writer of LAZ
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"Writing LAS needs the package {error.name}, which is not installed: "
-            "pip install 'featuredb[lidar]'"
-        ) from error
+    require("lidar", "Writing LAS", "laspy", "lazrs")
+    import laspy
+
     return laspy

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import MissingExtraError, ScanFileError
+from featuredb.errors import ScanFileError
+from featuredb.extras import require
 from featuredb.geometry.arrays import FloatArray
 
 Affine = tuple[float, float, float, float, float, float]
@@ -176,13 +177,9 @@ def import_rasterio() -> ModuleType:
     Raises:
         MissingExtraError: it is not installed.
     """
-    try:
-        import rasterio
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"Ortho images and rasters of heights need the package {error.name}, which is not installed: "
-            "pip install 'featuredb[lidar]'"
-        ) from error
+    require("lidar", "An ortho image or a raster of heights", "rasterio")
+    import rasterio
+
     module: ModuleType = rasterio
     return module
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from types import ModuleType
 from typing import Any, TypeVar
 
-from featuredb.errors import MissingExtraError
+from featuredb.extras import require
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -28,12 +28,5 @@ def compiled_module(name: str) -> ModuleType:
     Raises:
         MissingExtraError: numba is not installed.
     """
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name != "numba":
-            raise
-        raise MissingExtraError(
-            "Drawing point clouds needs the package numba, which is not installed: "
-            "pip install 'featuredb[lidar]'"
-        ) from error
+    require("lidar", "Drawing point clouds", "numba")
+    return importlib.import_module(name)

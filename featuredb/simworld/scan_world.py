@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from featuredb.errors import MissingExtraError
+from featuredb.extras import require
 from featuredb.simworld.airborne import ScanOptions, scan_town
 from featuredb.simworld.ortho import OrthoOptions, make_ortho
 from featuredb.simworld.scene import Scene
@@ -24,6 +24,8 @@ _FORMAT = 1  # raised when the same options give other files
 _OTHER_TOWN = 2000  # added to the seed: neither this town nor that of the negative photos
 
 Size = Literal["short", "full"]
+
+_NEEDS = ("lidar", "A scan with an ortho image", "laspy", "lazrs", "rasterio")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +91,7 @@ def write_scan_world(folder: Path, options: ScanWorldOptions, progress: Progress
     stamp, fingerprint = folder / _STAMP_FILE, options.fingerprint()
     if stamp.is_file() and json.loads(stamp.read_text())["fingerprint"] == fingerprint:
         return open_scan_world(folder)
-    _check_extra()
+    require(*_NEEDS)
     # The stamp comes last: a folder with it is complete.
     stamp.unlink(missing_ok=True)
     write_world(folder, options.world, progress)
@@ -107,7 +109,7 @@ def write_lidar(
         MissingExtraError: the packages of the extra `lidar` are not installed.
         OSError: the folder cannot be written.
     """
-    _check_extra()
+    require(*_NEEDS)
     from featuredb.lidar.geotiff import write_geotiff
     from featuredb.simworld.scan_file import write_scan
 
@@ -149,15 +151,3 @@ def open_scan_world(folder: Path) -> ScanWorld:
 def other_town_here(options: WorldOptions) -> Scene:
     """A town of another seed at the very place of the world's town."""
     return make_town(options.seed + _OTHER_TOWN, name="other town, same place", size_m=options.town_size_m)
-
-
-def _check_extra() -> None:
-    try:
-        import laspy  # noqa: F401
-        import lazrs  # type: ignore[import-untyped, unused-ignore]  # noqa: F401  # laspy's writer of LAZ
-        import rasterio  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise MissingExtraError(
-            f"Scans and ortho images need the package {error.name}, which is not installed: "
-            "pip install 'featuredb[lidar]'"
-        ) from error

@@ -5,9 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from featuredb.errors import MissingExtraError
-
-_MODULES = ("fastapi", "uvicorn", "python_multipart")
+from featuredb.extras import require
 
 
 def register(subparsers: Any) -> None:
@@ -48,26 +46,8 @@ def register(subparsers: Any) -> None:
     gateway.set_defaults(run=_run)
 
 
-def require_extra() -> None:
-    """Refuse early where the extra is not installed.
-
-    Raises:
-        MissingExtraError: with the name of the extra.
-    """
-    import importlib
-
-    for name in _MODULES:
-        try:
-            importlib.import_module(name)
-        except ImportError as error:
-            raise MissingExtraError(
-                f"the HTTP gateway needs the package {name}, which is not installed: "
-                "pip install 'featuredb[http]'"
-            ) from error
-
-
 def _run(args: argparse.Namespace) -> int:
-    require_extra()
+    require("http", "The HTTP gateway", "fastapi", "uvicorn", "python_multipart")
     from reloc.gateway.options import GatewayOptions
     from reloc.gateway.serve import serve
     from reloc.service.logs import log_to

@@ -5,14 +5,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from featuredb.errors import ExportError, MissingExtraError
+from featuredb.errors import ExportError
+from featuredb.extras import require
 
 if TYPE_CHECKING:
     from featuredb.export.selection import Selection
     from reloc.viewer.placing import PlacingPages
     from reloc.viewer.scene import Scene
-
-_MODULES = ("fastapi", "uvicorn")
 
 
 def register(subparsers: Any) -> None:
@@ -57,24 +56,6 @@ def register(subparsers: Any) -> None:
     view.set_defaults(run=_run)
 
 
-def require_extra() -> None:
-    """Refuse early where the extra is not installed.
-
-    Raises:
-        MissingExtraError: with the name of the extra.
-    """
-    import importlib
-
-    for name in _MODULES:
-        try:
-            importlib.import_module(name)
-        except ImportError as error:
-            raise MissingExtraError(
-                f"the viewer needs the package {name}, which is not installed: "
-                "pip install 'featuredb[http]'; `featuredb view DB --static OUT.html` works without it"
-            ) from error
-
-
 def _run(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database, progress_of_maps
     from reloc.tracking.trajectory_read import read_trajectory_csv
@@ -84,7 +65,7 @@ def _run(args: argparse.Namespace) -> int:
     from reloc.viewer.static_page import write_static_page
 
     if args.static is None:
-        require_extra()
+        require("http", "The viewer (but not `--static OUT.html`)", "fastapi", "uvicorn")
     elif args.static.exists():
         raise ExportError(f"{args.static}: expected a name that is free; nothing is overwritten")
     tracks = [read_trajectory_csv(path) for path in args.trajectory]

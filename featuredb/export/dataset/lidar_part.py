@@ -1,17 +1,16 @@
 """The scans that the maps lie on: their tiles as LAZ, and what is known of them."""
 
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from featuredb.errors import MissingExtraError
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import licence_is
+from featuredb.extras import require
 from featuredb.geo.tiles import tiles_touching
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
 from featuredb.store.scans import ScanSummary, list_scans
@@ -27,11 +26,7 @@ def check_lidar() -> None:
     Raises:
         MissingExtraError: laspy or its LAZ backend is not installed.
     """
-    for name in ("laspy", "lazrs"):
-        if find_spec(name) is None:
-            raise MissingExtraError(
-                f"LiDAR tiles need {name}; install it by: pip install 'featuredb[lidar]', or leave them out"
-            )
+    require("lidar", "A dataset with LiDAR tiles", "laspy", "lazrs")
 
 
 def write_scans(job: ExportJob, contents: Contents, folder: Path) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from typing import Any
 from featuredb.errors import MissingExtraError
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
+from featuredb.extras import require
 from featuredb.geo.wkt import utm_projjson
 from featuredb.store.tables import BOUNDS
 
@@ -29,12 +30,9 @@ def check_stac() -> None:
     Raises:
         MissingExtraError: pystac is not installed, or one that writes another version of STAC.
     """
-    try:
-        import pystac
-    except ImportError as error:
-        raise MissingExtraError(
-            "a dataset's catalogue needs pystac; install it by: pip install 'featuredb[dataset]'"
-        ) from error
+    require("dataset", "A dataset's catalogue", "pystac")
+    import pystac
+
     found = pystac.get_stac_version()
     if found != STAC_VERSION:
         raise MissingExtraError(
