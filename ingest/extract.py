@@ -87,11 +87,6 @@ def features_key(options: ExtractorOptions) -> str:
     return f"{options.fingerprint}-{options_fingerprint(options)}"
 
 
-def load_features(workspace: Workspace, options: ExtractorOptions, photo: Photo) -> PhotoFeatures:
-    """What `extract_photos` wrote for a photo."""
-    return read_features(workspace.features(features_key(options), photo.sha256))
-
-
 def read_features(path: Path) -> PhotoFeatures:
     """Features and colours of one npz file of this stage."""
     arrays = read_arrays(path)

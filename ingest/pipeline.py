@@ -115,7 +115,7 @@ def ingest_photos(
     job_id = digest(options.fingerprint, *sorted(photo.sha256 for photo in photos))[:24]
     workspace = Workspace(root=root, job_id=job_id)
     if options.stop_after == "scan":
-        result = Reconstructed(stopped_after="scan")
+        result = Reconstructed()
     else:
         with executor_of(options, shared=(root, folder.parent if is_table(folder) else folder)) as executor:
             result = reconstruct_photos(

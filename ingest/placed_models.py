@@ -11,7 +11,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap_bridge import Model
-from ingest.executor import Executor, Progress, no_progress
 from ingest.extract import PhotoFeatures
 from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
@@ -22,13 +21,11 @@ from ingest.reconstruction import (
     Reconstructed,
     gps_priors,
     local_frame_of,
-    reconstruct_photos,
 )
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.submodel import keep_photos, select_photos
 from ingest.tagged_elsewhere import Elsewhere, tagged_elsewhere
-from ingest.workspace import Workspace
 
 _WEAKLY_TIED = (
     "fewer than {least} points tie them to any other photo of their reconstruction: buildings that look "
@@ -63,21 +60,6 @@ class Component:
     reason_code: str = ""
     reason: str = ""
     control: ControlledPlacement | None = None
-
-
-def make_maps(
-    photos: Sequence[Photo],
-    workspace: Workspace,
-    options: MapMakingOptions,
-    executor: Executor,
-    *,
-    identity: Callable[[int], MapIdentity],
-    progress: Progress = no_progress,
-    survey: Survey | None = None,
-) -> tuple[Component, ...]:
-    """Reconstruct and place photos; all maps at once in memory. See `reconstruct_photos`, `place_models`."""
-    done = reconstruct_photos(photos, workspace, options, executor, progress=progress)
-    return tuple(place_models(done, options, identity=identity, survey=survey))
 
 
 def place_models(

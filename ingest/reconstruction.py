@@ -40,7 +40,6 @@ from ingest.workspace import Workspace
 logger = logging.getLogger(__name__)
 
 Stage = Literal["scan", "extract", "match", "reconstruct", "build", "commit"]
-STAGES: tuple[Stage, ...] = ("scan", "extract", "match", "reconstruct", "build", "commit")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +87,6 @@ class Reconstructed:
         pairs: pairs tried, by row.
         inliers: verified matches of the pairs that have enough of them.
         matches_per_photo: verified matches by photo name, summed over its pairs.
-        stopped_after: the stage after which the caller wanted to stop, or None.
     """
 
     usable: tuple[Photo, ...] = ()
@@ -102,7 +100,6 @@ class Reconstructed:
     pairs: tuple[Pair, ...] = ()
     inliers: dict[Pair, int] = field(default_factory=dict)
     matches_per_photo: dict[str, int] = field(default_factory=dict)
-    stopped_after: Stage | None = None
 
 
 def reconstruct_photos(
@@ -132,7 +129,7 @@ def reconstruct_photos(
     features = FeatureFiles([workspace.features(fingerprint, p.sha256) for p in usable])
     done = Reconstructed(usable=usable, features=features, unreadable=extracted.unreadable)
     if stop_after == "extract":
-        return replace(done, stopped_after="extract")
+        return done
 
     cameras, camera_rows = photo_cameras(usable, options.cameras, options.sfm.camera_model)
     views = _views(usable, features, cameras, camera_rows)
@@ -166,14 +163,13 @@ def reconstruct_photos(
         matches_per_photo=_matches_per_photo(usable, matched.inliers),
     )
     if stop_after == "match":
-        return replace(done, stopped_after="match")
+        return done
 
     with clock.stage("reconstruct") as counts:
         made = _reconstruct(done, cameras, camera_rows, matched, workspace, options, executor, progress)
         counts |= {"reused": made.reused, "total": made.blocks}
     lost = {usable[row].name: reason for row, reason in made.lost.items()}
-    stopped: Stage | None = "reconstruct" if stop_after == "reconstruct" else None
-    return replace(done, reconstruction=made, lost=lost, stopped_after=stopped)
+    return replace(done, reconstruction=made, lost=lost)
 
 
 def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:

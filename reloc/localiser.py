@@ -6,7 +6,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from featuredb.errors import IncompatibleExtractorError, MapNotFoundError, UnplacedBesideOthersError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import load_or_build
+from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import Lineage
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -69,7 +68,6 @@ class Localiser:
         as_of: int | datetime | None = None,
         *,
         previous: "Localiser | None" = None,
-        cache: Path | None = None,
         also: Collection[str] = (),
         instead: Mapping[str, FeatureMap] | None = None,
     ) -> "Localiser":
@@ -78,7 +76,6 @@ class Localiser:
         Args:
             as_of: snapshot number or time; None: the newest.
             previous: areas that have not changed since are taken over from it.
-            cache: folder for index files of large areas; None: indexes live in memory only.
             also: quarantined maps that take part as if they were active: a trial before they are.
             instead: states of maps, by id, that take part in the place of those in the database: a trial
                 before they are committed.
@@ -96,9 +93,7 @@ class Localiser:
         for group in _group(active):
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
-            loaded.append(
-                known[key] if key in known and not tried else _load(snapshot, group, key, cache, trial)
-            )
+            loaded.append(known[key] if key in known and not tried else _load(snapshot, group, key, trial))
         unplaced = {
             m.map_id: partial(snapshot.load_unplaced, m.map_id)
             for m in snapshot.unplaced_maps()
@@ -191,7 +186,7 @@ class Localiser:
             if self._own is None or self._own[0].map_id != map_id:
                 unplaced = self._unplaced[map_id]()
                 area = build_area([at_stand_in(unplaced)])
-                index = load_or_build(area.descriptors, area.digest, None)
+                index = build_index(area.descriptors)
                 self._own = (unplaced, IndexedArea(area=area, index=index))
             return self._own
 
@@ -230,9 +225,7 @@ class Localiser:
                 chosen.append(loaded.indexed)
             elif loaded.map_ids & wanted:
                 area = build_area([m for m in loaded.indexed.area.maps if m.map_id in wanted])
-                chosen.append(
-                    IndexedArea(area=area, index=load_or_build(area.descriptors, area.digest, None))
-                )
+                chosen.append(IndexedArea(area=area, index=build_index(area.descriptors)))
         return chosen
 
 
@@ -240,11 +233,10 @@ def _load(
     snapshot: Snapshot,
     group: list[MapSummary],
     key: tuple[str, ...],
-    cache: Path | None,
     instead: Mapping[str, FeatureMap],
 ) -> _Loaded:
     area = build_area([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
-    index = load_or_build(area.descriptors, area.digest, cache)
+    index = build_index(area.descriptors)
     _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
     return _Loaded(
         key=key,

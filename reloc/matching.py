@@ -65,11 +65,6 @@ class ClusterMatcher:
         return _concatenate([m.matches(xy, self.cluster.area, self._options) for m in self._maps])
 
 
-def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
-    """Matches of all features with a cluster, see `ClusterMatcher.matches`."""
-    return ClusterMatcher(features, cluster, options).matches(len(features))
-
-
 class _MapNeighbours:
     """The nearest points of one map, for as many features as were asked for so far."""
 

@@ -35,7 +35,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
-from ingest.extract import PhotoFeatures, load_features
+from ingest.extract import PhotoFeatures, features_key, read_features
 from ingest.fingerprint import digest
 from ingest.growth.grow_photos import Grown, GrowPhotosOptions, grow_photos
 from ingest.growth.grown_map import GrowOptions
@@ -45,8 +45,8 @@ from ingest.growth.values import GrownMap
 from ingest.joint.in_database import adjust_maps
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
-from ingest.placed_models import Component, make_maps
-from ingest.reconstruction import MapMakingOptions
+from ingest.placed_models import Component, place_models
+from ingest.reconstruction import MapMakingOptions, reconstruct_photos
 from ingest.register.gps import similarity_closed_form
 from ingest.scan import ScanOptions, require_usable, scan_folder
 from ingest.workspace import Workspace
@@ -85,7 +85,8 @@ class State:
 
     def features_of(self, row: int) -> PhotoFeatures:
         """Features of a photo, from the cache of the ingest."""
-        return load_features(Workspace(root=self.work, job_id="-"), self.making.extractor, self.photos[row])
+        workspace = Workspace(root=self.work, job_id="-")
+        return read_features(workspace.features(features_key(self.making.extractor), self.photos[row].sha256))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -252,7 +253,8 @@ def _reconstruct(
     chosen = [photos[r] for r in rows]
     job = Workspace(root=work, job_id=digest(making.fingerprint, *(p.sha256 for p in chosen))[:24])
     identity: Callable[[int], MapIdentity] = lambda number: _identity([*rows, number])  # noqa: E731
-    done = make_maps(chosen, job, making, InProcessExecutor(), identity=identity)
+    made = reconstruct_photos(chosen, job, making, InProcessExecutor())
+    done = list(place_models(made, making, identity=identity))
     return sorted(done, key=lambda c: -len(c.photos))
 
 

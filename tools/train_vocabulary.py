@@ -15,9 +15,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.index.codebook import use_threads
-from featuredb.index.vocabulary import train_vocabulary
+from featuredb.features.features import DESCRIPTOR_SIZE
+from featuredb.index.codebook import kmeans, use_threads
+from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import InProcessExecutor, PoolExecutor
 from ingest.extract import extract_photos, features_key
 from ingest.scan import ScanOptions, scan_folder
@@ -55,6 +60,46 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"digest {vocabulary.digest}\n"
     )
     return 0
+
+
+def train_vocabulary(
+    descriptors: Sequence[NDArray[np.uint8]],
+    *,
+    words: int = 128,
+    dimensions: int = 32,
+    per_photo: int = 1500,
+    seed: int = 0,
+) -> Vocabulary:
+    """Principal components and k-means of some descriptors of each photo, with fixed random choices.
+
+    Args:
+        descriptors: (n, 128) of each photo.
+        per_photo: descriptors taken of each.
+
+    Raises:
+        InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
+    """
+    generator = np.random.default_rng(seed)
+    parts = []
+    for photo in descriptors:
+        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
+        parts.append(photo[np.sort(rows)].astype(np.float32))
+    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
+    if len(samples) < 40 * words:
+        raise InvalidValueError(
+            f"train_vocabulary: expected at least {40 * words} descriptors for {words} words, found "
+            f"{len(samples)}; give more photos"
+        )
+    mean = samples.mean(axis=0, dtype=np.float64)
+    _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
+    projection = vectors[:, ::-1][:, :dimensions]
+    projection = projection * np.sign(projection[np.abs(projection).argmax(axis=0), np.arange(dimensions)])
+    projected = ((samples - mean) @ projection).astype(np.float32)
+    return Vocabulary(
+        mean=mean.astype(np.float32),
+        projection=projection.astype(np.float32),
+        words=kmeans(projected, words, seed, iterations=25).astype(np.float32),
+    )
 
 
 if __name__ == "__main__":

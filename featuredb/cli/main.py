@@ -23,7 +23,7 @@ from featuredb.errors import FeatureDbError
 logger = logging.getLogger(__name__)
 
 COMMAND_GROUP = "featuredb.commands"
-EXIT_NO, EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 1, 2, 70, 130
+EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 2, 70, 130  # 1: the command itself says no
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 Register = Callable[[Any], None]

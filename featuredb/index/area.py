@@ -4,7 +4,6 @@ An area is derived from maps and can be rebuilt at any time. Only points that ca
 in it.
 """
 
-import hashlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from featuredb.errors import IncompatibleExtractorError, InvalidValueError
-from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.features.film_lens import is_of_film
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -46,7 +44,6 @@ class Area:
         image_reach: (i,) float64, median distance of those points from the camera, metres.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
         extractor_fingerprint: of all descriptors.
-        digest: names the content; equal digests hold equal areas.
     """
 
     frame: LocalFrame
@@ -68,7 +65,6 @@ class Area:
     image_reach: FloatArray
     covisible: sparse.csr_array
     extractor_fingerprint: str
-    digest: str
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
@@ -149,7 +145,6 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         image_reach=image_reach,
         covisible=_covisibility(see_image, see_point, image_map, image_scene, image_reach),
         extractor_fingerprint=fingerprints[0],
-        digest=_digest(maps, frame),
     )
 
 
@@ -273,15 +268,3 @@ def _covisibility(
 
 def _repeat(counts: list[int]) -> NDArray[np.int32]:
     return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-
-
-def _digest(maps: Sequence[FeatureMap], frame: LocalFrame) -> str:
-    digest = hashlib.sha256(repr(frame).encode())
-    for feature_map in maps:
-        digest.update(feature_map.map_id.encode())
-        digest.update(np.ascontiguousarray(feature_map.points.utm).tobytes())
-        seen = feature_map.observations
-        for array in (seen.point_index, seen.image_id, seen.has_descriptor, seen.descriptors):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(str(DESCRIPTOR_SIZE).encode())
-    return digest.hexdigest()

@@ -6,7 +6,6 @@ representation, 2013) and intra-normalisation (Arandjelovic and Zisserman, All a
 """
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from io import BytesIO
@@ -20,7 +19,6 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.arrays import frozen_array
-from featuredb.index.codebook import kmeans
 
 _SHIPPED = "vocabulary.npz"
 _ARRAYS = ("mean", "projection", "words")
@@ -79,46 +77,6 @@ class Vocabulary:
         buffer = BytesIO()
         np.savez(buffer, **{name: getattr(self, name) for name in _ARRAYS})
         return buffer.getvalue()
-
-
-def train_vocabulary(
-    descriptors: Sequence[NDArray[np.uint8]],
-    *,
-    words: int = 128,
-    dimensions: int = 32,
-    per_photo: int = 1500,
-    seed: int = 0,
-) -> Vocabulary:
-    """Principal components and k-means of some descriptors of each photo, with fixed random choices.
-
-    Args:
-        descriptors: (n, 128) of each photo.
-        per_photo: descriptors taken of each.
-
-    Raises:
-        InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
-    """
-    generator = np.random.default_rng(seed)
-    parts = []
-    for photo in descriptors:
-        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
-        parts.append(photo[np.sort(rows)].astype(np.float32))
-    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
-    if len(samples) < 40 * words:
-        raise InvalidValueError(
-            f"train_vocabulary: expected at least {40 * words} descriptors for {words} words, found "
-            f"{len(samples)}; give more photos"
-        )
-    mean = samples.mean(axis=0, dtype=np.float64)
-    _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
-    projection = vectors[:, ::-1][:, :dimensions]
-    projection = projection * np.sign(projection[np.abs(projection).argmax(axis=0), np.arange(dimensions)])
-    projected = ((samples - mean) @ projection).astype(np.float32)
-    return Vocabulary(
-        mean=mean.astype(np.float32),
-        projection=projection.astype(np.float32),
-        words=kmeans(projected, words, seed, iterations=25).astype(np.float32),
-    )
 
 
 def shipped_vocabulary() -> Vocabulary:

@@ -14,7 +14,6 @@ from featuredb.render.rendering import Rendering
 from featuredb.render.splats import BlockPlanes, SplatOptions, draw_splats, project_points
 from featuredb.render.surfaces import SurfaceOptions, apart_px, block_planes, close_holes, surfaces_of
 from featuredb.render.threads import over_rows, thread_count
-from featuredb.stage_clock import StageClock
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
 _WORTH_REDRAWING_PX = 2.5
@@ -40,44 +39,32 @@ def render(
     camera: Camera,
     cam_from_local: Rigid3,
     options: RenderOptions | None = None,
-    clock: StageClock | None = None,
 ) -> Rendering:
     """What the camera sees of the cloud, in colour, intensity, depth and by index.
 
     The same picture whatever the number of threads; safe to call from several threads at once.
 
-    Args:
-        clock: is told how long each stage took.
-
     Raises:
         MissingExtraError: numba is not installed.
     """
-    options, clock = options or RenderOptions(), clock or StageClock()
+    options = options or RenderOptions()
     threads = thread_count(options.threads)
     near_m, finest_px = options.splats.near_m, options.splats.finest_px
     rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)
-    clock.lap("cull")
     points = project_points(
         cloud, rows, camera, cam_from_local, options.splats, threads, attributes=options.attributes
     )
-    clock.lap("project")
     splats = draw_splats(points, camera, options.splats, threads)
-    clock.lap("draw")
     focal_px, planes = camera.focal_px, BlockPlanes.unknown()
     apart = apart_px(splats, focal_px)
     if options.surfaces.tilt_splats and len(apart):
         planes = block_planes(splats, float(np.median(apart)), threads)
-        clock.lap("planes")
         if np.quantile(apart, 0.95) > _WORTH_REDRAWING_PX:
             splats = draw_splats(points, camera, options.splats, threads, planes)
-            clock.lap("draw again")
     surfaces = surfaces_of(splats, planes, focal_px, threads)
-    clock.lap("surfaces")
     if options.surfaces.close_holes:
         surfaces = close_holes(surfaces, splats, planes, focal_px, options.surfaces, threads)
-        clock.lap("close holes")
     rgb, intensity = _painted(surfaces.paint, cloud, options.attributes, threads)
-    clock.lap("paint")
     return Rendering(
         camera=camera,
         cam_from_local=cam_from_local,

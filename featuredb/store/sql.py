@@ -25,13 +25,10 @@ from featuredb.store.tables import (
     IMAGES,
     LIDAR,
     LIDAR_POINTS,
-    LIDAR_TABLES,
-    MAPS,
     POINTS,
     SPECS,
 )
 
-VIEWS = (MAPS, *CHILD_TABLES, "cameras", *LIDAR_TABLES, CANDIDATES, CANARIES)
 _BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
 _ALLOWED = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 

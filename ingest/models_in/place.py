@@ -21,7 +21,6 @@ from ingest.reconstruction import gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps, similarity_closed_form
 
 Axes = Literal["enu", "utm", "ecef"]
-AXES: tuple[Axes, ...] = ("enu", "utm", "ecef")
 # A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the
 # best similarity leaves of that is below a thousandth of the model's size; more means that it is no UTM.
 _MOST_MISFIT = 1e-3

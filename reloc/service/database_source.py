@@ -1,7 +1,5 @@
 """Areas of a database: the maps of its newest snapshot and a localiser over them."""
 
-from pathlib import Path
-
 import numpy as np
 
 from featuredb.geo.utm import geodetic_from_utm
@@ -15,12 +13,9 @@ from reloc.wire_server import BoundingBox, MapInfo
 class DatabaseSource:
     """Loads what a database offers now; see `reloc.service.source.AreaSource`."""
 
-    def __init__(
-        self, database: Database, options: LocaliseOptions | None = None, index_cache: Path | None = None
-    ) -> None:
+    def __init__(self, database: Database, options: LocaliseOptions | None = None) -> None:
         self._database = database
         self._options = options or LocaliseOptions()
-        self._index_cache = index_cache
         self._previous: Localiser | None = None
 
     def version(self) -> int:
@@ -33,9 +28,7 @@ class DatabaseSource:
         Raises:
             FeatureDbError: the store cannot be read, or maps do not fit together.
         """
-        localiser = Localiser.open(
-            self._database, self._options, previous=self._previous, cache=self._index_cache
-        )
+        localiser = Localiser.open(self._database, self._options, previous=self._previous)
         self._previous = localiser
         snapshot = self._database.snapshot(localiser.snapshot)
         active = [summary for summary in snapshot.maps() if summary.status == "active"]

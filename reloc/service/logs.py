@@ -24,12 +24,12 @@ class JsonLinesFormatter(logging.Formatter):
         return json.dumps(line, default=str)
 
 
-def log_to(stream: TextIO, level: int = logging.INFO) -> None:
+def log_to(stream: TextIO) -> None:
     """Write the service's logs to a stream; for the program's entry, not for library code."""
     handler = logging.StreamHandler(stream)
     handler.setFormatter(JsonLinesFormatter())
     for name in ("reloc", "featuredb"):
         logger = logging.getLogger(name)
         logger.addHandler(handler)
-        logger.setLevel(level)
+        logger.setLevel(logging.INFO)
         logger.propagate = False  # or each line comes a second time, in the program's own format

@@ -7,7 +7,6 @@ import uuid
 
 import zenoh
 
-from featuredb.errors import FeatureDbError
 from reloc.service.metrics import Metrics
 from reloc.wire import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
@@ -128,8 +127,3 @@ class PendingQuery:
                 exc_info=True,
                 extra={"fields": {"event": "reply_failed", "request_id": self.request_id}},
             )
-
-
-def as_request_error(error: FeatureDbError, code: ErrorCode) -> RequestError:
-    """The error as it goes over the wire."""
-    return RequestError(code, str(error))

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,7 +28,6 @@ from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
 _LOG = logging.getLogger(__name__)
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
-OnFrame = Callable[[TrackedFrame, TrajectoryPoint], None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +87,6 @@ def track_video(
     request: LocaliseRequest | None = None,
     overlay: Path | None = None,
     options: TrackVideoOptions | None = None,
-    on_frame: OnFrame | None = None,
 ) -> TrackedVideo:
     """Track every frame of a film.
 
@@ -100,7 +98,6 @@ def track_video(
         camera: intrinsics of the film's frames, upright, of any size; None: of the first frame that is found.
         request: what else is known of the first frame.
         overlay: an mp4 to be written.
-        on_frame: called after each frame.
 
     Raises:
         VideoError: the film cannot be read at all, or has no frames; the overlay cannot be written. Where it
@@ -146,8 +143,6 @@ def track_video(
                 _filled(points, tracker.late)
                 now = clock()
                 gap, last = (max(gap, now - last) if len(points) > 1 else 0.0), now
-                if on_frame is not None:
-                    on_frame(tracked, point)
                 if writer is not None:
                     first_s = frame.time_s if first_s is None else first_s
                     picture = draw_frame(frame.rgb(), tracked, point)

@@ -13,8 +13,8 @@ from reloc.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
     ClusterMatcher,
+    Matches,
     guided_matches,
-    match_cluster,
     visible_points,
 )
 from reloc.options import MatchOptions
@@ -31,6 +31,12 @@ from tests.support.scenes import (
 )
 
 OPTIONS = MatchOptions()
+
+
+def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
+    return ClusterMatcher(features, cluster, options).matches(len(features))
+
+
 POSE = looking_at(np.array([38.0, 22.0, 33.0]), np.array([0.0, 0.0, 3.0]))
 RNG = np.random.default_rng(0)
 POINTS, DESCRIPTORS = box_points(RNG, 200), random_descriptors(RNG, 200)

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.index.vocabulary import train_vocabulary
 from featuredb.maps.feature_map import GeoPrior
 from ingest.pairs import PairOptions, choose_pairs, more_pairs
 from ingest.photo import Photo
+from tools.train_vocabulary import train_vocabulary
 
 _FRAME = LocalFrame(latitude_deg=48.99, longitude_deg=8.41, height_m=100.0)
 
