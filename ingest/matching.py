@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
-from featuredb.index.codebook import use_threads
+from featuredb.index.descriptor_index import use_threads
 from featuredb.index.nearest import nearest
 from ingest.colmap_bridge import TwoView, verify_pair
 from ingest.executor import Executor, Lost, Progress, no_progress

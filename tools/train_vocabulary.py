@@ -15,13 +15,14 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import faiss
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.features.features import DESCRIPTOR_SIZE
-from featuredb.index.codebook import kmeans, use_threads
+from featuredb.index.descriptor_index import use_threads
 from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import InProcessExecutor, PoolExecutor
 from ingest.extract import extract_photos, features_key
@@ -98,8 +99,23 @@ def train_vocabulary(
     return Vocabulary(
         mean=mean.astype(np.float32),
         projection=projection.astype(np.float32),
-        words=kmeans(projected, words, seed, iterations=25).astype(np.float32),
+        words=_kmeans(projected, words, seed, iterations=25).astype(np.float32),
     )
+
+
+def _kmeans(samples: NDArray[np.float32], clusters: int, seed: int, iterations: int) -> NDArray[np.float64]:
+    """Cluster centres (clusters, d) of samples (n, d) by Lloyd's algorithm with a fixed seed."""
+    trainer = faiss.Kmeans(
+        samples.shape[1],
+        clusters,
+        niter=iterations,
+        seed=seed,
+        min_points_per_centroid=1,
+        max_points_per_centroid=1_000_000,
+        verbose=False,
+    )
+    trainer.train(np.ascontiguousarray(samples, dtype=np.float32))
+    return np.asarray(trainer.centroids, dtype=np.float64).reshape(clusters, -1)
 
 
 if __name__ == "__main__":

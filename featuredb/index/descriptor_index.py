@@ -67,3 +67,8 @@ def build_index(descriptors: NDArray[np.uint8]) -> DescriptorIndex:
     for start in range(0, count, 100_000):
         index.add(descriptors[start : start + 100_000].astype(np.float32))
     return DescriptorIndex(index)
+
+
+def use_threads(count: int) -> None:
+    """Cap the threads of FAISS in what the calling thread does."""
+    faiss.omp_set_num_threads(count)

@@ -58,15 +58,6 @@ def _through_lens(u: float, v: float, r2: float, q: float, scale: float, lens: L
 
 
 @compiled
-def project_many(points: Float64, lens: Lens) -> Float64:
-    """Pixels (n, 2) of points (n, 3) in camera axes."""
-    pixels = np.empty((len(points), 2))
-    for i in range(len(points)):
-        pixels[i] = project(points[i, 0], points[i, 1], points[i, 2], lens)
-    return pixels
-
-
-@compiled
 def project_runs(
     xyz: Float32,
     runs: Int64,

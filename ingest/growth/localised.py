@@ -13,7 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
-from featuredb.index.codebook import use_threads
+from featuredb.index.descriptor_index import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photo import Photo
 from reloc.acceptance import AcceptanceOptions, agreement

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.index.codebook import use_threads
+from featuredb.index.descriptor_index import use_threads
 from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.workspace import Workspace, read_array, write_arrays

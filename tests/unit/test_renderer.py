@@ -14,7 +14,7 @@ from featuredb.geometry.rays import pixel_rays
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
-from featuredb.render.draw_loops import project_many
+from featuredb.render.draw_loops import project
 from featuredb.render.lens import lens_numbers
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import RenderOptions, render
@@ -75,7 +75,8 @@ def cloud_of(*parts: NDArray[np.float64]) -> PointCloud:
 def test_the_compiled_projection_is_pycolmaps(camera: Camera) -> None:
     rng = np.random.default_rng(3)
     points = np.column_stack([rng.uniform(-30, 30, (4000, 2)), rng.uniform(-5, 30, 4000)])
-    ours, theirs = project_many(points, lens_numbers(camera)), camera.project(points)
+    lens = lens_numbers(camera)
+    ours, theirs = np.array([project(*point, lens) for point in points]), camera.project(points)
     assert np.array_equal(np.isnan(ours), np.isnan(theirs))
     seen = np.isfinite(theirs).all(axis=1)
     assert seen.any()
