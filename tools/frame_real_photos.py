@@ -1,7 +1,7 @@
 """Real photos registered to a real scan, one by one, from their EXIF alone and from priors that are wrong.
 
     python -m tools.frame_real_photos SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
-        [--photos NAME ...] [--refine] [--json FILE]
+        [--photos NAME ...] [--json FILE]
 
 Two registrations of each photo:
 
@@ -43,7 +43,7 @@ _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     cloud = read_cloud(args.scan, args.epsg)
-    options = FrameOptions(threads=2, refine=args.refine)
+    options = FrameOptions(threads=2)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
     passed, accepted, apart, seconds = True, 0, [], []
     for number, name in enumerate(names):
@@ -166,7 +166,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--epsg", type=int, default=32615, help="UTM zone of the scan")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
-    parser.add_argument("--refine", action="store_true", help="with intensity refinement")
     parser.add_argument("--max-s", type=float, default=10.0, help="seconds on two cores")
     add_json_option(parser)
     return parser.parse_args(argv)

@@ -50,7 +50,6 @@ def test_good_evidence_is_believed() -> None:
         ({"agreement": 0.1}, "NO_CONSISTENT_POSE"),
         ({"rival_share": 0.6}, "AMBIGUOUS"),
         ({"position_sigma_share": 0.2}, "NO_CONSISTENT_POSE"),
-        ({"focal_sigma_rel": 0.05}, "NO_CONSISTENT_POSE"),
         ({"prior_sigmas": 9.0}, "CONTRADICTS_PRIOR"),
     ],
 )

@@ -12,7 +12,6 @@ from ingest.register.frame.dense import (
     confirmed,
     dense_fitted,
     dense_hypotheses,
-    intensity_refined,
     searched_again,
 )
 from ingest.register.frame.options import FrameOptions
@@ -144,18 +143,7 @@ def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock
         else:
             fitted = dense_fitted(views, prior, found, views.options.dense_fit) or found
     with clock.stage("confirm"):
-        judged = Judged(found=fitted, confirmation=confirmed(views, fitted))
-    if not views.options.refine or not judged.confirmation.confirmed:
-        return judged
-    with clock.stage("refine"):
-        return _refined(views, judged)
-
-
-def _refined(views: FrameViews, judged: Judged) -> Judged:
-    """By intensities, where the photo's pieces agree better with the refined pose than the fitted one."""
-    refined = intensity_refined(views, judged.found)
-    again = Judged(found=refined, confirmation=confirmed(views, refined))
-    return again if again.confirmation.score > judged.confirmation.score else judged
+        return Judged(found=fitted, confirmation=confirmed(views, fitted))
 
 
 def _guided(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis:

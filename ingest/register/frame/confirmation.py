@@ -27,7 +27,6 @@ from ingest.register.frame.score_maps import (
     TemplateOptions,
     cut_templates,
     peaks,
-    scores_at,
     search_around,
 )
 from ingest.register.frame.source_pictures import source_picture
@@ -90,8 +89,6 @@ class Confirmation:
             pose does.
         log_nfa: evidence, see ConfirmOptions.
         cells: parts of the photo, of 16, that hold an agreeing piece.
-        score: mean score of all pieces at the pose, in standard deviations of chance.
-        local_maximum: whether the mean score falls in all twelve directions of the pose.
         message: why not, or "".
         low_share, high_share: of agreeing pieces among the lower and the upper half, by height.
     """
@@ -101,8 +98,6 @@ class Confirmation:
     agreeing: int
     log_nfa: float
     cells: int
-    score: float
-    local_maximum: bool
     message: str
     low_share: float = 0.0
     high_share: float = 0.0
@@ -137,8 +132,6 @@ def confirm_pose(
             agreeing=0,
             log_nfa=0.0,
             cells=0,
-            score=0.0,
-            local_maximum=False,
             message=f"only {n} pieces of the picture have structure, {options.min_pieces} are needed",
         )
     places, _ = peaks(maps.maps)
@@ -151,7 +144,6 @@ def confirm_pose(
     log_nfa = float(-binom.logsf(free - 1, total, chance) / np.log(10.0))
     pixels = (maps.origin + places)[near] / (view.camera.width, view.camera.height)
     cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
-    score, is_maximum = _around(maps, cam_from_local)
     layers = _layers(maps.points_local[:, 2], near)
     message = _objection(agreeing / n, log_nfa, cells, layers, options)
     return Confirmation(
@@ -160,8 +152,6 @@ def confirm_pose(
         agreeing=agreeing,
         log_nfa=log_nfa,
         cells=cells,
-        score=score,
-        local_maximum=is_maximum,
         message=message,
         low_share=layers.low,
         high_share=layers.high,
@@ -178,24 +168,6 @@ def _maps(
     templates = cut_templates(channels, rendering, pieces)
     photo = oriented_gradients(view.image, view.valid, options.gradients)
     return search_around(templates, photo, view.camera, pose, options.search_px)
-
-
-def _around(maps: ScoreMaps, pose: Rigid3) -> tuple[float, bool]:
-    """Mean score at the pose, and whether it is less four pixels away in all directions of the pose."""
-    depth = float(np.median(pose.act(maps.points_local)[:, 2]))
-    turn = 4.0 / maps.camera.focal_px
-    width = max(maps.camera.width, maps.camera.height) / 2.0
-    # A turn about the axis and a step along it move the picture's border by four pixels too.
-    scale = np.array([turn, turn, 4.0 / width, turn * depth, turn * depth, 4.0 / width * depth])
-    here = _mean_score(maps, pose)
-    steps = [sign * scale * axis for axis in np.eye(6) for sign in (-1.0, 1.0)]
-    return here, all(_mean_score(maps, Rigid3.exp(step) @ pose) < here for step in steps)
-
-
-def _mean_score(maps: ScoreMaps, pose: Rigid3) -> float:
-    pixels: FloatArray = maps.camera.project(pose.act(maps.points_local))
-    scores, inside = scores_at(maps, pixels[None])
-    return float(scores.sum() / max(int(inside.sum()), 1))
 
 
 class _Layers(NamedTuple):

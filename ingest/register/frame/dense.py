@@ -7,7 +7,6 @@ import numpy as np
 from ingest.register.frame.confirmation import Confirmation, confirm_pose
 from ingest.register.frame.dense_fit import DenseFitOptions, near_places
 from ingest.register.frame.dense_search import register_dense, searched_near
-from ingest.register.frame.intensity import refine_by_intensity
 from ingest.register.frame.matching import joined
 from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.search import FrameHypothesis, independent
@@ -128,10 +127,3 @@ def confirmed(views: FrameViews, found: FrameHypothesis) -> Confirmation:
         found.source,
         views.options.confirm,
     )
-
-
-def intensity_refined(views: FrameViews, found: FrameHypothesis) -> FrameHypothesis:
-    """The pose moved to where the pictures agree best by mutual information and gradient correlation."""
-    pose = found.pose
-    refined = refine_by_intensity(views.gray, pose.camera, pose.cam_from_local, views.cloud, found.source)
-    return replace(found, pose=replace(pose, cam_from_local=refined.cam_from_local))

@@ -19,11 +19,6 @@ class FrameOptions:
     Attributes:
         sources: what is rendered, in the order in which it is tried; empty takes what the scan has. Colours
             come first: where a scan has them they match best by far, and a decisive result ends the search.
-        estimate_focal: the focal length is estimated with the pose; refused where it cannot be told from
-            the distance, as over flat ground.
-        refine: whether a confirmed pose is refined by mutual information and gradient correlation, and that
-            kept where the photo's pieces agree better. Off: the fit to dense pieces is more accurate by half
-            (docs/registration.md).
         search_side_px, final_side_px: longer side of the renders of the first round and of those from the
             pose found, at most.
         min_side_px: and at least; smaller pictures show too little.
@@ -54,8 +49,6 @@ class FrameOptions:
     """
 
     sources: tuple[RenderSource, ...] = ()
-    estimate_focal: bool = False
-    refine: bool = False
     search_side_px: int = 960
     final_side_px: int = 1600
     min_side_px: int = 400

@@ -95,9 +95,9 @@ def fitted_under_prior(
         options: of the fit that `pose` comes from. correlated: so many matches count as one.
 
     Returns:
-        `pose` itself where its lens was estimated with it, or the matches are few.
+        `pose` itself where the matches are few.
     """
-    if pose.focal_is_free or len(matches) < _MIN_MATCHES:
+    if len(matches) < _MIN_MATCHES:
         return pose
     tolerance_px = options.tolerance_rel * max(pose.camera.width, pose.camera.height)
     here = pose.cam_from_local

@@ -16,7 +16,7 @@ from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened, prior_sigmas
 from ingest.register.frame.search import FrameHypothesis, pose_options
-from ingest.register.frame.uncertainty import focal_sigma_rel, frame_covariance
+from ingest.register.frame.uncertainty import frame_covariance
 from ingest.register.frame.verdict import (
     FrameEvidence,
     asks_elsewhere,
@@ -45,7 +45,7 @@ def register_frame(
 
     Args:
         image: (h, w) or (h, w, 3) BGR uint8, the pixels that `camera` describes.
-        camera: calibrated intrinsics; with `options.estimate_focal` the focal length is a start only.
+        camera: calibrated intrinsics.
         prior: coarse pose in the frame of `cloud`, with honest standard deviations.
         cloud: the scan around it.
 
@@ -56,8 +56,6 @@ def register_frame(
     options = options or FrameOptions()
     clock = StageClock()
     gray = _gray(image, camera)
-    if options.estimate_focal and camera.model != "SIMPLE_RADIAL":
-        camera = Camera.from_focal(camera.width, camera.height, camera.focal_px)
     with clock.stage("look"):
         look = first_look(cloud, camera, prior)
     if look is None or look.cover < options.verdict.min_cover:
@@ -152,9 +150,6 @@ def _evidence(
         prior_sigmas=prior_sigmas(prior, found.pose.cam_from_local),
         position_sigma_share=share,
         relief_only=found.source == "shaded",
-        focal_sigma_rel=focal_sigma_rel(
-            found.inliers.pixels, found.inliers.points, found.pose, views.options.correlated_inliers
-        ),
     )
 
 

@@ -20,7 +20,7 @@ from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.acceptance import independent_inliers, log_nfa
 from reloc.lens_prior import LensPriors
 from reloc.options import PoseOptions
-from reloc.pose import CameraSource, PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+from reloc.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
 
 MatchKind = Literal["upright", "oriented", "dense"]
 
@@ -134,10 +134,10 @@ def guided(
         options.max_ratio,
     )
     settings = pose_options(views)
-    pose = estimate_pose(matches.pixels, matches.points, start.pose.camera, _lens(options), settings)
+    pose = estimate_pose(matches.pixels, matches.points, start.pose.camera, "request", settings)
     if pose is None:
         return None
-    pose = refine_pose(matches.pixels, matches.points, _with_prior_lens(pose, start.pose), settings)
+    pose = refine_pose(matches.pixels, matches.points, pose, settings)
     pose = fitted_under_prior(matches, pose, prior, settings, options.correlated_inliers)
     return replace(
         start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
@@ -182,7 +182,7 @@ def _hypothesis(
     views: FrameViews, raw: FrameMatches, kept: FrameMatches, source: RenderSource, upright: bool
 ) -> FrameHypothesis | None:
     settings = pose_options(views)
-    pose = estimate_pose(kept.pixels, kept.points, views.camera, _lens(views.options), settings)
+    pose = estimate_pose(kept.pixels, kept.points, views.camera, "request", settings)
     if pose is None:
         return None
     pose = refine_pose(kept.pixels, kept.points, pose, settings)
@@ -219,15 +219,6 @@ def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
     """Those inliers that are measurements of their own."""
     gap = _SAME_STRUCTURE_REL * max(camera.width, camera.height)
     return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
-
-
-def _lens(options: FrameOptions) -> CameraSource:
-    return "exif" if options.estimate_focal else "request"
-
-
-def _with_prior_lens(pose: PoseHypothesis, start: PoseHypothesis) -> PoseHypothesis:
-    """What was known of the lens beforehand stays what it was: a round's result is no new prior."""
-    return replace(pose, prior_focal_px=start.prior_focal_px)
 
 
 def _any_heading(prior: FramePrior, options: FrameOptions) -> bool:

@@ -8,7 +8,6 @@ from ingest.register.frame.prior_fit import prior_information
 from ingest.register.frame_registration import FramePrior
 from reloc.options import PoseOptions
 from reloc.pose import PoseHypothesis, pose_uncertainty
-from reloc.self_calibration import covariance_from_information, joint_jacobians
 
 
 def frame_covariance(
@@ -39,7 +38,7 @@ def frame_covariance(
     covariance = correlated_inliers * found.covariance
     shared = (shared_point_share * spacing_m) ** 2
     covariance = covariance + np.diag([shared / depth_m**2] * 3 + [shared] * 3)
-    if prior is not None and not pose.focal_is_free:
+    if prior is not None:
         information = np.linalg.inv(covariance) + prior_information(pose.cam_from_local, prior)
         covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     return left_perturbation(covariance, pose.cam_from_local)
@@ -54,21 +53,3 @@ def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatAr
     turn[:3, :3] = turn[3:, 3:] = -cam_from_local.rotation
     result = turn @ covariance @ turn.T
     return np.asarray((result + result.T) / 2.0, dtype=np.float64)
-
-
-def focal_sigma_rel(
-    pixels: FloatArray, points: FloatArray, pose: PoseHypothesis, correlated_inliers: float
-) -> float:
-    """Standard deviation of an estimated focal length as a share of it; 0 where the lens was given.
-
-    From the inliers with the residuals' own variance, so many of them counted as one, and what was known
-    of the lens beforehand: over flat ground it stays at that.
-    """
-    if pose.lens_prior is None or len(points) < 6:
-        return 0.0
-    _, jacobian = joint_jacobians(pose.camera, pose.cam_from_local, points)
-    residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
-    variance = correlated_inliers * max(float(np.mean(residual**2)), 1e-4)
-    information = np.einsum("nij,nik->jk", jacobian, jacobian) / variance
-    information[6:, 6:] += np.diag(pose.lens_prior.information)
-    return float(np.sqrt(covariance_from_information(information)[6, 6]) / pose.camera.focal_px)

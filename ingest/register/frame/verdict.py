@@ -40,7 +40,6 @@ class VerdictOptions:
             axes together. Generous: people and devices understate their errors.
         max_position_sigma_share: largest standard deviation of the position, as a share of the distance to
             what is seen; above it the geometry does not determine the pose.
-        max_focal_sigma_rel: largest standard deviation of an estimated focal length.
     """
 
     min_cover: float = 0.03
@@ -58,7 +57,6 @@ class VerdictOptions:
     rival_share: float = 0.5
     max_prior_sigmas: float = 6.0
     max_position_sigma_share: float = 0.05
-    max_focal_sigma_rel: float = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +72,7 @@ class FrameEvidence:
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
-        position_sigma_share: see VerdictOptions. focal_sigma_rel: of an estimated focal length, else 0.
+        position_sigma_share: see VerdictOptions.
         places_elsewhere, elsewhere_log_nfa: see `elsewhere`; none where it was not asked.
         relief_only: the pictures were compared by shaded relief, which shows what stands and nothing of the
             ground: an ortho image's roofs agreed with 10^-5.8 while the ground lay 6 m off.
@@ -92,7 +90,6 @@ class FrameEvidence:
     rival_share: float
     prior_sigmas: float
     position_sigma_share: float
-    focal_sigma_rel: float = 0.0
     places_elsewhere: int = 0
     elsewhere_log_nfa: float = 0.0
     relief_only: bool = False
@@ -140,12 +137,11 @@ def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReas
         )
     if e.rival_share >= o.rival_share:
         return "AMBIGUOUS", f"a pose elsewhere has {100 * e.rival_share:.0f} % of this one's inliers"
-    if e.position_sigma_share > o.max_position_sigma_share or e.focal_sigma_rel > o.max_focal_sigma_rel:
+    if e.position_sigma_share > o.max_position_sigma_share:
         return (
             "NO_CONSISTENT_POSE",
             f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % "
-            f"of the distance, focal length to {100 * e.focal_sigma_rel:.1f} %; over flat ground a focal "
-            "length cannot be told from a distance: give a calibrated camera",
+            f"of the distance, {100 * o.max_position_sigma_share:.1f} % needed",
         )
     if e.prior_sigmas > o.max_prior_sigmas:
         return (
