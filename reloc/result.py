@@ -1,7 +1,7 @@
 """What goes into a localisation and what comes out of it."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,7 @@ Reason = Literal[
     "AMBIGUOUS",
     "CONTRADICTS_PRIOR",
 ]
-REASONS: tuple[Reason, ...] = (
-    "NO_COVERAGE",
-    "TOO_FEW_FEATURES",
-    "TOO_FEW_MATCHES",
-    "TOO_FEW_INLIERS",
-    "AMBIGUOUS",
-    "CONTRADICTS_PRIOR",
-)
+REASONS: tuple[Reason, ...] = get_args(Reason)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -5,8 +5,7 @@
         --out featuredb/index/data/vocabulary.npz
 
 made the one that comes with featuredb: of photos that everybody can make again, by fixed seeds and on one
-thread. Others are used with `featuredb ingest photos --vocabulary FILE`. tools/retrieval_recall.py compares
-them.
+thread. Others are used with `featuredb ingest photos --vocabulary FILE`.
 """
 
 import argparse

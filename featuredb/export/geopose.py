@@ -4,14 +4,12 @@ The body is the camera with axes x forward, y left, z up. Heights are above the 
 wants, where the map's datum can be converted here; `manifest.json` says of each map what its heights are.
 """
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
-from featuredb.export.job import Exported, ExportJob
+from featuredb.export.job import Exported, ExportJob, write_json
 from featuredb.export.shots import Shot, shots_of
 from featuredb.export.tally import folder_for_each_map
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
@@ -35,14 +33,14 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     shots = list(shots_of(feature_map))
     names = _file_names(shots)
     for shot, name in zip(shots, names, strict=True):
-        _write(folder / BASIC / name, basic_ypr(shot.geopose))
+        write_json(folder / BASIC / name, basic_ypr(shot.geopose))
     timed = [(shot, name) for shot, name in zip(shots, names, strict=True) if shot.unix_ms is not None]
     if timed:
         (folder / ADVANCED).mkdir()
         for shot, name in timed:
-            _write(folder / ADVANCED / name, advanced(shot.geopose, _time(shot)))
+            write_json(folder / ADVANCED / name, advanced(shot.geopose, _time(shot)))
         in_time = sorted((_time(shot), shot.number, shot.geopose) for shot, _ in timed)
-        _write(folder / SERIES, irregular_series([(unix_ms, pose) for unix_ms, _, pose in in_time]))
+        write_json(folder / SERIES, irregular_series([(unix_ms, pose) for unix_ms, _, pose in in_time]))
     manifest = {
         "map_id": feature_map.map_id,
         "height_datum": shots[0].height_datum if shots else feature_map.height_datum,
@@ -54,7 +52,7 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
             for shot, name in zip(shots, names, strict=True)
         ],
     }
-    _write(folder / MANIFEST, manifest)
+    write_json(folder / MANIFEST, manifest)
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
 
 
@@ -70,9 +68,3 @@ def _file_names(shots: Sequence[Shot]) -> list[str]:
         folder_name(shot.name if counts[shot.name] == 1 else f"{shot.number}_{shot.name}") + ".json"
         for shot in shots
     ]
-
-
-def _write(path: Path, document: dict[str, Any]) -> None:
-    path.write_text(
-        json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )

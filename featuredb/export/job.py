@@ -1,5 +1,6 @@
 """What every format is given and gives back, and an output that is there whole or not at all."""
 
+import json
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
@@ -7,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from featuredb.errors import ExportError
 from featuredb.export.selection import Selection, exported_any, exported_maps, selected_any, selected_maps
@@ -108,3 +109,10 @@ def size_of(path: Path) -> int:
     if path.is_file():
         return path.stat().st_size
     return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+
+
+def write_json(path: Path, document: dict[str, Any]) -> None:
+    """Write a document for people and programs: indented, no NaN."""
+    path.write_text(
+        json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )

@@ -14,7 +14,7 @@ import numpy as np
 from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
 from featuredb.export.colmap_model import image_names
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
-from featuredb.export.job import Exported, ExportJob
+from featuredb.export.job import Exported, ExportJob, write_json
 from featuredb.export.opensfm_camera import opensfm_camera
 from featuredb.export.shots import Shot, shots_of
 from featuredb.export.tally import folder_for_each_map
@@ -40,7 +40,7 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     reference = _reference(feature_map)
     with (folder / "reconstruction.json").open("w", encoding="utf-8", newline="\n") as out:
         _write_reconstruction(out, feature_map, names)
-    _write(folder / "reference_lla.json", reference)
+    write_json(folder / "reference_lla.json", reference)
     with (folder / "tracks.csv").open("w", encoding="utf-8", newline="\n") as out:
         _write_tracks(out, feature_map, names)
     shots = {
@@ -50,7 +50,7 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
             for shot, image, name in zip(shots_of(feature_map), feature_map.images, names, strict=True)
         ],
     }
-    _write(folder / "shots.geojson", shots)
+    write_json(folder / "shots.geojson", shots)
     (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
 
@@ -151,9 +151,3 @@ def _odm_shot(shot: Shot, image: MapImage, feature_map: FeatureMap, name: str) -
 
 def _camera_id(index: int) -> str:
     return f"camera {index}"
-
-
-def _write(path: Path, document: dict[str, Any]) -> None:
-    path.write_text(
-        json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
-    )

@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
@@ -18,7 +18,7 @@ from featuredb.geo.checks import as_geodetic
 from featuredb.geo.projections import shift_heights
 
 HeightDatum = Literal["ellipsoidal", "egm96", "egm2008", "navd88", "unknown"]
-HEIGHT_DATUMS: tuple[HeightDatum, ...] = ("ellipsoidal", "egm96", "egm2008", "navd88", "unknown")
+HEIGHT_DATUMS: tuple[HeightDatum, ...] = get_args(HeightDatum)
 
 # Grid files of each geoid by PROJ's present and former names, best first; `projsync --file` installs one.
 GEOID_GRIDS: dict[HeightDatum, tuple[str, ...]] = {

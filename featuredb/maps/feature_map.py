@@ -9,7 +9,7 @@ local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes 
 from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,8 @@ from featuredb.geometry.sim3 import Sim3
 
 MapMethod = Literal["gps", "lidar", "gcp", "map"]
 MapStatus = Literal["quarantined", "active", "retired"]
-MAP_METHODS: tuple[MapMethod, ...] = ("gps", "lidar", "gcp", "map")
-MAP_STATUSES: tuple[MapStatus, ...] = ("quarantined", "active", "retired")
+MAP_METHODS: tuple[MapMethod, ...] = get_args(MapMethod)
+MAP_STATUSES: tuple[MapStatus, ...] = get_args(MapStatus)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

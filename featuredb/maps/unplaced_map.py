@@ -5,7 +5,7 @@ makes a FeatureMap of it, under the same map id.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias, TypeVar
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from featuredb.maps.feature_map import (
 )
 
 UnplacedStatus = Literal["unplaced", "retired"]
-UNPLACED_STATUSES: tuple[UnplacedStatus, ...] = ("unplaced", "retired")
+UNPLACED_STATUSES: tuple[UnplacedStatus, ...] = get_args(UnplacedStatus)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
 """Pictures that no map of the town may claim."""
 
-from typing import Literal
+from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ from featuredb.simworld.noise import fractal
 from featuredb.simworld.texture import Image8, to_image
 
 NegativeKind = Literal["other_town", "blank", "noise", "text", "mirrored", "blurred"]
-NEGATIVE_KINDS: tuple[NegativeKind, ...] = ("other_town", "blank", "noise", "text", "mirrored", "blurred")
+NEGATIVE_KINDS: tuple[NegativeKind, ...] = get_args(NegativeKind)
 
 _WORDS = [
     "bridge",

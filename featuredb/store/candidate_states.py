@@ -10,13 +10,13 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from featuredb.errors import InvalidValueError
 from featuredb.store.encode import Row
 
 CandidateState = Literal["waiting", "used", "refused", "withdrawn"]
-CANDIDATE_STATES: tuple[CandidateState, ...] = ("waiting", "used", "refused", "withdrawn")
+CANDIDATE_STATES: tuple[CandidateState, ...] = get_args(CandidateState)
 
 CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN = "contributed", "used", "refused", "reopened", "withdrawn"
 

@@ -11,7 +11,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.control_file import ControlFile, Mark, parse_control_file
+from ingest.register.control.control_file import ControlFile, parse_control_file
 from ingest.register.control.marks import Control, meet
 from tests.support.planar_map import view
 from tests.support.scenes import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, pixels_inside
@@ -138,8 +138,3 @@ def _with_points(block: Block, kept: np.ndarray) -> Block:
         photo_of=block.photo_of[rows],
         xy=block.xy[rows],
     )
-
-
-def mark_of(marks: tuple[Mark, ...], point: str, photo: str) -> Mark:
-    """The mark of a point in a photo."""
-    return next(m for m in marks if (m.point, m.photo) == (point, photo))

@@ -1,11 +1,9 @@
 """Pictures of an anchoring: the scan's edges over a photo, the map over the scan, residuals."""
 
-import io
 from typing import Any
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
 from ingest.register.anchor.proposals import small_camera
+from ingest.report_plots import png_bytes
 
 _WIDTH_PX = 1280  # of overlays: a screen's width; more only makes the page heavy
 _DEPTH_STEP = 0.015  # share of the depth by which it jumps at an edge: 1 m seen from 70 m
@@ -140,7 +139,7 @@ def map_over_scan_png(
     )
     for axes in (top, side):
         _tidy(axes)
-    return _figure_png(figure)
+    return png_bytes(figure)
 
 
 def residuals_png(before_m: FloatArray, after_m: FloatArray) -> bytes:
@@ -163,7 +162,7 @@ def residuals_png(before_m: FloatArray, after_m: FloatArray) -> bytes:
     axes.set(xscale="log", xlabel="distance of a map point to the scan, m", ylabel="map points")
     axes.legend(fontsize=8)
     _tidy(axes)
-    return _figure_png(figure)
+    return png_bytes(figure)
 
 
 def _bounds(points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -182,10 +181,3 @@ def _tidy(axes: Any) -> None:
     axes.set_axisbelow(True)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
-
-
-def _figure_png(figure: Figure) -> bytes:
-    buffer = io.BytesIO()
-    FigureCanvasAgg(figure)
-    figure.savefig(buffer, format="png")
-    return buffer.getvalue()
