@@ -71,7 +71,6 @@ def localise_features(
     request: LocaliseRequest,
     areas: Sequence[IndexedArea],
     options: LocaliseOptions | None = None,
-    snapshot: int = 0,
 ) -> Localised:
     """`localise` of a photo whose features are there already, strongest and best spread first.
 
@@ -81,7 +80,7 @@ def localise_features(
     """
     options = options or LocaliseOptions()
     check_extractor(areas, options)
-    return _localised(features, request, areas, options, snapshot, StageClock())
+    return _localised(features, request, areas, options, 0, StageClock())
 
 
 def _localised(

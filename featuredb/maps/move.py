@@ -1,8 +1,6 @@
 """A feature map moved by a similarity: points, poses and covariances, as one rigid and scaled whole."""
 
-from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +20,6 @@ def move_map(
     frame: LocalFrame | None = None,
     *,
     covariance: FloatArray | None = None,
-    evidence: Mapping[str, Any] | None = None,
 ) -> FeatureMap:
     """The map where a similarity takes it; its local frame, ids, observations and lenses stay.
 
@@ -33,7 +30,6 @@ def move_map(
         frame: in which the similarity is meant; default: the map's own.
         covariance: (7, 7) of the new placement, left perturbation in the map's own frame; default: the old
             one, carried along.
-        evidence: of the new placement; default: the old one.
     """
     move = in_frame(new_from_old, frame or feature_map.frame, feature_map.frame)
     placement = feature_map.placement
@@ -45,7 +41,7 @@ def move_map(
         if covariance is None
         else np.asarray(covariance, dtype=np.float64),
         residual_rms_m=placement.residual_rms_m,
-        evidence=dict(placement.evidence if evidence is None else evidence),
+        evidence=dict(placement.evidence),
     )
     if is_identity(move):
         return replace(feature_map, placement=moved)

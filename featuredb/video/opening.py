@@ -190,11 +190,11 @@ def _what_it_is(path: Path) -> str:
     return f"expected {_FILE_FORMATS_SAID}, found a file that begins with {head!r}"
 
 
-def _box_names(file: Any, most: int = 64) -> list[str]:
+def _box_names(file: Any) -> list[str]:
     """Names of the top-level boxes of an ISO base media file (ISO 14496-12, 4.2); empty if it is none."""
     names: list[str] = []
     at = 0
-    while len(names) < most:
+    while len(names) < 64:
         file.seek(at)
         header = file.read(16)
         if len(header) < 8 or not re.fullmatch(rb"[A-Za-z0-9 ]{4}", header[4:8]):

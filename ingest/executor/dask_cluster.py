@@ -37,7 +37,6 @@ class DaskExecutor:
 
     Args:
         shared: folders that every worker must see: the work folder (written to) first, then the photos'.
-        no_workers_s: an ingest ends when the cluster has had no worker for so long.
 
     Raises:
         IngestError: `distributed` is not installed, nobody answers at the address, there are no workers, or
@@ -49,14 +48,11 @@ class DaskExecutor:
         address: str,
         *,
         shared: Sequence[Path] = (),
-        threads_per_worker: int = 1,
-        no_workers_s: float = _NO_WORKERS_S,
     ) -> None:
         self._address = address
-        self._no_workers_s = no_workers_s
         self._client = _connected(address)
         try:
-            self._client.register_plugin(_thread_caps(threads_per_worker))
+            self._client.register_plugin(_thread_caps(1))
             _require_shared(self._client, address, [p.absolute() for p in shared])
         except BaseException:
             self._client.close()
@@ -153,7 +149,7 @@ class DaskExecutor:
             )
         if self._threads():
             return 0.0
-        if idle_s >= self._no_workers_s:
+        if idle_s >= _NO_WORKERS_S:
             raise IngestError(
                 f"{stage}: the Dask cluster at {self._address} has had no workers for {idle_s:.0f} s; {again}"
             )

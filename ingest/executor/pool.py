@@ -35,9 +35,8 @@ class PoolExecutor:
     Workers are spawned, never forked: threads of the parent (FAISS, Arrow) do not survive a fork.
     """
 
-    def __init__(self, workers: int, threads_per_worker: int = 1) -> None:
+    def __init__(self, workers: int) -> None:
         self._count = workers
-        self._threads = threads_per_worker
         self._workers: list[_Worker] = []
         self._failed_starts = 0
 
@@ -133,9 +132,9 @@ class PoolExecutor:
                 worker.send(todo.popleft(), function, items)
         starting = sum(not w.ready for w in self._workers)
         if todo and len(self._workers) < most and starting < len(todo):
-            with capped_environment(self._threads):
+            with capped_environment(1):
                 while len(self._workers) < most and starting < len(todo):
-                    self._workers.append(_Worker(self._threads))
+                    self._workers.append(_Worker(1))
                     starting += 1
 
     def _buried(self, stage: str, worker: "_Worker") -> None:

@@ -11,8 +11,7 @@ evidence, and the evidence is told. In this order:
    (37.8757,-122.3061,0.0M)). A whole third number counts satellites and comes after longitude, latitude:
    Mavic Pro, Mini, Phantom 4 (five of the eight recordings in the test data show it by 1 or 2).
 
-What 1 and 2 say stands against 3. If they contradict each other or nothing decides, the file is refused; the
-caller may then say the order.
+What 1 and 2 say stands against 3. If they contradict each other or nothing decides, the file is refused.
 """
 
 from typing import Literal, NamedTuple
@@ -47,7 +46,6 @@ def decide_order(
     distances_m: FloatArray,
     third: ThirdValue,
     step_deg: float,
-    stated: AxisOrder | None = None,
 ) -> OrderDecision:
     """The order of unnamed coordinates of one dialect in one file.
 
@@ -58,7 +56,6 @@ def decide_order(
         distances_m: (n,) written horizontal distance from take-off, NaN where there is none.
         third: what follows the two coordinates.
         step_deg: worth of the last written digit.
-        stated: what the caller says, which counts where magnitude and distance do not decide.
 
     Raises:
         TelemetryError: contradictory evidence, or none.
@@ -72,20 +69,15 @@ def decide_order(
             f"{certain[1].evidence}"
         )
     if certain:
-        if stated not in (None, certain[0].order):
-            raise TelemetryError(
-                f"{origin}: the order {stated} was stated, but {certain[0].evidence}; leave it to the file"
-            )
         return certain[0]
-    if stated is not None:
-        return OrderDecision(stated, "as stated by the caller", True)
     if third == "metres":
         return OrderDecision("lat_lon", "latitude first, by the third value in metres (Matrice 300)", False)
     if third == "count":
         return OrderDecision("lon_lat", "longitude first, by the whole third number (satellites)", False)
     raise TelemetryError(
         f"{origin}: whether latitude or longitude comes first cannot be told: no value is beyond 90 degrees, "
-        "no distance from take-off is written, and the spelling is of no known drone; state the order"
+        "no distance from take-off is written, and the spelling is of no known drone; give a CSV table "
+        "with named columns"
     )
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.assemble import MAX_WARNINGS
-from featuredb.video.telemetry.axis_order import AxisOrder
 from featuredb.video.telemetry.csv_table import read_csv
 from featuredb.video.telemetry.gpmf import has_positions, read_gpmf
 from featuredb.video.telemetry.gpx import read_gpx
@@ -33,14 +32,13 @@ class _Candidate:
     read: Callable[[], Telemetry]
 
 
-def read_telemetry(path: Path, order: AxisOrder | None = None) -> Telemetry:
+def read_telemetry(path: Path) -> Telemetry:
     """The telemetry of a file: subtitles, GPX, a table, or a video with a track of it.
 
     What it is, is told by its contents; the suffix counts where they do not tell.
 
     Args:
         path: the file.
-        order: which coordinate comes first in subtitles that do not name them, where the file cannot tell.
 
     Raises:
         TelemetryError: it cannot be read, is none of these, or holds no position.
@@ -48,7 +46,7 @@ def read_telemetry(path: Path, order: AxisOrder | None = None) -> Telemetry:
     kind = path.suffix.lower()
     if kind in VIDEO_SUFFIXES:
         tracks = read_tracks(path)
-        candidates = _embedded(tracks, path.name, order)
+        candidates = _embedded(tracks, path.name)
         if not candidates:
             found = "; ".join(tracks.hints + tracks.damage)
             hint = f" ({found})" if found else ""
@@ -62,7 +60,7 @@ def read_telemetry(path: Path, order: AxisOrder | None = None) -> Telemetry:
         raise TelemetryError(f"{path.name}: the file is empty; was the recording interrupted?")
     kind = _kind_of(data[:_SNIFFED_BYTES]) or kind
     if kind == ".srt":
-        return read_srt(data, path.name, order)
+        return read_srt(data, path.name)
     if kind == ".gpx":
         return read_gpx(data, path.name)
     if kind in (".csv", ".tsv", ".txt"):
@@ -73,7 +71,7 @@ def read_telemetry(path: Path, order: AxisOrder | None = None) -> Telemetry:
     )
 
 
-def telemetry_of_video(path: Path, order: AxisOrder | None = None) -> Telemetry | None:
+def telemetry_of_video(path: Path) -> Telemetry | None:
     """The telemetry that belongs to a video, in it or beside it; None where there is none.
 
     Looked at in this order; the first that can be read is taken, and the others are named in its warnings:
@@ -85,7 +83,6 @@ def telemetry_of_video(path: Path, order: AxisOrder | None = None) -> Telemetry 
 
     Args:
         path: the video, or a folder of its frames (for which only the files beside it count).
-        order: as for `read_telemetry`.
 
     Raises:
         TelemetryError: no such video, or telemetry was found and none of it can be read; says why.
@@ -98,19 +95,19 @@ def telemetry_of_video(path: Path, order: AxisOrder | None = None) -> Telemetry 
     if not path.is_dir():
         try:
             tracks = read_tracks(path)
-            candidates += _embedded(tracks, path.name, order)
+            candidates += _embedded(tracks, path.name)
             damage = tracks.damage
             for hint in tracks.hints:
                 logger.info("%s: %s", path.name, hint)
         except TelemetryError as error:
             refused.append(str(error))
-    candidates += _sidecars(path, order)
+    candidates += _sidecars(path)
     if not candidates and not refused:
         return None
     return _first_readable(path.name, candidates, refused, damage)
 
 
-def _embedded(tracks: Tracks, name: str, order: AxisOrder | None) -> list[_Candidate]:
+def _embedded(tracks: Tracks, name: str) -> list[_Candidate]:
     """Readers of the tracks that hold telemetry, best first."""
     found = []
     for index, packets in tracks.gpmf.items():
@@ -120,11 +117,11 @@ def _embedded(tracks: Tracks, name: str, order: AxisOrder | None) -> list[_Candi
     for index, blocks in tracks.subtitles.items():
         if any(looks_like_telemetry(block.text) for block in blocks):
             label = f"{name}, subtitle track {index}"
-            found.append(_Candidate(label, partial(telemetry_of_blocks, blocks, label, order)))
+            found.append(_Candidate(label, partial(telemetry_of_blocks, blocks, label)))
     return found
 
 
-def _sidecars(path: Path, order: AxisOrder | None) -> list[_Candidate]:
+def _sidecars(path: Path) -> list[_Candidate]:
     """Readers of the files beside a video that bear its name, best first, without people's talk."""
     try:
         beside = sorted(path.absolute().parent.iterdir())
@@ -138,7 +135,7 @@ def _sidecars(path: Path, order: AxisOrder | None) -> list[_Candidate]:
                 continue
             if suffix == ".srt" and _is_dialogue(file):
                 continue
-            found.append(_Candidate(file.name, partial(read_telemetry, file, order)))
+            found.append(_Candidate(file.name, partial(read_telemetry, file)))
     return found
 
 

@@ -20,7 +20,7 @@ from featuredb.video.telemetry.assemble import (
     check_count,
     resolution_of_decimals,
 )
-from featuredb.video.telemetry.axis_order import AxisOrder, ThirdValue, decide_order
+from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
 from featuredb.video.telemetry.srt_blocks import Block, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.srt_fields import BlockFields, looks_like_telemetry, parse_block
 from featuredb.video.telemetry.text import decode_text, parse_wall_clock
@@ -30,14 +30,12 @@ from featuredb.video.telemetry.values import Telemetry
 _COARSE_M = 5.0
 
 
-def read_srt(data: bytes, origin: str = "subtitles", order: AxisOrder | None = None) -> Telemetry:
+def read_srt(data: bytes, origin: str = "subtitles") -> Telemetry:
     """The telemetry of a drone's subtitle file.
 
     Args:
         data: the file's bytes, UTF-8 or UTF-16, any line ends.
         origin: its name, for messages.
-        order: which coordinate comes first in dialects that do not name them, for files where that cannot be
-            told (see `axis_order.py`).
 
     Raises:
         TelemetryError: no subtitles, no telemetry in them, no position, or an order of coordinates that
@@ -45,10 +43,10 @@ def read_srt(data: bytes, origin: str = "subtitles", order: AxisOrder | None = N
     """
     if not data.strip():
         raise TelemetryError(f"{origin}: the file is empty; was the recording interrupted?")
-    return telemetry_of_blocks(split_blocks(decode_text(data)), origin, order)
+    return telemetry_of_blocks(split_blocks(decode_text(data)), origin)
 
 
-def telemetry_of_blocks(blocks: Sequence[Block], origin: str, order: AxisOrder | None = None) -> Telemetry:
+def telemetry_of_blocks(blocks: Sequence[Block], origin: str) -> Telemetry:
     """The telemetry of subtitles that were read already; arguments and errors as for `read_srt`."""
     check_count(len(blocks), origin)
     if not any(looks_like_telemetry(block.text) for block in blocks):
@@ -65,7 +63,7 @@ def telemetry_of_blocks(blocks: Sequence[Block], origin: str, order: AxisOrder |
     clocks = _clocks(blocks)
     times, in_video_time = _times(blocks, clocks, origin, warnings)
     step_m = resolution_of_decimals(max((fields.decimals for fields in parsed), default=-1))
-    _place_pairs(parsed, origin, order, warnings)
+    _place_pairs(parsed, origin, warnings)
     _tell_heights(parsed, warnings)
     if step_m > _COARSE_M:
         warnings.append(f"coordinates are written in steps of {step_m:.0f} m")
@@ -128,9 +126,7 @@ def _times(
     return clocks, False
 
 
-def _place_pairs(
-    parsed: list[BlockFields], origin: str, stated: AxisOrder | None, warnings: list[str]
-) -> None:
+def _place_pairs(parsed: list[BlockFields], origin: str, warnings: list[str]) -> None:
     """Gives the unnamed coordinates their names, dialect by dialect."""
     kinds: dict[str, list[BlockFields]] = defaultdict(list)
     for fields in parsed:
@@ -146,7 +142,6 @@ def _place_pairs(
             np.array([fields.distance_m for fields in rows]),
             thirds.pop() if len(thirds) == 1 else "none",
             step_deg,
-            stated,
         )
         if not decision.certain:
             warnings.append(

@@ -17,6 +17,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.oriented_gradients import FloatImage
 
+_MIN_OVERLAP = 0.6  # of a piece that lies over the photo's border
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TemplateOptions:
@@ -100,16 +102,14 @@ def cut_templates(channels: FloatImage, rendering: Rendering, options: TemplateO
     return Templates(channels=np.stack(pieces) if pieces else empty, points_local=points)
 
 
-def search_everywhere(
-    templates: Templates, photo: FloatImage, camera: Camera, min_overlap: float = 0.6
-) -> ScoreMaps:
-    """Score maps over the whole photo, and over its border where `min_overlap` of a piece lies inside.
+def search_everywhere(templates: Templates, photo: FloatImage, camera: Camera) -> ScoreMaps:
+    """Score maps over the whole photo, and over its border where most of a piece lies inside.
 
     Args:
         photo: (k, h, w) channels of the photo's view with the pinhole `camera`.
     """
     size = templates.channels.shape[-1]
-    margin = int(size * (1.0 - min_overlap))
+    margin = int(size * (1.0 - _MIN_OVERLAP))
     _, h, w = photo.shape
     padded = np.pad(photo, ((0, 0), (margin, margin), (margin, margin)))
     out = (h + 2 * margin - size + 1, w + 2 * margin - size + 1)
