@@ -1,7 +1,7 @@
 """Real photos registered to a real scan, one by one, from their EXIF alone and from priors that are wrong.
 
     python -m tools.frame_real_photos SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
-        [--photos NAME ...] [--json FILE]
+        [--photos NAME ...] [--refine] [--json FILE]
 
 Two registrations of each photo:
 
@@ -36,6 +36,7 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.figures import add_json_option, write_figures
+from tools.intensity_refinement import refine_by_intensity
 
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 
@@ -60,6 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         wrong = wrong_prior(first.cam_from_local, np.random.default_rng(number))
         second, cpu_s = _timed(name, "wrong", image, camera, wrong, cloud, options, first.cam_from_local)
         seconds.append(cpu_s)
+        if args.refine and first.cam_from_local is not None:
+            _tell_refined(name, image, camera, first.cam_from_local, cloud)
         accepted += first.accepted and second.accepted
         passed &= second.cam_from_local is not None and cpu_s <= 2.0 * args.max_s
         if second.cam_from_local is not None:
@@ -96,6 +99,19 @@ def _timed(
     )
     sys.stdout.flush()
     return found, cpu_s
+
+
+def _tell_refined(
+    name: str, image: NDArray[np.uint8], camera: Camera, pose: Rigid3, cloud: PointCloud
+) -> None:
+    """How far the refinement by intensities moves a registered frame."""
+    start = time.perf_counter()
+    refined = refine_by_intensity(image, camera, pose, cloud, "rgb")
+    metres, degrees = _apart(refined.cam_from_local, pose)
+    sys.stdout.write(
+        f"{name:<14} refined by intensities: moved {metres:.3f} m {degrees:.3f} deg, "
+        f"{time.perf_counter() - start:.1f} s {refined.message}\n"
+    )
 
 
 def read_cloud(path: Path, epsg: int) -> PointCloud:
@@ -166,6 +182,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--epsg", type=int, default=32615, help="UTM zone of the scan")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
+    parser.add_argument("--refine", action="store_true", help="and refine by intensities")
     parser.add_argument("--max-s", type=float, default=10.0, help="seconds on two cores")
     add_json_option(parser)
     return parser.parse_args(argv)
