@@ -136,18 +136,23 @@ def _given_up(films: Sequence[dict[str, Any]]) -> Iterator[tuple[str, float, flo
 
 
 def keyframe_to_pick_in(one: FilmMap, stills: Path) -> tuple[Path, Seen]:
-    """Folder of the map's images, below `stills`, and one that shows the place in the whole picture."""
-    for keyframe in one.keyframes[len(one.keyframes) // 2 :] + one.keyframes:
+    """Folder of the map's images, below `stills`, and the one a person would pick in: whole, full of detail."""
+    files = {file.as_posix(): file for file in stills.rglob("*.jpg")}
+    best: tuple[int, Path, Seen] | None = None
+    for keyframe in one.keyframes:
         pose, camera = keyframe.truth.pose, keyframe.truth.camera
-        (file,) = [
-            f for f in stills.rglob(Path(keyframe.image).name) if f.as_posix().endswith(keyframe.image)
-        ]
+        (file,) = [file for name, file in files.items() if name.endswith("/" + keyframe.image)]
+        size = file.stat().st_size
+        if pose is None or camera is None or (best is not None and size <= best[0]):
+            continue
         with Image.open(file) as picture:
             whole = picture.height == HEIGHT
-        if whole and pose is not None and camera is not None:
+        if whole:
             folder = file.parents[len(Path(keyframe.image).parts) - 1]
-            return folder, Seen(image=keyframe.image, camera=camera, cam_from_local=pose)
-    raise SystemExit(f"map {one.map_id} has no keyframe to pick in")
+            best = size, folder, Seen(image=keyframe.image, camera=camera, cam_from_local=pose)
+    if best is None:
+        raise SystemExit(f"map {one.map_id} has no keyframe to pick in")
+    return best[1:]
 
 
 def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> Keyframe:

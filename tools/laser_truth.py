@@ -1,132 +1,190 @@
-"""A map of photos without positions against the cameras that a laser scan gives (Strecha's sets).
+"""Maps and answers against laser truth (Strecha's sets), beside plain COLMAP that is given the true lens.
 
-    python -m tools.laser_truth FOLDER [--json FILE]
+    python -m tools.laser_truth FOLDER... [--json FILE]
 
-FOLDER has images/ and cameras/, a `NAME.camera` for each photo: calibration, camera-to-world rotation and
-centre in metres, size. Copies of the photos with the EXIF of one camera (maker, model, focal length in
-whole millimetres of 35 mm film) are ingested into a new database, which knows of no place; the map's camera
-centres are moved onto the true ones by the similarity that fits them best. Prints photos in the map, medians
-and largest of what is left: of positions in millimetres, of orientations in degrees, and the scale of the
-set, its largest distance between two cameras. Exit code 0 if there is one map of all photos.
+Of each folder (see `tools.laser_set`) all photos but every fifth from the third on are ingested into a new
+database, with exact positions and the EXIF of one camera whose focal length is rounded to a whole
+millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
+alone. Prints, for the map's cameras and for both kinds of answers: the median and largest error of position
+and orientation, the median of the 68 % radius that was reported, and the baseline's median
+(`tools.laser_baseline`). Exit code 0 if every median is at most 1.5 times the baseline's and at most 1.5
+times the reported radius.
 """
 
 import argparse
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pycolmap
-from PIL import ExifTags, Image
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import nearest_rotation
-from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.unplaced_map import AnyMap
+from featuredb.index.area import build_area
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store import Database
+from reloc.answer import placement_covariance, radius_68
+from reloc.wire import CameraRequest
 from tools.figures import add_json_option, write_figures
-from tools.made_maps import all_maps, make, photo_names
+from tools.laser_baseline import colmap_given_the_lens
+from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif
+from tools.made_maps import all_maps, make
+from tools.real_photos import ask_poses
 
-_ROTATION_LINES, _CENTER_LINE, _SIZE_LINE = slice(4, 7), 7, 8
+_TIMES = 1.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Errors:
+    """Of one kind of poses, of `wanted`: errors in metres and degrees, and the 68 % radii that were reported."""
+
+    metres: tuple[float, ...]
+    degrees: tuple[float, ...]
+    told_m: tuple[float, ...] = ()
+    told_deg: tuple[float, ...] = ()
+    wanted: int = 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
-    photos = args.folder / "images" if (args.folder / "images").is_dir() else args.folder
-    names = photo_names(photos)
-    truth = {name: true_pose(camera_file(args.folder / "cameras", name)) for name in names}
-    with tempfile.TemporaryDirectory() as scratch:
-        work = args.work or Path(scratch)
-        lens = true_lens(camera_file(args.folder / "cameras", names[0]))
-        shown = with_exif(photos, names, lens, work / "photos")
-        made = make(work / "db", "photos", shown, len(names))
-        found = all_maps(work / "db")
-    figures: dict[str, object] = {"photos": len(names), "maps": made.maps, "largest": made.largest}
-    if found:
-        figures |= compared(max(found, key=lambda one: len(one.images)), truth)
-    sys.stdout.write(f"{args.folder.name}: {figures}\n")
-    write_figures(args.json, figures)
-    return 0 if made.maps == 1 and made.largest == len(names) else 1
+    rows: dict[str, dict[str, float]] = {}
+    for folder in args.folders:
+        with tempfile.TemporaryDirectory() as scratch:
+            work = (args.work or Path(scratch)) / folder.name
+            rows[folder.name] = judged(read_laser_set(folder), work)
+        sys.stdout.write(folder.name + "\n" + text(rows[folder.name]) + "\n")
+    figures = next(iter(rows.values())) if len(rows) == 1 else {"sets": rows}
+    worst = max(row["worst"] for row in rows.values())
+    write_figures(args.json, {**figures, "worst": worst})
+    return 0 if worst <= _TIMES else 1
 
 
-def compared(one: AnyMap, truth: dict[str, Rigid3]) -> dict[str, float]:
-    """What a similarity leaves between the map's cameras and the true ones."""
-    mine = np.array([image.cam_from_local.center for image in one.images])
-    true = [truth[image.name] for image in one.images]
-    move = best_similarity(mine, np.array([pose.center for pose in true]))
-    moved = [move.act_on_pose(image.cam_from_local) for image in one.images]
-    millimetres = [
-        1000.0 * float(np.linalg.norm(a.center - b.center)) for a, b in zip(moved, true, strict=True)
-    ]
-    degrees = [a.angle_to_deg(b) for a, b in zip(moved, true, strict=True)]
-    apart = max(float(np.linalg.norm(a.center - b.center)) for a in true for b in true)
-    return {
-        "median_mm": float(np.median(millimetres)),
-        "largest_mm": max(millimetres),
-        "median_deg": float(np.median(degrees)),
-        "largest_deg": max(degrees),
-        "set_m": apart,
+def judged(truth: LaserSet, work: Path) -> dict[str, float]:
+    """The figures of one set."""
+    photos = with_exif(truth, truth.mapped, work / "photos", positions=True)
+    asked = with_exif(truth, truth.asked, work / "asked", positions=False)
+    make(work / "db", "photos", photos, len(truth.mapped))
+    maps = [one for one in all_maps(work / "db") if isinstance(one, FeatureMap)]
+    if not maps:
+        raise SystemExit(f"{truth.photos}: no map was placed")
+    baseline = colmap_given_the_lens(truth)
+    lens = truth.camera
+    told = CameraRequest(model=lens.model, width=lens.width, height=lens.height, params=lens.params)
+    database = Database.open(work / "db")
+    kinds = {
+        "map": map_errors(maps, truth),
+        "told": answer_errors(database, asked, truth, told),
+        "unknown": answer_errors(database, asked, truth, None),
     }
+    theirs = {
+        "map": pose_errors(baseline.mapped, truth.poses),
+        "asked": pose_errors(baseline.asked, truth.poses),
+    }
+    return figures_of(kinds, theirs)
 
 
-def best_similarity(source: FloatArray, target: FloatArray) -> Sim3:
-    """The similarity that takes points (n, 3) onto others with the least squares left."""
-    found = pycolmap.estimate_sim3d(source, target)
-    if found is None:
-        raise SystemExit("the cameras of the map lie on a line or a point; no similarity can be told")
-    return Sim3(
-        scale=float(found.scale),
-        rotation=np.array(found.rotation.matrix()),
-        translation=np.array(found.translation),
+def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dict[str, float]:
+    """Medians, and the worst ratio of one to what it is compared with."""
+    figures: dict[str, float] = {}
+    ratios = []
+    for kind, errors in kinds.items():
+        other = theirs["map" if kind == "map" else "asked"]
+        figures |= {f"{kind}_wanted": errors.wanted, f"{kind}_found": len(errors.metres)}
+        for unit in ("m", "deg"):
+            mine = errors.metres if unit == "m" else errors.degrees
+            reported = errors.told_m if unit == "m" else errors.told_deg
+            baseline = other.metres if unit == "m" else other.degrees
+            median = _median(mine)
+            figures |= {
+                f"{kind}_{unit}": median,
+                f"{kind}_largest_{unit}": max(mine, default=float("nan")),
+                f"{kind}_reported_{unit}": _median(reported),
+                f"{kind}_colmap_{unit}": _median(baseline),
+            }
+            ratios.append(median / _median(reported))
+            if unit == "m":
+                ratios.append(median / _median(baseline))
+        ratios.append(1.0 if errors.metres and len(errors.metres) == errors.wanted else float("inf"))
+    figures["worst"] = float(np.nan_to_num(ratios, nan=np.inf).max())
+    return figures
+
+
+def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
+    """Of the cameras of placed maps, as they lie."""
+    poses, told_m, told_deg = {}, [], []
+    for one in maps:
+        area = build_area([one])
+        turn = FRAME.enu_from(one.frame)
+        for image in one.images:
+            pose = image.cam_from_local
+            poses[image.name] = pose @ turn.inverse()
+            world_from_cam = np.kron(np.eye(2), pose.rotation.T)
+            own = np.zeros((6, 6)) if image.covariance is None else image.covariance
+            covariance = world_from_cam @ own @ world_from_cam.T
+            covariance += placement_covariance(area, one, pose.center)
+            told_m.append(radius_68(covariance[3:, 3:]))
+            told_deg.append(float(np.degrees(radius_68(covariance[:3, :3]))))
+    return pose_errors(poses, truth.poses, told_m, told_deg, len(truth.mapped))
+
+
+def answer_errors(database: Database, photos: Path, truth: LaserSet, camera: CameraRequest | None) -> Errors:
+    """Of a server's answers."""
+    rows = ask_poses(database, photos, truth.asked, FRAME, truth.poses, camera)
+    found = [row for row in rows if row.error is not None]
+    return Errors(
+        metres=tuple(row.error.position_m for row in found if row.error is not None),
+        degrees=tuple(row.error.angle_deg for row in found if row.error is not None),
+        told_m=tuple(row.position_68_m for row in found),
+        told_deg=tuple(row.orientation_68_deg for row in found),
+        wanted=len(truth.asked),
     )
 
 
-def with_exif(photos: Path, names: Sequence[str], focal_rel: float, folder: Path) -> Path:
-    """Copies of JPEG files with EXIF of one camera.
-
-    Args:
-        focal_rel: focal length as a share of the longer side; photos are in 3:2, as film is.
-    """
-    exif = Image.Exif()
-    exif[ExifTags.Base.Make], exif[ExifTags.Base.Model] = "Strecha", "laser truth"
-    exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = round(36.0 * focal_rel)
-    content = exif.tobytes()
-    segment = b"\xff\xe1" + (len(content) + 2).to_bytes(2, "big") + content
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        data = (photos / name).read_bytes()
-        if data[:2] != b"\xff\xd8":
-            raise SystemExit(f"{photos / name}: expected a JPEG file")
-        (folder / name).write_bytes(data[:2] + segment + data[2:])
-    return folder
+def pose_errors(
+    poses: Mapping[str, Rigid3],
+    truth: Mapping[str, Rigid3],
+    told_m: Sequence[float] = (),
+    told_deg: Sequence[float] = (),
+    wanted: int = 0,
+) -> Errors:
+    """Poses cam_from_local against the true ones."""
+    return Errors(
+        metres=tuple(float(np.linalg.norm(p.center - truth[name].center)) for name, p in poses.items()),
+        degrees=tuple(p.angle_to_deg(truth[name]) for name, p in poses.items()),
+        told_m=tuple(told_m),
+        told_deg=tuple(told_deg),
+        wanted=wanted,
+    )
 
 
-def true_lens(path: Path) -> float:
-    """Focal length over the longer side, in a file of Strecha's."""
-    rows = [[float(word) for word in line.split()] for line in path.read_text(encoding="utf-8").splitlines()]
-    return rows[0][0] / max(rows[_SIZE_LINE])
+def text(figures: Mapping[str, Any]) -> str:
+    """A line for each kind."""
+    lines = [
+        f"  {'':<9}{'found':>8}{'mm':>8}{'largest':>9}{'reported':>10}{'COLMAP':>8}"
+        f"{'deg':>8}{'largest':>9}{'reported':>10}{'COLMAP':>8}"
+    ]
+    for kind in ("map", "told", "unknown"):
+        f = {key: figures[f"{kind}_{key}"] for key in ("found", "wanted")}
+        line = f"  {kind:<9}{f['found']:>4} / {f['wanted']}"
+        for unit, factor, digits in (("m", 1e3, 1), ("deg", 1.0, 3)):
+            values = (
+                figures[f"{kind}_{name}{unit}"] * factor for name in ("", "largest_", "reported_", "colmap_")
+            )
+            line += "".join(f"{v:>{w}.{digits}f}" for v, w in zip(values, (8, 9, 10, 8), strict=True))
+        lines.append(line)
+    return "\n".join([*lines, f"  worst ratio {figures['worst']:.2f}"])
 
 
-def camera_file(folder: Path, photo: str) -> Path:
-    """Its camera: `0000.camera` or `0000.png.camera`."""
-    found = [p for p in (folder / f"{Path(photo).stem}.camera", folder / f"{photo}.camera") if p.is_file()]
-    if not found:
-        raise SystemExit(f"{folder}: no camera of photo {photo}")
-    return found[0]
-
-
-def true_pose(path: Path) -> Rigid3:
-    """The pose in a file of Strecha's: cam_from_world."""
-    rows = [[float(word) for word in line.split()] for line in path.read_text(encoding="utf-8").splitlines()]
-    world_from_cam, center = nearest_rotation(rows[_ROTATION_LINES]), np.array(rows[_CENTER_LINE])
-    return Rigid3(rotation=world_from_cam.T, translation=-world_from_cam.T @ center)
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--work", type=Path, default=None, help="keep the database there")
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    parser.add_argument("--work", type=Path, default=None, help="keep databases there")
     add_json_option(parser)
     return parser.parse_args(argv)
 

@@ -29,9 +29,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
+from reloc.answer import radius_68
 from reloc.client import Client, LocaliseReply
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
+from reloc.wire import CameraRequest
 from tools.figures import add_json_option, write_figures
 
 _ROOT = Path(__file__).resolve().parent.parent
@@ -71,6 +73,7 @@ class Row:
     vertical_68_m: float
     orientation_68_deg: float
     wall_ms: float
+    position_68_m: float = float("nan")
 
     def passes(self, max_m: float, max_deg: float) -> bool:
         """Whether it was localised, within both limits."""
@@ -156,9 +159,18 @@ def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMa
 
 
 def ask_poses(
-    database: Database, photos: Path, names: Sequence[str], frame: LocalFrame, poses: Mapping[str, Rigid3]
+    database: Database,
+    photos: Path,
+    names: Sequence[str],
+    frame: LocalFrame,
+    poses: Mapping[str, Rigid3],
+    camera: CameraRequest | None = None,
 ) -> list[Row]:
-    """Localise the photos over Zenoh and compare with poses `cam_from_local` in a frame."""
+    """Localise the photos over Zenoh and compare with poses `cam_from_local` in a frame.
+
+    Args:
+        camera: sent with each photo.
+    """
     missing = [name for name in names if name not in poses]
     if missing:
         raise SystemExit(f"without a reference pose, so there is nothing to compare with: {missing}")
@@ -169,7 +181,7 @@ def ask_poses(
     ):
         for name in names:
             start = time.perf_counter()
-            reply = client.localise(photos / name, timeout_s=60.0)
+            reply = client.localise(photos / name, camera=camera, timeout_s=60.0)
             rows.append(_row(name, reply, frame, poses[name], 1e3 * (time.perf_counter() - start)))
     return rows
 
@@ -191,6 +203,7 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_
         vertical_68_m=accuracy.vertical_68_m if accuracy else nan,
         orientation_68_deg=accuracy.orientation_68_deg if accuracy else nan,
         wall_ms=wall_ms,
+        position_68_m=nan if reply.covariance is None else radius_68(np.array(reply.covariance)[3:, 3:]),
     )
 
 

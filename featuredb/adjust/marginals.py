@@ -39,6 +39,31 @@ class Marginals:
         """(6, 6) of a photo's pose; zero where it is held."""
         return self._part(int(self.pose_start[photo]), 6)
 
+    def poses(self, lens_dilution: float = 1.0) -> FloatArray:
+        """(k, 6, 6) of all poses; zero where they are held.
+
+        Args:
+            lens_dilution: so much less than their number says do the observations tell of lenses: what comes
+                from lenses grows by it.
+        """
+        by_lens = self._from_lenses() if lens_dilution > 1.0 else np.zeros_like(self.shared)
+        result = np.zeros((len(self.pose_start), 6, 6))
+        for photo, start in enumerate(self.pose_start.tolist()):
+            if start >= 0:
+                rows = slice(start, start + 6)
+                result[photo] = self.shared[rows, rows] + (lens_dilution - 1.0) * by_lens[rows, rows]
+        return result
+
+    def _from_lenses(self) -> FloatArray:
+        """What would be gone of the poses' covariance if the lenses were exact."""
+        first = 6 * int((self.pose_start >= 0).sum())
+        if first == len(self.shared):
+            return np.zeros_like(self.shared)
+        across, lenses = self.shared[:first, first:], self.shared[first:, first:]
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(lenses), 1e-300))
+        factor = cho_factor(lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale)))
+        return np.asarray((across * scale) @ cho_solve(factor, (across * scale).T))
+
     def lens(self, camera: int) -> FloatArray:
         """(p, p) of a camera's parameters; zero where they are held."""
         return self._part(int(self.lens_start[camera]), self.lens_size[camera])

@@ -149,9 +149,10 @@ def _too_little(
             feature_map=None,
         )
     if len(agreement.agreeing) < needed:
+        others = "".join(f"; {name}: {why}" for name, why in refusals.items())
         return AnchorResult(
             reason="TOO_FEW_FRAMES",
-            message=f"{len(agreement.agreeing)} frame was registered ({names[agreement.agreeing[0]]}), "
+            message=f"{len(agreement.agreeing)} frame places the map ({names[agreement.agreeing[0]]}){others}; "
             f"{needed} that agree are needed without a person; look at its overlay and confirm it "
             "(--confirm), or accept one frame (--frames 1)",
             feature_map=None,

@@ -23,6 +23,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
+from ingest.colmap_adjust import AdjustOptions
 from ingest.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
@@ -52,6 +53,8 @@ class AdjustLidarOptions:
         center_rel: of the principal point's, as a share of the longer side: most lenses are centred to that.
         aspect_rel: of the ratio of the two focal lengths: pixels are square.
         radial, tangential: of a coefficient's.
+        lens_dilution: what lenses leave open counts so many times in the poses' covariances
+            (`ingest.colmap_adjust.AdjustOptions.dilution`, measured there).
         rounds: of looking up the scan's planes; it ends earlier when points move by less than `settled_m`.
         steps: of the solver in each round.
         settled_m: see above; far below a scan's noise.
@@ -72,6 +75,7 @@ class AdjustLidarOptions:
     aspect_rel: float = 0.002
     radial: float = 0.1
     tangential: float = 0.003
+    lens_dilution: float = AdjustOptions().dilution
     rounds: int = 25
     steps: int = 8
     settled_m: float = 1e-3
@@ -283,14 +287,14 @@ def _pose_covariances(
     """(6, 6) of each pose with all that points and lenses leave open.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
-    or the pairs of structure projection do.
+    or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
     as_is = replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3)
     sigmas = _sigmas(block, control, _planes(surface, block.xyz, options.reach_m)[0], as_is)
     found = Problem(block, _terms(block, control, surface, start.cameras, sigmas, options)).marginals()
     shared = design_effect(_track_residuals(block), block.xy, block.photo_of, _longer_side(block))
-    dilution = max(float(structure.figures["neighbours_factor"]), shared)
-    return tuple(dilution * found.pose(k) for k in range(len(block.names)))
+    factor = max(float(structure.figures["neighbours_factor"]), shared)
+    return tuple(factor * found.poses(options.lens_dilution))
 
 
 def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
