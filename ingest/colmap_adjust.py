@@ -186,12 +186,12 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
         block = whole_lens(block)
     centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
     lenses = [
-        _lens_prior(camera, known.focal_px.get(camera_id), options)
+        prior_of_lens(camera, known.focal_px.get(camera_id), options)
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
     terms = Terms(
         keypoint_px=loss_scale_px,
-        dilution=options.dilution * _shared_variance_px2(block) / loss_scale_px**2,
+        dilution=options.dilution * shared_variance_of_block(block) / loss_scale_px**2,
         lenses=tuple(lenses) if options.refine_focal else (None,) * len(lenses),
         centers=centers,
         held_photos=() if centers is not None else (0,),
@@ -211,8 +211,8 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     reconstruction.update_point_3d_errors()
 
 
-def _shared_variance_px2(block: Block) -> float:
-    """Of the block's residuals; points that their camera cannot see say nothing."""
+def shared_variance_of_block(block: Block) -> float:
+    """`shared_variance_px2` of the block's residuals; points that their camera cannot see say nothing."""
     residuals = linearise(
         block.cameras,
         block.camera_of,
@@ -227,7 +227,7 @@ def _shared_variance_px2(block: Block) -> float:
     return max(shared_variance_px2(residuals[seen], block.xy[seen], block.photo_of[seen], side), _LEAST_PX2)
 
 
-def _lens_prior(camera: Camera, exif_px: float | None, options: AdjustOptions) -> LensPrior:
+def prior_of_lens(camera: Camera, exif_px: float | None, options: AdjustOptions) -> LensPrior:
     """Around an undistorted lens in the middle of the picture, of EXIF's focal length or the one found."""
     widths = options.lens if exif_px is None else replace(options.lens, focal_rel=options.exif_focal_rel)
     focal_px = camera.focal_px if exif_px is None else exif_px

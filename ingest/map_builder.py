@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
@@ -17,6 +18,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, Ma
 from featuredb.maps.unplaced_map import NoPlace, OwnPoints, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
+from ingest.lens_doubt import lens_doubt
 from ingest.own_frame import own_frame_of
 from ingest.photo import Photo
 from ingest.precision import (
@@ -27,6 +29,8 @@ from ingest.precision import (
     residual_variance,
     upper_triangle,
 )
+
+_MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,9 +153,36 @@ def _parts(
             "extractor_fingerprint": used.fingerprint,
             "source": identity.source,
             "licence": identity.licence,
-            "provenance": identity.provenance | {"residual_sigma_px": variance**0.5},
+            "provenance": identity.provenance
+            | {"residual_sigma_px": variance**0.5}
+            | _lens_doubt(model, poses, xyz, xy, photos),
         },
     )
+
+
+def _lens_doubt(
+    model: Model, poses: Sequence[Rigid3], xyz: FloatArray, xy: FloatArray, photos: Sequence[Photo]
+) -> dict[str, Any]:
+    """What the map's lenses leave open, for its provenance; nothing of what is too large or too small."""
+    if not 2 <= len(poses) <= _MOST_PHOTOS:
+        return {}
+    block = Block(
+        names=tuple(photo.name for photo in photos),
+        cameras=model.cameras,
+        camera_of=model.camera_of,
+        cam_from_block=tuple(poses),
+        xyz=xyz,
+        point_of=model.point_of,
+        photo_of=model.photo_of,
+        xy=xy,
+    )
+    focal_px = {
+        int(c): photo.focal_px
+        for photo, c in zip(photos, model.camera_of, strict=True)
+        if photo.focal_px is not None
+    }
+    doubt = lens_doubt(block, focal_px)
+    return {} if doubt is None else doubt.as_provenance()
 
 
 def _camera_keys(model: Model, photos: Sequence[Photo]) -> tuple[str, ...]:

@@ -4,9 +4,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from featuredb.adjust.block import whole_camera
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
+from featuredb.maps.lens_doubt import LensDoubt
+
+# An exact parameter has a sigma that no photo can tell from 0.
+_EXACT = np.array([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,15 +102,30 @@ def known_within(camera: Camera, sigmas: FloatArray) -> LensPrior:
         raise InvalidValueError(
             f"known_within: expected {len(mean)} sigmas of {camera.model}'s parameters, found {sigmas.shape}"
         )
-    # An exact parameter has a sigma that no photo can tell from 0.
-    floor = np.array([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])[: len(mean)]
     sigma = sigmas
     if len(mean) == 8:
         fx, fy, cx, cy, k1, k2, p1, p2 = sigmas
         # Pixels are square but for a thousandth, and both focal lengths are off together.
         aspect = min(float(np.hypot(fx, fy)) / mean[0], LensPriors().aspect)
         sigma = np.array([fx, cx, cy, k1, aspect, k2, p1, p2])
-    return LensPrior(mean=mean, sigma=np.maximum(sigma, floor))
+    return LensPrior(mean=mean, sigma=np.maximum(sigma, _EXACT[: len(mean)]))
+
+
+def seen_by_a_map(camera: Camera, doubt: LensDoubt) -> tuple[Camera, LensPrior] | None:
+    """An exactly known lens as a map shows it whose points are bent by what its own lenses leave open.
+
+    Returns:
+        The same lens as OPENCV and what is known of it; None for lenses that are no OPENCV.
+    """
+    whole = whole_camera(camera)
+    if whole.model != "OPENCV":
+        return None
+    longer, fx = max(camera.width, camera.height), whole.params[0]
+    cx, cy = (longer * share for share in doubt.center_rel)
+    sigma = np.array(
+        [doubt.focal_rel * fx, cx, cy, doubt.radial[0], doubt.aspect, doubt.radial[1], *doubt.tangential]
+    )
+    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT))
 
 
 def lens_of(camera: Camera) -> FloatArray:

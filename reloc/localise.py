@@ -149,7 +149,10 @@ def _decide(
     uncertainty = pose_uncertainty(
         pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
     )
-    answer = make_answer(best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
+    pose = best.pose
+    if request.camera is not None and request.camera_prior is None:
+        pose = replace(pose, camera=request.camera)  # exact, whatever the map's bend made of it
+    answer = make_answer(best.area, pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)

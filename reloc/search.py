@@ -12,9 +12,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lens_doubt import LensDoubt
 from featuredb.stage_clock import StageClock
 from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa, spread
 from reloc.candidates import Cluster, IndexedArea, find_clusters
+from reloc.lens_prior import seen_by_a_map
 from reloc.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
@@ -165,7 +167,7 @@ def _poses(
         features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
     )
     if pose is not None:
-        pose = replace(pose, lens_prior=request.camera_prior)
+        pose = _with_lens_prior(pose, cluster.area, matches, request)
     clock.lap("pose")
     if pose is None or pose.count < 4:
         return []
@@ -189,6 +191,18 @@ def _poses(
         best,
         replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
     ]
+
+
+def _with_lens_prior(
+    pose: PoseHypothesis, area: Area, matches: Matches, request: LocaliseRequest
+) -> PoseHypothesis:
+    """What is known of the lens: as the request says; of one that is known exactly, as the map shows it."""
+    if request.camera is None or request.camera_prior is not None:
+        return replace(pose, lens_prior=request.camera_prior)
+    counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
+    doubt = LensDoubt.of_provenance(area.maps[int(np.argmax(counts))].provenance)
+    seen = None if doubt is None else seen_by_a_map(pose.camera, doubt)
+    return pose if seen is None else replace(pose, camera=seen[0], lens_prior=seen[1])
 
 
 def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -> bool:

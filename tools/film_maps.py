@@ -136,7 +136,7 @@ def _given_up(films: Sequence[dict[str, Any]]) -> Iterator[tuple[str, float, flo
 
 
 def keyframe_to_pick_in(one: FilmMap, stills: Path) -> tuple[Path, Seen]:
-    """Folder of the map's images, below `stills`, and the one a person would pick in: whole, full of detail."""
+    """Folder of the map's images, below `stills`, and the one to pick in: whole and rich in detail."""
     files = {file.as_posix(): file for file in stills.rglob("*.jpg")}
     best: tuple[int, Path, Seen] | None = None
     for keyframe in one.keyframes:

@@ -38,7 +38,7 @@ _TIMES = 1.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Errors:
-    """Of one kind of poses, of `wanted`: errors in metres and degrees, and the 68 % radii that were reported."""
+    """Errors of one kind of poses, of `wanted`, in metres and degrees, and the 68 % radii reported."""
 
     metres: tuple[float, ...]
     degrees: tuple[float, ...]

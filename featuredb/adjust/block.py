@@ -55,10 +55,11 @@ def whole_lens(block: Block) -> Block:
 
     Fisheye lenses and those that have all of it stay.
     """
-    return replace(block, cameras=tuple(_whole(camera) for camera in block.cameras))
+    return replace(block, cameras=tuple(whole_camera(camera) for camera in block.cameras))
 
 
-def _whole(camera: Camera) -> Camera:
+def whole_camera(camera: Camera) -> Camera:
+    """A radial lens with two focal lengths and tangential terms; others stay."""
     lens = camera.params
     if camera.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         focal, (cx, cy), radial = lens[0], lens[1:3], (*lens[3:], 0.0, 0.0)[:2]

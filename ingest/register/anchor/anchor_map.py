@@ -152,8 +152,8 @@ def _too_little(
         others = "".join(f"; {name}: {why}" for name, why in refusals.items())
         return AnchorResult(
             reason="TOO_FEW_FRAMES",
-            message=f"{len(agreement.agreeing)} frame places the map ({names[agreement.agreeing[0]]}){others}; "
-            f"{needed} that agree are needed without a person; look at its overlay and confirm it "
+            message=f"{len(agreement.agreeing)} frame places the map, {names[agreement.agreeing[0]]}{others}"
+            f"; {needed} that agree are needed without a person; look at its overlay and confirm it "
             "(--confirm), or accept one frame (--frames 1)",
             feature_map=None,
         )

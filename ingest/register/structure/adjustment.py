@@ -22,6 +22,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
 from featuredb.render.cloud import PointCloud
 from ingest.colmap_adjust import AdjustOptions
 from ingest.precision import design_effect, linearise
@@ -95,6 +96,7 @@ class LidarAdjustment:
         block: the map in the cloud's local frame, None when refused.
         covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
+        lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
         before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
         seconds: of the whole.
@@ -105,6 +107,7 @@ class LidarAdjustment:
     block: Block | None
     covariance: FloatArray | None
     poses: tuple[FloatArray, ...]
+    lenses: LensDoubt | None
     before_m: FloatArray
     after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
@@ -162,12 +165,14 @@ def adjust_to_scan(
     reason, message = _gate(block, figures, options)
     if reason is not None:
         return _refused(reason, message, before, after, figures, started)
+    poses, lenses = _left_open(block, control, surface, structure, start, options)
     return LidarAdjustment(
         reason=None,
         message="adjusted to the scan",
         block=block,
         covariance=structure.covariance,
-        poses=_pose_covariances(block, control, surface, structure, start, options),
+        poses=poses,
+        lenses=lenses,
         before_m=before,
         after_m=after,
         figures=figures,
@@ -195,7 +200,12 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
     )
     placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
     images = zip(placed.images, adjustment.poses, strict=True)
-    return replace(placed, images=tuple(replace(image, covariance=c) for image, c in images))
+    doubt = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
+    return replace(
+        placed,
+        images=tuple(replace(image, covariance=c) for image, c in images),
+        provenance=placed.provenance | doubt,
+    )
 
 
 def control_of(
@@ -276,15 +286,15 @@ def _terms(
     )
 
 
-def _pose_covariances(
+def _left_open(
     block: Block,
     control: Marks,
     surface: Surface,
     structure: StructurePlacement,
     start: Block,
     options: AdjustLidarOptions,
-) -> tuple[FloatArray, ...]:
-    """(6, 6) of each pose with all that points and lenses leave open.
+) -> tuple[tuple[FloatArray, ...], LensDoubt | None]:
+    """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
@@ -294,7 +304,10 @@ def _pose_covariances(
     found = Problem(block, _terms(block, control, surface, start.cameras, sigmas, options)).marginals()
     shared = design_effect(_track_residuals(block), block.xy, block.photo_of, _longer_side(block))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
-    return tuple(factor * found.poses(options.lens_dilution))
+    lenses = [factor * options.lens_dilution * found.lens(c) for c in range(len(block.cameras))]
+    photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
+    doubt = doubt_of_lenses(block.cameras, lenses, photos)
+    return tuple(factor * found.poses(options.lens_dilution)), doubt
 
 
 def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
@@ -435,6 +448,7 @@ def _refused(
         block=None,
         covariance=None,
         poses=(),
+        lenses=None,
         before_m=before,
         after_m=after,
         figures=figures,

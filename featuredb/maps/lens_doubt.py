@@ -1,0 +1,73 @@
+"""How well the lenses of a map are known, as far as they bend the map.
+
+Points that were reconstructed with a lens that is a little off are bent by as much. Whoever is localised by
+them and knows the own lens exactly sees the bend as a lens that is off; so a map's provenance keeps what its
+adjustment left open.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+
+_KEY = "lens_doubt"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LensDoubt:
+    """Standard deviations of a map's lenses, of all together.
+
+    Attributes:
+        focal_rel: of the focal length. aspect: of the second focal length over the first.
+        center_rel: (x, y) of the principal point, as shares of the longer side.
+        radial, tangential: of the two coefficients of each.
+    """
+
+    focal_rel: float
+    aspect: float
+    center_rel: tuple[float, float]
+    radial: tuple[float, float]
+    tangential: tuple[float, float]
+
+    def as_provenance(self) -> dict[str, Any]:
+        """To be merged into a map's provenance."""
+        numbers = (self.focal_rel, self.aspect, *self.center_rel, *self.radial, *self.tangential)
+        return {_KEY: [float(f"{number:.4g}") for number in numbers]}
+
+    @classmethod
+    def of_provenance(cls, provenance: dict[str, Any]) -> "LensDoubt | None":
+        """None for maps that were made before it was kept, or of lenses that have no such parameters."""
+        numbers = provenance.get(_KEY)
+        if numbers is None:
+            return None
+        f, aspect, cx, cy, k1, k2, p1, p2 = numbers
+        return cls(focal_rel=f, aspect=aspect, center_rel=(cx, cy), radial=(k1, k2), tangential=(p1, p2))
+
+
+def doubt_of_lenses(
+    cameras: Sequence[Camera], covariances: Sequence[FloatArray], photos: Sequence[int]
+) -> LensDoubt | None:
+    """Of independent lenses that have so many photos each; None where none is of OPENCV's parameters.
+
+    Args:
+        covariances: (8, 8) of OPENCV's parameters.
+    """
+    rows = [c for c, camera in enumerate(cameras) if camera.model == "OPENCV" and photos[c]]
+    if not rows:
+        return None
+    share = np.array([photos[c] for c in rows], dtype=np.float64)
+    share /= share.sum()
+    variance = np.zeros(8)
+    for weight, c in zip(share, rows, strict=True):
+        camera = cameras[c]
+        fx, fy = camera.params[:2]
+        longer = max(camera.width, camera.height)
+        by = np.diag([1.0 / fx, 0.0, 1.0 / longer, 1.0 / longer, 1.0, 1.0, 1.0, 1.0])
+        by[1, :2] = -fy / fx**2, 1.0 / fx
+        variance += weight**2 * np.diag(by @ covariances[c] @ by.T)
+    f, aspect, cx, cy, k1, k2, p1, p2 = np.sqrt(np.maximum(variance, 0.0)).tolist()
+    return LensDoubt(focal_rel=f, aspect=aspect, center_rel=(cx, cy), radial=(k1, k2), tangential=(p1, p2))
