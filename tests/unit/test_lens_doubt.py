@@ -1,0 +1,112 @@
+"""What a map's lenses leave open, and what that makes of a lens that is known exactly."""
+
+import json
+
+import numpy as np
+import pytest
+
+from featuredb.adjust.block import Block
+from featuredb.adjust.marginals import Marginals
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
+from ingest.lens_doubt import lens_doubt
+from reloc.lens_prior import LensPrior, seen_by_a_map
+from reloc.self_calibration import calibrate
+
+_LENS = Camera(
+    model="OPENCV", width=1600, height=1200, params=(1200.0, 1202.0, 805.0, 597.0, -0.02, 0.01, 4e-4, -3e-4)
+)
+
+
+def test_the_doubt_is_that_of_drawn_lenses() -> None:
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(8, 8)) * np.array([3.0, 3.0, 1.0, 1.0, 1e-3, 1e-3, 1e-4, 1e-4])[:, None]
+    drawn = np.array(_LENS.params) + rng.normal(size=(200_000, 8)) @ root.T
+    doubt = doubt_of_lenses([_LENS], [root @ root.T], [5])
+    assert doubt is not None
+    assert doubt.focal_rel == pytest.approx(np.std(drawn[:, 0]) / 1200.0, rel=0.02)
+    assert doubt.aspect == pytest.approx(np.std(drawn[:, 1] / drawn[:, 0]), rel=0.02)
+    assert doubt.center_rel[1] == pytest.approx(np.std(drawn[:, 3]) / 1600.0, rel=0.02)
+    assert doubt.tangential[0] == pytest.approx(np.std(drawn[:, 6]), rel=0.02)
+    # Two lenses of as many photos each: the map's points are bent by their mean.
+    both = doubt_of_lenses([_LENS, _LENS], [root @ root.T] * 2, [5, 5])
+    assert both is not None
+    assert both.focal_rel == pytest.approx(doubt.focal_rel / 2**0.5)
+
+
+def test_a_provenance_keeps_it_and_old_ones_have_none() -> None:
+    doubt = LensDoubt(
+        focal_rel=1e-3, aspect=2e-3, center_rel=(3e-3, 4e-3), radial=(5e-3, 6e-3), tangential=(7e-4, 8e-4)
+    )
+    assert LensDoubt.of_provenance(json.loads(json.dumps(doubt.as_provenance()))) == doubt
+    assert LensDoubt.of_provenance({"version": "1"}) is None
+
+
+def test_lenses_of_other_models_have_none() -> None:
+    fisheye = Camera(
+        model="OPENCV_FISHEYE",
+        width=1600,
+        height=1200,
+        params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
+    )
+    assert doubt_of_lenses([fisheye], [np.eye(8)], [3]) is None
+    doubt = LensDoubt(focal_rel=1e-3, aspect=1e-3, center_rel=(0, 0), radial=(0, 0), tangential=(0, 0))
+    assert seen_by_a_map(fisheye, doubt) is None
+
+
+def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told() -> None:
+    """A map whose lens is 0.3 % flatter than the truth: its scene is as much taller."""
+    rng = np.random.default_rng(3)
+    told = Camera(model="PINHOLE", width=1600, height=1200, params=(1200.0, 1200.0, 800.0, 600.0))
+    scene = rng.uniform([-4, -3, 8], [4, 3, 14], (400, 3))
+    pixels = told.project(scene) + rng.normal(0, 0.3, (400, 2))
+    bent = scene * [1.0, 1.003, 1.0] + [0.0, 0.0, 0.0]
+    doubt = LensDoubt(
+        focal_rel=1e-3, aspect=2e-3, center_rel=(1e-3, 1e-3), radial=(1e-3, 1e-3), tangential=(2e-4, 2e-4)
+    )
+    seen = seen_by_a_map(told, doubt)
+    assert seen is not None
+    by_doubt = calibrate(pixels, bent, Rigid3.identity(), *seen, 1.0).cam_from_local
+    exact = LensPrior(mean=seen[1].mean, sigma=np.full(8, 1e-7))
+    as_told = calibrate(pixels, bent, Rigid3.identity(), seen[0], exact, 1.0).cam_from_local
+    assert np.linalg.norm(by_doubt.center) < 0.5 * np.linalg.norm(as_told.center)
+
+
+def test_more_photos_leave_less_open() -> None:
+    few, many = lens_doubt(_block(4), {0: 1200.0}), lens_doubt(_block(12), {0: 1200.0})
+    assert few is not None
+    assert many is not None
+    assert many.focal_rel < few.focal_rel
+    assert many.center_rel[0] < few.center_rel[0]
+    assert 1e-6 < many.focal_rel < 0.03  # EXIF says 0.02, and counts less where other parameters are off
+
+
+def test_what_lenses_leave_open_counts_as_often_as_it_is_told_to() -> None:
+    root = np.random.default_rng(5).normal(size=(14, 14))
+    shared = root @ root.T
+    found = Marginals(shared=shared, pose_start=np.array([0]), lens_start=np.array([6]), lens_size=(8,))
+    exact = np.linalg.inv(np.linalg.inv(shared)[:6, :6])  # with lenses known
+    by_lens = shared[:6, :6] - exact
+    np.testing.assert_allclose(found.poses(9.0)[0], exact + 9.0 * by_lens, rtol=1e-6)
+    np.testing.assert_allclose(found.poses()[0], shared[:6, :6])
+
+
+def _block(photos: int) -> Block:
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform([-5, -4, 8], [5, 4, 13], (300, 3))
+    poses = [
+        Rigid3(rotation=np.eye(3), translation=np.array([0.8 * (k % 4) - 1.2, 0.7 * (k // 4) - 0.7, 0.0]))
+        for k in range(photos)
+    ]
+    xy = np.concatenate([_LENS.project(pose.act(xyz)) for pose in poses])
+    return Block(
+        names=tuple(str(k) for k in range(photos)),
+        cameras=(_LENS,),
+        camera_of=np.zeros(photos, dtype=np.int64),
+        cam_from_block=tuple(poses),
+        xyz=xyz,
+        point_of=np.tile(np.arange(300), photos),
+        photo_of=np.repeat(np.arange(photos), 300),
+        xy=xy + rng.normal(0, 0.3, xy.shape),
+    )
