@@ -7,17 +7,19 @@ ingest.colmap_bridge this module knows pycolmap's reconstructions.
 """
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import CenterPriors, LensPrior, LensWidths, Terms, lens_prior
+from featuredb.adjust.terms import CenterPriors, LensPrior, LensWidths, Marks, Terms, lens_prior
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
@@ -186,12 +188,12 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
         block = whole_lens(block)
     centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None
     lenses = [
-        prior_of_lens(camera, known.focal_px.get(camera_id), options)
+        lens_prior_of(camera, known.focal_px.get(camera_id), options)
         for camera, camera_id in zip(block.cameras, camera_ids, strict=True)
     ]
     terms = Terms(
         keypoint_px=loss_scale_px,
-        dilution=options.dilution * shared_variance_of_block(block) / loss_scale_px**2,
+        dilution=options.dilution * block_variance_px2(block) / loss_scale_px**2,
         lenses=tuple(lenses) if options.refine_focal else (None,) * len(lenses),
         centers=centers,
         held_photos=() if centers is not None else (0,),
@@ -211,23 +213,36 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     reconstruction.update_point_3d_errors()
 
 
-def shared_variance_of_block(block: Block) -> float:
-    """`shared_variance_px2` of the block's residuals; points that their camera cannot see say nothing."""
+def residuals_of(
+    block: Block, marks: Marks | None = None
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Residuals (m, 2) of a block and its marks, with their pixels (m, 2) and photos (m,).
+
+    Points that their camera cannot see are left out: they say nothing.
+    """
+    xyz, point_of, photo_of, xy = block.xyz, block.point_of, block.photo_of, block.xy
+    if marks is not None:
+        point_of = np.concatenate([point_of, len(xyz) + np.arange(len(marks.xyz))])
+        xyz, photo_of = np.concatenate([xyz, marks.xyz]), np.concatenate([photo_of, marks.photo_of])
+        xy = np.concatenate([xy, marks.xy])
     residuals = linearise(
-        block.cameras,
-        block.camera_of,
-        block.cam_from_block,
-        block.xyz,
-        block.point_of,
-        block.photo_of,
-        block.xy,
+        block.cameras, block.camera_of, block.cam_from_block, xyz, point_of, photo_of, xy
     ).residual
     seen = np.isfinite(residuals).all(axis=1)
-    side = max(max(camera.width, camera.height) for camera in block.cameras)
-    return max(shared_variance_px2(residuals[seen], block.xy[seen], block.photo_of[seen], side), _LEAST_PX2)
+    return residuals[seen], xy[seen], photo_of[seen]
 
 
-def prior_of_lens(camera: Camera, exif_px: float | None, options: AdjustOptions) -> LensPrior:
+def block_variance_px2(block: Block, marks: Marks | None = None) -> float:
+    """`shared_variance_px2` of the residuals of a block and its marks."""
+    return max(shared_variance_px2(*residuals_of(block, marks), longest_side(block.cameras)), _LEAST_PX2)
+
+
+def longest_side(cameras: Sequence[Camera]) -> int:
+    """Of all pictures, pixels."""
+    return max(max(camera.width, camera.height) for camera in cameras)
+
+
+def lens_prior_of(camera: Camera, exif_px: float | None, options: AdjustOptions) -> LensPrior:
     """Around an undistorted lens in the middle of the picture, of EXIF's focal length or the one found."""
     widths = options.lens if exif_px is None else replace(options.lens, focal_rel=options.exif_focal_rel)
     focal_px = camera.focal_px if exif_px is None else exif_px

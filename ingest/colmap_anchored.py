@@ -1,24 +1,27 @@
-"""Bundle adjustment of a model with some of its points and lenses held fixed.
+"""Adjustment of a model against points and photos that stay where they are, lenses under their priors.
 
 Like ingest.colmap_bridge and ingest.colmap_adjust this module knows pycolmap's reconstructions.
 """
 
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block, whole_camera, whole_lens
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import LensPrior, LensWidths, Marks, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from ingest.colmap_adjust import AdjustOptions, block_variance_px2, lens_prior_of, longest_side
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
-from ingest.focal_prior import FocalPriorOptions, add_focal_priors, fix_gauge
-from ingest.precision import shared_variance_px2
+
+_FUNCTION_TOLERANCE = 1e-6  # relative
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,18 +35,58 @@ class AnchoredOptions:
             reconstruction itself allows.
         error_reference_side_px: keypoints are located on images of about this size.
         rounds: of adjusting and dropping.
-        focal_prior: how much the focal lengths of EXIF count.
-        max_iterations: of Ceres, each round.
-        threads: one gives the same numbers in every run.
+        lent: of a lens that a map lends, against that map's points. They were made with that very lens: what
+            it trades for height, they trade alike. Of the coefficients of a lens that is not whole no more is
+            known than of any lens.
+        mapping: what is known of other lenses, what observations count against it, and the solver, all as
+            where reconstructions are made.
     """
 
     loss_scale_px: float = 0.5
     max_error_px: float = 4.0
     error_reference_side_px: int = 1600
-    rounds: int = 2
-    focal_prior: FocalPriorOptions = field(default_factory=FocalPriorOptions)
-    max_iterations: int = 60
-    threads: int = 1
+    rounds: int = 3
+    lent: LensWidths = field(
+        default_factory=lambda: LensWidths(
+            focal_rel=0.001, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005
+        )
+    )
+    mapping: AdjustOptions = field(default_factory=AdjustOptions)
+
+    def keypoint_px(self, cameras: Sequence[Camera]) -> float:
+        """`loss_scale_px` at the size of these cameras' pictures."""
+        return self.loss_scale_px * max(1.0, longest_side(cameras) / self.error_reference_side_px)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lenses:
+    """What is known of a model's lenses, by camera, without its photos.
+
+    Attributes:
+        held: cameras whose lens stays.
+        lent: lenses of maps.
+        focal_px: focal lengths of EXIF.
+    """
+
+    held: Collection[int] = ()
+    lent: Mapping[int, Camera] = field(default_factory=dict)
+    focal_px: Mapping[int, float] = field(default_factory=dict)
+
+    def priors(self, cameras: Sequence[Camera], options: AnchoredOptions) -> tuple[LensPrior | None, ...]:
+        """Of whole lenses; None for those that are held."""
+
+        def prior(c: int, camera: Camera) -> LensPrior | None:
+            if c in self.held:
+                return None
+            if c in self.lent:
+                lens, widths = whole_camera(self.lent[c]), options.lent
+                if lens != self.lent[c]:  # the map did not ask for the other coefficients
+                    any_lens = options.mapping.lens
+                    widths = replace(widths, radial=any_lens.radial, tangential=any_lens.tangential)
+                return lens_prior(lens, widths)
+            return lens_prior_of(whole_camera(camera), self.focal_px.get(c), options.mapping)
+
+        return tuple(prior(c, camera) for c, camera in enumerate(cameras))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,42 +130,41 @@ def adjust_anchored(
     model: Model,
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
-    constant_cameras: Sequence[int],
+    lenses: Lenses,
     options: AnchoredOptions,
-    focal_px: Mapping[int, float] | None = None,
     *,
-    free_centers: bool = False,
-    constant_photos: Sequence[int] = (),
-    constant_points: Sequence[int] = (),
+    held_photos: Sequence[int] = (),
+    held_points: Sequence[int] = (),
 ) -> Anchored:
-    """Adjust poses, free points and lenses (focal lengths and distortion) but those of `constant_cameras`.
+    """Adjust poses, free points and whole lenses.
 
-    Without fixed points and constant photos the gauge is that of the first two photos' poses.
+    Without fixed points and held photos the first photo's pose stays.
 
     Args:
         keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
-        focal_px: focal lengths of EXIF by camera, where there is one.
-        free_centers: adjust the principal points of these lenses, too.
-        constant_photos: rows of the model's photos whose poses stay. constant_points: of its points.
+        held_photos: rows of the model's photos whose poses stay. held_points: of its points.
     """
     observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    if not len(held_photos) and not len(fixed.point_of):
+        held_photos = (0,)
+    priors = lenses.priors(model.cameras, options)
     state = model
+    variance_px2 = options.keypoint_px(model.cameras) ** 2  # until the model has settled
     for _ in range(options.rounds):
-        with quiet():
-            state = _adjusted(
-                state,
-                observation,
-                keypoints,
-                fixed,
-                kept,
-                constant_cameras,
-                focal_px or {},
-                free_centers,
-                constant_photos,
-                constant_points,
-                options,
-            )
+        block, marks = block_and_marks(state, observation, keypoints, fixed, kept, held_points, held_photos)
+        terms = terms_of(block, marks, priors, options, variance_px2, held_photos)
+        problem = Problem(block, terms, options.mapping.threads)
+        problem.solve(options.mapping.max_iterations, _FUNCTION_TOLERANCE)
+        found = problem.block()
+        variance_px2 = block_variance_px2(found, marks)
+        cameras = zip(model.cameras, found.cameras, priors, strict=True)
+        state = replace(
+            state,
+            cameras=tuple(given if prior is None else own for given, own, prior in cameras),
+            cam_from_sfm=found.cam_from_block,
+            xyz=found.xyz,
+        )
         observation, kept = _fitting(state, keypoints, fixed, options)
         observation &= _in_tracks(state, observation)
     return Anchored(
@@ -132,150 +174,67 @@ def adjust_anchored(
     )
 
 
-def _adjusted(
+def block_and_marks(
     model: Model,
     observation: NDArray[np.bool_],
     keypoints: Sequence[FloatArray],
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
-    constant_cameras: Sequence[int],
-    focal_px: Mapping[int, float],
-    free_centers: bool,
-    constant_photos: Sequence[int],
-    constant_points: Sequence[int],
+    held_points: Sequence[int] = (),
+    held_photos: Sequence[int] = (),
+) -> tuple[Block, Marks]:
+    """The model with whole lenses, and what its free photos see of points that stay.
+
+    Args:
+        observation: (m,) those of the model that take part. kept: those of the fixed points.
+        held_points: of the model, those that stay.
+    """
+    held = np.isin(np.arange(len(model.xyz)), held_points)
+    xy = np.zeros((len(model.point_of), 2))
+    for k, pixels in enumerate(keypoints):
+        mine = model.photo_of == k
+        xy[mine] = pixels[model.keypoint_of[mine]]
+    free = np.flatnonzero(observation & ~held[model.point_of])
+    stays = np.flatnonzero(observation & held[model.point_of] & ~np.isin(model.photo_of, held_photos))
+    block = Block(
+        names=tuple(str(r) for r in model.rows),
+        cameras=model.cameras,
+        camera_of=model.camera_of,
+        cam_from_block=model.cam_from_sfm,
+        xyz=model.xyz,
+        point_of=model.point_of[free],
+        photo_of=model.photo_of[free],
+        xy=xy[free],
+    )
+    marks = Marks(
+        xyz=np.concatenate([fixed.xyz[fixed.point_of[kept]], model.xyz[model.point_of[stays]]]),
+        photo_of=np.concatenate([fixed.photo_of[kept], model.photo_of[stays]]),
+        xy=np.concatenate([fixed.pixels[kept], xy[stays]]),
+    )
+    return whole_lens(block), marks
+
+
+def terms_of(
+    block: Block,
+    marks: Marks,
+    lenses: tuple[LensPrior | None, ...],
     options: AnchoredOptions,
-) -> Model:
-    """One round: the model with new poses, lenses and points."""
-    reconstruction, free_ids, fixed_ids = _reconstruction(model, observation, keypoints, fixed, kept)
-    side = max(max(c.width, c.height) for c in model.cameras)
-    settings = pycolmap.BundleAdjustmentOptions()
-    settings.print_summary = False
-    settings.refine_principal_point = free_centers
-    settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    loss_scale_px = options.loss_scale_px * max(1.0, side / options.error_reference_side_px)
-    settings.ceres.loss_function_scale = loss_scale_px
-    settings.ceres.solver_options.max_num_iterations = options.max_iterations
-    settings.ceres.solver_options.function_tolerance = 1e-6
-    settings.ceres.solver_options.num_threads = options.threads
-    config = pycolmap.BundleAdjustmentConfig()
-    for k in range(len(model.rows)):
-        config.add_image(k + 1)
-    for camera in constant_cameras:
-        config.set_constant_cam_intrinsics(camera + 1)
-    for photo in constant_photos:
-        config.set_constant_rig_from_world_pose(reconstruction.image(photo + 1).frame_id)
-    for point_id in (*fixed_ids, *(free_ids[p] for p in constant_points if p in free_ids)):
-        config.add_constant_point(point_id)
-    free = set(np.unique(model.camera_of).tolist()) - set(constant_cameras)
-    focals = {c + 1: focal for c, focal in options.focal_prior.of(focal_px, free).items()}
-    if not fixed_ids and not constant_photos:
-        fix_gauge(reconstruction, config, 1, focals)
-    if focals:
-        variance = _shared_variance_px2(model, observation, keypoints)
-        add_focal_priors(reconstruction, config, focals, variance, loss_scale_px, options.focal_prior)
-    pycolmap.create_default_bundle_adjuster(settings, config, reconstruction).solve()
-    xyz = model.xyz.copy()
-    for point, point_id in free_ids.items():
-        xyz[point] = reconstruction.point3D(point_id).xyz
-    poses = [reconstruction.image(k + 1).cam_from_world().matrix() for k in range(len(model.rows))]
-    return replace(
-        model,
-        cameras=tuple(Camera.from_pycolmap(reconstruction.camera(c + 1)) for c in range(len(model.cameras))),
-        cam_from_sfm=tuple(Rigid3.from_matrix(np.asarray(pose)) for pose in poses),
-        xyz=xyz,
-    )
+    variance_px2: float,
+    held_photos: Sequence[int] = (),
+) -> Terms:
+    """Marks and lenses; observations count as they do where reconstructions are made.
 
-
-def _shared_variance_px2(
-    model: Model, observation: NDArray[np.bool_], keypoints: Sequence[FloatArray]
-) -> float:
-    """Of the residuals of the free points, see `shared_variance_px2`."""
-    rows = np.flatnonzero(observation)
-    residuals, pixels = np.zeros((len(rows), 2)), np.zeros((len(rows), 2))
-    for k, pose in enumerate(model.cam_from_sfm):
-        mine = model.photo_of[rows] == k
-        pixels[mine] = keypoints[k][model.keypoint_of[rows[mine]]]
-        seen = pose.act(model.xyz[model.point_of[rows[mine]]])
-        residuals[mine] = model.cameras[int(model.camera_of[k])].project(seen) - pixels[mine]
-    good = np.isfinite(residuals).all(axis=1)
-    side = max(max(c.width, c.height) for c in model.cameras)
-    return shared_variance_px2(residuals[good], pixels[good], model.photo_of[rows[good]], side)
-
-
-def _reconstruction(
-    model: Model,
-    observation: NDArray[np.bool_],
-    keypoints: Sequence[FloatArray],
-    fixed: FixedPoints,
-    kept: NDArray[np.bool_],
-) -> tuple[Any, dict[int, int], list[int]]:
-    """pycolmap's reconstruction, ids of the free points by row, ids of the fixed points.
-
-    Pixels of fixed points are keypoints of their own, behind the photo's: a feature may be held by points
-    of two maps.
+    Args:
+        variance_px2: of the residuals, with what neighbours share.
     """
-    reconstruction = pycolmap.Reconstruction()
-    for c, camera in enumerate(model.cameras):
-        reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
-    place = np.zeros(len(fixed.point_of), dtype=np.int64)
-    for k, pose in enumerate(model.cam_from_sfm):
-        rows = np.flatnonzero((fixed.photo_of == k) & kept)
-        place[rows] = len(keypoints[k]) + np.arange(len(rows))
-        image = pycolmap.Image(
-            name=str(k),
-            keypoints=np.concatenate([keypoints[k], fixed.pixels[rows]]).astype(np.float64),
-            camera_id=int(model.camera_of[k]) + 1,
-            image_id=k + 1,
-        )
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
-    free = np.flatnonzero(observation)
-    free_ids = _add_points(
-        reconstruction, model.xyz, model.point_of[free], model.photo_of[free], model.keypoint_of[free]
+    keypoint_px = options.keypoint_px(block.cameras)
+    return Terms(
+        keypoint_px=keypoint_px,
+        dilution=options.mapping.dilution * variance_px2 / keypoint_px**2,
+        lenses=lenses,
+        marks=replace(marks, sigma_px=keypoint_px),
+        held_photos=tuple(held_photos),
     )
-    held = np.flatnonzero(kept)
-    fixed_ids = _add_points(
-        reconstruction, fixed.xyz, fixed.point_of[held], fixed.photo_of[held], place[held]
-    )
-    _add_onlooker(reconstruction, list(fixed_ids.values()), len(model.cameras) + 1, len(model.rows) + 1)
-    return reconstruction, free_ids, list(fixed_ids.values())
-
-
-def _add_onlooker(reconstruction: Any, point_ids: list[int], camera_id: int, image_id: int) -> None:
-    """An image outside the problem that sees the points of one photo: COLMAP wants two views of each.
-
-    Point, pose and lens of these residuals are constant, so they change nothing.
-    """
-    single = [p for p in point_ids if reconstruction.point3D(p).track.length() == 1]
-    if not single:
-        return
-    lens = Camera.from_focal(100, 100, 100.0, "SIMPLE_PINHOLE")
-    reconstruction.add_camera_with_trivial_rig(lens.to_pycolmap(camera_id))
-    image = pycolmap.Image(
-        name="onlooker", keypoints=np.zeros((len(single), 2)), camera_id=camera_id, image_id=image_id
-    )
-    reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    for k, point_id in enumerate(single):
-        reconstruction.add_observation(point_id, pycolmap.TrackElement(image_id, k))
-
-
-def _add_points(
-    reconstruction: Any,
-    xyz: FloatArray,
-    point_of: NDArray[np.int64],
-    photo_of: NDArray[np.int64],
-    keypoint_of: NDArray[np.int64],
-) -> dict[int, int]:
-    """Add the points that have observations; their ids by row of xyz."""
-    order = np.argsort(point_of, kind="stable")
-    ids: dict[int, int] = {}
-    starts = np.flatnonzero(np.diff(point_of[order], prepend=-1))
-    for rows in np.split(order, starts[1:]) if len(order) else []:
-        track = pycolmap.Track()
-        for o in rows:
-            track.add_element(int(photo_of[o]) + 1, int(keypoint_of[o]))
-        point = int(point_of[rows[0]])
-        ids[point] = reconstruction.add_point3D(xyz[point], track)
-    return ids
 
 
 def _fitting(
@@ -342,8 +301,7 @@ def triangulate_posed(
         settings.triangulation.ignore_two_view_tracks = False
         settings.num_threads = 1
         settings.random_seed = 0
-        side = max(max(camera.width, camera.height) for camera in cameras)
-        error_px = 4.0 * max(1.0, side / AnchoredOptions().error_reference_side_px)
+        error_px = 4.0 * max(1.0, longest_side(cameras) / AnchoredOptions().error_reference_side_px)
         settings.triangulation.create_max_angle_error = 2.0
         settings.mapper.filter_max_reproj_error = error_px
         settings.triangulation.complete_max_reproj_error = error_px

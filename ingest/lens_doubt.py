@@ -9,7 +9,7 @@ from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import CenterPriors, Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
-from ingest.colmap_adjust import AdjustOptions, prior_of_lens, shared_variance_of_block
+from ingest.colmap_adjust import AdjustOptions, lens_prior_of, block_variance_px2
 
 
 def lens_doubt(
@@ -22,9 +22,9 @@ def lens_doubt(
     """
     options = options or AdjustOptions()
     block = whole_lens(block)
-    priors = tuple(prior_of_lens(camera, focal_px.get(c), options) for c, camera in enumerate(block.cameras))
+    priors = tuple(lens_prior_of(camera, focal_px.get(c), options) for c, camera in enumerate(block.cameras))
     terms = Terms(
-        keypoint_px=float(np.sqrt(shared_variance_of_block(block))),
+        keypoint_px=float(np.sqrt(block_variance_px2(block))),
         dilution=options.dilution,
         lenses=priors,
         centers=_any_scale(block),

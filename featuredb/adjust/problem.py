@@ -31,7 +31,8 @@ class Problem:
 
     def __init__(self, block: Block, terms: Terms, threads: int = 1) -> None:
         self._block, self._terms, self._threads = block, terms, threads
-        self._reconstruction = _reconstruction(block)
+        only_marks = _seen_by_marks_alone(block, terms)
+        self._reconstruction = _reconstruction(block, only_marks)
         self._options = pycolmap.BundleAdjustmentOptions()
         self._options.refine_principal_point = True
         self._options.print_summary = False
@@ -42,6 +43,8 @@ class Problem:
             config.add_image(k + 1)
         for k in terms.held_photos:
             config.set_constant_rig_from_world_pose(self._reconstruction.image(k + 1).frame_id)
+        for k in range(len(only_marks)):
+            config.add_constant_point(len(block.xyz) + k + 1)
         for c, lens in enumerate(terms.lenses):
             if lens is None:
                 config.set_constant_cam_intrinsics(c + 1)
@@ -101,12 +104,24 @@ class Problem:
 
     def marginals(self) -> Marginals:
         """Covariances at the parameters as they are now, for independent residuals of the stated sigmas."""
-        poses = [pose for k, pose in enumerate(self._poses) if k not in self._terms.held_photos]
-        lenses = [p for p, prior in zip(self._lenses, self._terms.lenses, strict=True) if prior is not None]
+        photos = [
+            k for k, pose in enumerate(self._poses) if k not in self._terms.held_photos and self._has(pose)
+        ]
+        cameras = [
+            c
+            for c, prior in enumerate(self._terms.lenses)
+            if prior is not None and self._has(self._lenses[c])
+        ]
         rows = list(self._points)
         order = pyceres.EvaluateOptions()
         order.num_threads = self._threads
-        order.set_parameter_blocks([*self._points.values(), *poses, *lenses])
+        order.set_parameter_blocks(
+            [
+                *self._points.values(),
+                *(self._poses[k] for k in photos),
+                *(self._lenses[c] for c in cameras),
+            ]
+        )
         found = self._ceres.evaluate_jacobian(order)
         jacobian = sparse.csr_matrix(
             (np.asarray(found.values), np.asarray(found.cols), np.asarray(found.rows)),
@@ -115,16 +130,20 @@ class Problem:
         return marginals(
             jacobian / self._terms.keypoint_px,
             np.array(rows, dtype=np.int64),
-            [k for k in range(len(self._poses)) if k not in self._terms.held_photos],
-            [c for c, prior in enumerate(self._terms.lenses) if prior is not None],
+            photos,
+            cameras,
             self.block(),
         )
+
+    def _has(self, parameters: FloatArray) -> bool:
+        """Whether anything is observed of them."""
+        return bool(self._ceres.has_parameter_block(parameters))
 
     def _add_lenses(self, priors: tuple[LensPrior | None, ...]) -> None:
         unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
         loss = pyceres.CauchyLoss(_LETS_GO / np.sqrt(unit))
         for params, prior in zip(self._lenses, priors, strict=True):
-            if prior is not None and self._ceres.has_parameter_block(params):
+            if prior is not None and self._has(params):
                 cost = pyceres.factors.NormalPrior(np.array(prior.mean.params), unit * prior.covariance)
                 self._ceres.add_residual_block(cost, loss, [params])
 
@@ -160,8 +179,18 @@ def _pose(params: FloatArray) -> Rigid3:
     return Rigid3.from_quaternion(params[:4] / np.linalg.norm(params[:4]), params[4:])
 
 
-def _reconstruction(block: Block) -> Any:
-    """The block as COLMAP's reconstruction; ids are rows + 1, each photo a frame of its camera's rig."""
+def _seen_by_marks_alone(block: Block, terms: Terms) -> list[int]:
+    """Photos that see marks and nothing of the block."""
+    marked = terms.marks.photo_of if terms.marks is not None else np.zeros(0, dtype=np.int64)
+    return sorted(set(marked.tolist()) - set(block.photo_of.tolist()))
+
+
+def _reconstruction(block: Block, only_marks: list[int]) -> Any:
+    """The block as COLMAP's reconstruction; ids are rows + 1, each photo a frame of its camera's rig.
+
+    COLMAP makes parameters of photos that see points. Those of `only_marks` get one behind them, twice, which
+    has no residual, beyond the ids of the block's points.
+    """
     result = pycolmap.Reconstruction()
     for c, camera in enumerate(block.cameras):
         result.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
@@ -171,18 +200,25 @@ def _reconstruction(block: Block) -> Any:
     for k, pose in enumerate(block.cam_from_block):
         rows = by_photo[starts[k] : starts[k + 1]]
         place[rows] = np.arange(len(rows))
+        pixels = np.zeros((2, 2)) if k in only_marks else block.xy[rows]
         image = pycolmap.Image(
-            name=str(k), keypoints=block.xy[rows], camera_id=int(block.camera_of[k]) + 1, image_id=k + 1
+            name=str(k), keypoints=pixels, camera_id=int(block.camera_of[k]) + 1, image_id=k + 1
         )
         result.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
     by_point = np.argsort(block.point_of, kind="stable")
     points, first = np.unique(block.point_of[by_point], return_index=True)
     photo, at = (block.photo_of[by_point] + 1).tolist(), place[by_point].tolist()
-    ends = [*first[1:].tolist(), len(by_point)]
+    ends = np.append(first[1:], len(by_point))[: len(first)].tolist()
     colour = np.zeros(3, dtype=np.uint8)
     for point, start, end in zip(points.tolist(), first.tolist(), ends, strict=True):
         elements = [pycolmap.TrackElement(photo[i], at[i]) for i in range(start, end)]
         result.add_point3D_with_id(
             point + 1, pycolmap.Point3D(xyz=block.xyz[point], track=pycolmap.Track(elements), color=colour)
+        )
+    for i, k in enumerate(only_marks):
+        track = pycolmap.Track([pycolmap.TrackElement(k + 1, 0), pycolmap.TrackElement(k + 1, 1)])
+        behind = block.cam_from_block[k].inverse().act(np.array([0.0, 0.0, -1.0]))
+        result.add_point3D_with_id(
+            len(block.xyz) + i + 1, pycolmap.Point3D(xyz=behind, track=track, color=colour)
         )
     return result

@@ -16,7 +16,13 @@ from scipy.sparse.csgraph import connected_components
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_anchored import AnchoredOptions, FixedPoints, adjust_anchored, triangulate_posed
+from ingest.colmap_anchored import (
+    AnchoredOptions,
+    FixedPoints,
+    Lenses,
+    adjust_anchored,
+    triangulate_posed,
+)
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.localised import in_frame
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
@@ -276,6 +282,6 @@ def _triangulated(
         {(place[a], place[b]): view for (a, b), view in geometries.items()},
     )
     keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
-    lenses = range(len(model.cameras))
+    lenses = Lenses(held=range(len(model.cameras)))
     free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses, AnchoredOptions()).model
     return replace(free, rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64))

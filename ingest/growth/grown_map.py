@@ -9,7 +9,6 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap, Placement
@@ -18,11 +17,9 @@ from ingest.colmap_bridge import Model
 from ingest.growth.anchors import Anchors, find_anchors
 from ingest.growth.localised import LocaliseEachOptions, in_frame, with_lens
 from ingest.growth.map_graph import drift_m, places_of
-from ingest.growth.model_parts import without_photos
-from ingest.growth.own_lenses import OwnLensOptions, own_lenses
 from ingest.growth.parents import drift_covariance, map_agreements
 from ingest.growth.placement import Held, PlacementOptions, place_by_maps
-from ingest.growth.refine import Lenses, adopt_lenses, hold_lenses, refine_with_maps
+from ingest.growth.refine import adopt_lenses
 from ingest.growth.settle import SettleOptions, settle
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
@@ -38,7 +35,6 @@ class GrowOptions:
 
     Attributes:
         placement, settle: the steps.
-        own_lens: when existing points tell a lens better than the map that lent it.
         localise: how poses are found again with the lenses of the reconstruction.
         maps: what goes into the map; the height datum is that of the parents. Points of two photos carry
             descriptors: a handful of photos has hardly longer tracks, and the next photo needs them to be
@@ -47,7 +43,6 @@ class GrowOptions:
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
     settle: SettleOptions = field(default_factory=SettleOptions)
-    own_lens: OwnLensOptions = field(default_factory=OwnLensOptions)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     maps: MapOptions = field(default_factory=lambda: MapOptions(min_track_length=2))
 
@@ -109,11 +104,6 @@ def _grown(
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
     model, lenses = adopt_lenses(model, mine, photos, near, keypoints, options.settle.refine)
     mine, anchors, held = _placed(model, mine, keypoints, photos, near, frame, options)
-    better = _better_lenses(model, anchors, held, keypoints, lenses, options)
-    if better:
-        model = hold_lenses(model, better, keypoints, lenses, options.settle.refine)
-        lenses = replace(lenses, constant=tuple(c for c in lenses.constant if c not in better))
-        mine, anchors, held = _placed(model, mine, keypoints, photos, near, frame, options)
     placement = held.placement
     if placement.reason is not None or placement.local_from_sfm is None:
         return Refused(
@@ -151,27 +141,6 @@ def _placed(
     mine = {r: with_lens(p, model.cameras[camera_of[r]], options.localise) for r, p in localised.items()}
     anchors = find_anchors(model, mine, dict(zip(rows, keypoints, strict=True)))
     return mine, anchors, place_by_maps(model, mine, anchors, photos, areas, frame, options.placement)
-
-
-def _better_lenses(
-    model: Model,
-    anchors: Anchors,
-    held: Held,
-    keypoints: Sequence[FloatArray],
-    lenses: Lenses,
-    options: GrowOptions,
-) -> dict[int, Camera]:
-    """Lenses by camera that the existing points tell better than the model has them; none if not placed."""
-    placement = held.placement
-    if placement.reason is not None or placement.local_from_sfm is None:
-        return {}
-    outside = [int(k) for k in np.flatnonzero(np.isin(model.rows, placement.disagreeing))]
-    good = anchors.take(np.flatnonzero(held.used & ~np.isin(anchors.photo_of, outside)))
-    refine = options.settle.refine
-    adjusted, fixed, _ = refine_with_maps(
-        without_photos(model, outside), placement.local_from_sfm, good, lenses, keypoints, refine
-    )
-    return own_lenses(adjusted, keypoints, fixed, lenses, refine.adjust, options.own_lens)
 
 
 def _with_covariances(feature_map: FeatureMap, spread: FloatArray) -> FeatureMap:

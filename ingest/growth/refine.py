@@ -1,4 +1,4 @@
-"""Step: the reconstruction adjusted, with lenses and points of existing maps held where they are."""
+"""Step: the reconstruction adjusted, around lenses of existing maps, with their points where they are."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +14,7 @@ from ingest.colmap_anchored import (
     Anchored,
     AnchoredOptions,
     FixedPoints,
+    Lenses,
     adjust_anchored,
     with_observations,
 )
@@ -30,29 +31,11 @@ class RefineOptions:
     Attributes:
         max_point_sigma_px: existing points whose own uncertainty, seen from the new photo, is larger do
             not hold it (at images of 1600 pixels): twice the inlier tolerance of a pose.
-        own_lens_photos: a camera of the reconstruction with so many photos keeps its own lens, refined with
-            the existing points; with fewer it takes the map's where the EXIF key is the same. Fewer do not
-            tell the lens from the scene's shape: six nadir photos in a line gave `brighton`'s drone a
-            focal length 12 to 25 % off.
         adjust: the adjustment itself.
     """
 
     max_point_sigma_px: float = 8.0
-    own_lens_photos: int = 20
     adjust: AnchoredOptions = field(default_factory=AnchoredOptions)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lenses:
-    """What is known of a model's lenses.
-
-    Attributes:
-        constant: cameras whose lens is a map's and stays.
-        focal_px: focal lengths of EXIF by camera.
-    """
-
-    constant: tuple[int, ...]
-    focal_px: Mapping[int, float]
 
 
 def adopt_lenses(
@@ -63,50 +46,25 @@ def adopt_lenses(
     keypoints: Sequence[FloatArray],
     options: RefineOptions,
 ) -> tuple[Model, Lenses]:
-    """The model adjusted, in its own frame, to the lenses that existing maps have for its cameras.
+    """The model adjusted, in its own frame, around the lenses that existing maps have for its cameras.
 
     Args:
         photos: all, rows as in the model.
         areas: where it may lie; they lend lenses to cameras none of whose photos is localised, too.
         keypoints: pixels of all features of the model's photos, in the order of its rows.
     """
-    focal_px = exif_focals(model, photos)
-    cameras = list(model.cameras)
-    adopted: list[int] = []
-    for c in range(len(cameras)):
-        mine = np.flatnonzero(model.camera_of == c)
-        rows = model.rows[mine].tolist()
+    lent: dict[int, Camera] = {}
+    for c, camera in enumerate(model.cameras):
+        rows = model.rows[model.camera_of == c].tolist()
         lens = _lens_of_maps([localised[r] for r in rows if r in localised])
         lens = lens or _lens_for_key({photos[r].camera_key for r in rows}, areas)
-        if lens is None or len(mine) >= options.own_lens_photos:
-            continue
-        if (lens.width, lens.height) == (cameras[c].width, cameras[c].height):
-            cameras[c] = lens
-            adopted.append(c)
-    lenses = Lenses(constant=tuple(adopted), focal_px=focal_px)
-    if not adopted:
+        if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
+            lent[c] = lens
+    lenses = Lenses(lent=lent, focal_px=exif_focals(model, photos))
+    if not lent:
         return model, lenses
-    return hold_lenses(model, {c: cameras[c] for c in adopted}, keypoints, lenses, options), lenses
-
-
-def hold_lenses(
-    model: Model,
-    cameras: Mapping[int, Camera],
-    keypoints: Sequence[FloatArray],
-    lenses: Lenses,
-    options: RefineOptions,
-) -> Model:
-    """The model adjusted, in its own frame, to lenses that are given by camera."""
-    given = with_cameras(model, cameras)
-    constant = sorted({*lenses.constant, *cameras})
-    return adjust_anchored(
-        given, keypoints, FixedPoints.none(), constant, options.adjust, lenses.focal_px
-    ).model
-
-
-def with_cameras(model: Model, cameras: Mapping[int, Camera]) -> Model:
-    """The model with other lenses, by camera; nothing else is changed."""
-    return replace(model, cameras=tuple(cameras.get(c, camera) for c, camera in enumerate(model.cameras)))
+    given = replace(model, cameras=tuple(lent.get(c, own) for c, own in enumerate(model.cameras)))
+    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses, options.adjust).model, lenses
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
@@ -149,8 +107,7 @@ def refine_with_maps(
     first, number = held.existing()
     fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
     free = without_anchored(placed, held)
-    adjusted = adjust_anchored(free, keypoints, fixed, lenses.constant, options.adjust, lenses.focal_px)
-    return adjusted, fixed, sharp
+    return adjust_anchored(free, keypoints, fixed, lenses, options.adjust), fixed, sharp
 
 
 def exif_focals(model: Model, photos: Sequence[Photo]) -> dict[int, float]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_anchored import Anchored
+from ingest.colmap_anchored import Anchored, Lenses
 from ingest.colmap_bridge import Model
 from ingest.growth import gates
 from ingest.growth.anchors import Anchors
@@ -28,7 +28,7 @@ from ingest.growth.photo_spread import (
     turning_covariance,
 )
 from ingest.growth.placement import Held, PlacementOptions
-from ingest.growth.refine import Lenses, RefineOptions, refine_with_maps
+from ingest.growth.refine import RefineOptions, refine_with_maps
 from ingest.growth.similarity_fit import Fit, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
 from ingest.links import firmness
@@ -144,7 +144,13 @@ def settle(
         if not gate.passes:
             return _refused(gate.reason, gate.message, rows, asked)
         spread = photo_covariances(
-            adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, options.drift
+            adjusted.model,
+            keypoints,
+            fixed,
+            adjusted.fixed_kept,
+            lenses,
+            options.refine.adjust,
+            options.drift,
         )
         held_anchors = good.take(sharp)
         fit = fit_similarity(adjusted.model, Sim3.identity(), held_anchors, adjusted.fixed_kept, placing.fit)

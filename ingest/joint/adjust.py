@@ -20,7 +20,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import Anchored, FixedPoints, adjust_anchored
+from ingest.colmap_anchored import Anchored, FixedPoints, Lenses, adjust_anchored
 from ingest.colmap_bridge import Model
 from ingest.growth.refine import in_metres
 from ingest.joint.adjusted_map import adjusted_map, precision_of
@@ -73,11 +73,10 @@ def adjust_together(
         joined.model,
         joined.keypoints,
         FixedPoints.none(),
-        np.unique(joined.model.camera_of[constant]).tolist(),
+        Lenses(held=np.unique(joined.model.camera_of[constant]).tolist(), focal_px=joined.known_focal_px),
         options.adjust,
-        joined.known_focal_px,
-        constant_photos=constant.tolist(),
-        constant_points=np.unique(
+        held_photos=constant.tolist(),
+        held_points=np.unique(
             np.concatenate([np.zeros(0, np.int64), *(joined.maps[a].point_of for a in kept)])
         ).tolist(),
     )

@@ -40,7 +40,7 @@ class JointOptions:
     sigmas: float = 3.0
     least_move_m: float = 0.05
     links: LinkOptions = field(default_factory=LinkOptions)
-    adjust: AnchoredOptions = field(default_factory=lambda: AnchoredOptions(rounds=3))
+    adjust: AnchoredOptions = field(default_factory=lambda: AnchoredOptions())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -319,10 +319,14 @@ def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
 def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, area: IndexedArea) -> None:
     found, _ = localise_photos(new.photos, range(2), new.features_of, [area])
     away = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.05, 1.5, 0.0, 0.0]))
-    found[1] = replace(found[1], cam_from_local=away.act_on_pose(found[1].cam_from_local))
+    found[1] = replace(
+        found[1],
+        cam_from_local=away.act_on_pose(found[1].cam_from_local),
+        points=away.act(found[1].points),
+    )
     grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
     assert not grown.maps
-    assert [r.reason for r in grown.refused] == ["RESIDUALS"]
+    assert [r.reason for r in grown.refused] == ["TOO_FEW_AGREE"]
 
 
 @pytest.mark.parametrize(("bystanders", "enough"), [(1, False), (2, True)])

@@ -169,7 +169,7 @@ def of_another_scene(metres: float) -> FeatureMap:
     return with_pixels(other, pixels)
 
 
-@pytest.mark.parametrize(("metres", "reason"), [(0.6, "RESIDUALS"), (1.5, "OBSERVATIONS_LOST")])
+@pytest.mark.parametrize(("metres", "reason"), [(0.8, "RESIDUALS"), (1.5, "OBSERVATIONS_LOST")])
 def test_maps_that_contradict_each_other_are_refused(metres: float, reason: str) -> None:
     """No poses and points fit both; the robust loss would rather leave one's observations out."""
     maps = [strip_map("anchor", 40.0), of_another_scene(metres)]

@@ -20,6 +20,7 @@ from featuredb.adjust.terms import (
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from ingest.precision import linearise
 
 WIDTHS = LensWidths(focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.05, tangential=0.003)
 TRUE = Camera(
@@ -201,6 +202,38 @@ def test_what_is_held_stays_and_has_no_covariance() -> None:
     assert not covariance.pose(3).any()
     assert not covariance.lens(0).any()
     assert np.linalg.norm(found.cam_from_block[4].center - block.cam_from_block[4].center) > 0
+
+
+def test_a_photo_that_sees_marks_alone_is_placed_by_them() -> None:
+    """COLMAP makes no parameters of a photo without points; its covariance is that of a resection."""
+    block = _block(noise_px=0.0)
+    rng = np.random.default_rng(3)
+    xyz = block.xyz[np.unique(block.point_of[block.photo_of == 2])]
+    true = block.cam_from_block[2]
+    xy = TRUE.project(true.act(xyz))
+    others = block.photo_of != 2
+    poses = list(block.cam_from_block)
+    poses[2] = Rigid3.exp(rng.normal(0, 0.01, 6)) @ true
+    block = replace(
+        block,
+        cam_from_block=tuple(poses),
+        point_of=block.point_of[others],
+        photo_of=block.photo_of[others],
+        xy=block.xy[others],
+    )
+    marks = Marks(xyz=xyz, photo_of=np.full(len(xyz), 2), xy=xy, sigma_px=0.5)
+    terms = Terms(keypoint_px=0.5, lenses=(None,), marks=marks, held_photos=(0, 1))
+    problem = Problem(replace(block, cameras=(TRUE,)), terms)
+    problem.solve(50, 1e-14)
+    found = problem.block()
+    assert np.abs((found.cam_from_block[2] @ true.inverse()).log()).max() < 1e-6
+    by_pose = linearise(
+        [TRUE], np.zeros(1, np.int64), [true], xyz, np.arange(len(xyz)), 0 * marks.photo_of, xy
+    )
+    rows = by_pose.by_pose.reshape(-1, 6) / 0.5
+    np.testing.assert_allclose(
+        problem.marginals().pose(2), np.linalg.inv(rows.T @ rows), rtol=1e-3, atol=1e-9
+    )
 
 
 def test_points_go_where_their_priors_want_them() -> None:

@@ -12,6 +12,7 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_anchored import (
     AnchoredOptions,
     FixedPoints,
+    Lenses,
     adjust_anchored,
     triangulate_posed,
     with_observations,
@@ -19,9 +20,9 @@ from ingest.colmap_anchored import (
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView
 from ingest.register.gps import similarity_closed_form
 from tests.support.new_photos import NewPhotos, take_photos
-from tests.support.scenes import CAMERA, box_points, random_descriptors, ring
+from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors, ring
 
-OPTIONS = AnchoredOptions()
+OPTIONS, HELD = AnchoredOptions(), Lenses(held=[0])
 UNMOVED = Sim3.identity()
 
 
@@ -76,7 +77,9 @@ def test_fixed_points_hold_poses_and_points(scene: tuple[NewPhotos, FloatArray])
     new, points = scene
     keypoints = list(new.keypoints().values())
     before = centers_off(new.model, new)
-    done = adjust_anchored(without(new, 40), keypoints, fixed_of(new, points, 40, (0, 1, 2, 3)), [0], OPTIONS)
+    done = adjust_anchored(
+        without(new, 40), keypoints, fixed_of(new, points, 40, (0, 1, 2, 3)), HELD, OPTIONS
+    )
     assert before.max() > 0.15
     assert centers_off(done.model, new).max() < 0.03
     assert done.fixed_kept.all()
@@ -93,7 +96,7 @@ def test_points_that_one_photo_sees_hold_it_too(scene: tuple[NewPhotos, FloatArr
         fixed, point_of=fixed.point_of[own], photo_of=fixed.photo_of[own], pixels=fixed.pixels[own]
     )
     assert np.bincount(alone.point_of).max() == 1
-    done = adjust_anchored(without(new, 40), list(new.keypoints().values()), alone, [0], OPTIONS)
+    done = adjust_anchored(without(new, 40), list(new.keypoints().values()), alone, HELD, OPTIONS)
     assert centers_off(done.model, new).max() < 0.08
 
 
@@ -103,7 +106,7 @@ def test_fixed_points_that_do_not_fit_are_dropped(scene: tuple[NewPhotos, FloatA
     wrong = fixed.point_of < 5
     pixels = fixed.pixels + np.where(wrong[:, None], 50.0, 0.0)
     done = adjust_anchored(
-        without(new, 40), list(new.keypoints().values()), replace(fixed, pixels=pixels), [0], OPTIONS
+        without(new, 40), list(new.keypoints().values()), replace(fixed, pixels=pixels), HELD, OPTIONS
     )
     assert not done.fixed_kept[wrong].any()
     assert done.fixed_kept[~wrong].mean() > 0.95
@@ -117,14 +120,14 @@ def test_a_free_lens_is_found_and_a_constant_one_stays(scene: tuple[NewPhotos, F
     fixed = fixed_of(new, points, 40, (0, 1, 2, 3))
     keypoints = list(new.keypoints().values())
     wide = replace(OPTIONS, max_error_px=40.0)
-    free = adjust_anchored(model, keypoints, fixed, [], wide).model.cameras[0]
+    free = adjust_anchored(model, keypoints, fixed, Lenses(), wide).model.cameras[0]
     assert free.focal_px == pytest.approx(CAMERA.focal_px, abs=2.0)
-    assert adjust_anchored(model, keypoints, fixed, [0], wide).model.cameras[0] == off
+    assert adjust_anchored(model, keypoints, fixed, HELD, wide).model.cameras[0] == off
 
 
 def test_without_fixed_points_the_first_photo_stays(scene: tuple[NewPhotos, FloatArray]) -> None:
     new, _ = scene
-    done = adjust_anchored(new.model, list(new.keypoints().values()), FixedPoints.none(), [0], OPTIONS)
+    done = adjust_anchored(new.model, list(new.keypoints().values()), FixedPoints.none(), HELD, OPTIONS)
     first, before = done.model.cam_from_sfm[0], new.model.cam_from_sfm[0]
     assert np.abs((first @ before.inverse()).log()).max() < 1e-9
     truth = np.array([p.center for p in new.poses])
@@ -171,3 +174,84 @@ def _essential(a: Rigid3, b: Rigid3) -> FloatArray:
     relative = b @ a.inverse()
     x, y, z = relative.translation
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative.rotation
+
+
+def nadir_line(seed: int) -> NewPhotos:
+    """Photos straight down on nearly flat ground: focal length and height are one."""
+    rng = np.random.default_rng(seed)
+    points = np.column_stack([rng.uniform(-60, 60, 500), rng.uniform(-25, 25, 500), rng.uniform(0, 1, 500)])
+    spots = [np.array([-24.0 + 12.0 * k, 0.0, 0.0]) for k in range(5)]
+    return take_photos(
+        rng,
+        points,
+        random_descriptors(rng, len(points)),
+        [looking_at(spot + np.array([0.0, -0.1, 40.0]), spot) for spot in spots],
+        sfm_from_local=Sim3.identity(),
+        noise_px=0.5,
+        point_noise_m=0.1,
+        pose_noise_m=0.1,
+    )
+
+
+def focal_after(new: NewPhotos, start_px: float, lenses: Lenses) -> float:
+    camera = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(start_px, 500.0, 400.0, 0.0))
+    wide = replace(OPTIONS, max_error_px=60.0)
+    model = replace(new.model, cameras=(camera,))
+    done = adjust_anchored(model, list(new.keypoints().values()), FixedPoints.none(), lenses, wide)
+    return done.model.cameras[0].focal_px
+
+
+@pytest.mark.parametrize("known", [Lenses(focal_px={0: CAMERA.focal_px}), Lenses(lent={0: CAMERA})])
+def test_over_flat_ground_what_is_known_of_a_lens_decides(known: Lenses) -> None:
+    for seed in range(2):
+        new = nadir_line(seed)
+        free = focal_after(new, 1.1 * CAMERA.focal_px, Lenses())
+        held = focal_after(new, 1.1 * CAMERA.focal_px, known)
+        assert abs(held / CAMERA.focal_px - 1.0) < 0.005
+        assert abs(free / CAMERA.focal_px - 1.0) > 4.0 * abs(held / CAMERA.focal_px - 1.0)
+
+
+def test_a_wrong_focal_length_of_exif_loses_to_photos_that_know() -> None:
+    """Photos from many directions tell the focal length; EXIF names that of another mode of the camera."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform((-15, -15, 0), (15, 15, 12), (400, 3))
+    around = zip(np.arange(6), (8, 25) * 3, strict=True)
+    places = [np.array([40 * np.cos(a), 40 * np.sin(a), h]) for a, h in around]
+    new = take_photos(
+        rng,
+        points,
+        random_descriptors(rng, len(points)),
+        [looking_at(place, np.array([0.0, 0.0, 5.0])) for place in places],
+        sfm_from_local=Sim3.identity(),
+        noise_px=0.5,
+        point_noise_m=0.05,
+        pose_noise_m=0.05,
+    )
+    wrong = Lenses(focal_px={0: 1.3 * CAMERA.focal_px})
+    assert focal_after(new, 1.05 * CAMERA.focal_px, wrong) == pytest.approx(CAMERA.focal_px, rel=0.005)
+
+
+def test_points_of_the_model_that_are_held_count_and_stay(scene: tuple[NewPhotos, FloatArray]) -> None:
+    """They place the photos that are free, whatever the photo that is held says of them."""
+    new, points = scene
+    model = new.model
+    world = np.array([new.world_of[k][f] for k, f in zip(model.photo_of, model.keypoint_of, strict=True)])
+    xyz = model.xyz.copy()
+    xyz[model.point_of] = points[world]
+    poses = (new.poses[0], *model.cam_from_sfm[1:])
+    known = replace(model, xyz=xyz, cam_from_sfm=poses)
+    held = np.unique(model.point_of[world < 40])
+    done = adjust_anchored(
+        known,
+        list(new.keypoints().values()),
+        FixedPoints.none(),
+        HELD,
+        OPTIONS,
+        held_photos=[0],
+        held_points=held.tolist(),
+    )
+    assert np.abs(done.model.cam_from_sfm[0].matrix() - new.poses[0].matrix()).max() < 1e-9
+    stayed = np.isin(done.old_point, held)
+    assert stayed.sum() > 30
+    np.testing.assert_array_equal(done.model.xyz[stayed], xyz[done.old_point[stayed]])
+    assert centers_off(done.model, new).max() < 0.03
