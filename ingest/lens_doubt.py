@@ -9,7 +9,7 @@ from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import CenterPriors, Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
-from ingest.colmap_adjust import AdjustOptions, lens_prior_of, block_variance_px2
+from ingest.colmap_adjust import AdjustOptions, block_variance_px2, lens_prior_of
 
 
 def lens_doubt(
