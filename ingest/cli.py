@@ -313,7 +313,10 @@ def _survey(args: argparse.Namespace) -> "Survey | None":
     from ingest.register.control.control_file import read_control_file
     from ingest.register.control.model import Survey
 
-    return Survey(file=read_control_file(args.gcp, args.gcp_crs), options=control_options(args))
+    return Survey(
+        file=read_control_file(args.gcp, args.gcp_crs),
+        options=control_options(args, keep_lens=args.keep_focal),
+    )
 
 
 def _given(**values: Any) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 
 _DAMPING = 1e-12  # relative; of directions that nothing determines
+_CONTROLLED = 1e-3  # least redundancy of a direction in which a residual says something of its observation
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,6 +75,50 @@ class Marginals:
         return self.shared[start : start + size, start : start + size]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Whitened:
+    """Residuals of c observations of d coordinates over their standard deviations, and what they may be.
+
+    Baarda, A testing procedure for use in geodetic networks, 1968: a residual is smaller than its
+    observation's error where few others control it. The trace of `covariance` is its share of the redundancy.
+
+    Attributes:
+        residual: (c, d) adjusted minus observed.
+        covariance: (c, d, d) of the residual; the unit matrix less what the adjusted unknowns take up.
+    """
+
+    residual: FloatArray
+    covariance: FloatArray
+
+    def without_it(self) -> FloatArray:
+        """(c, d) the residual, had the observation taken no part; 0 where nothing else controls it."""
+        share, axes = np.linalg.eigh(self.covariance)
+        along = np.einsum("cij,ci->cj", axes, self.residual)
+        along = np.where(share > _CONTROLLED, along / np.maximum(share, _CONTROLLED), 0.0)
+        return np.asarray(np.einsum("cij,cj->ci", axes, along))
+
+    def statistic(self) -> FloatArray:
+        """(c,) chi-square of d degrees of freedom where the observation is as good as stated."""
+        return np.asarray((self.residual * self.without_it()).sum(axis=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TargetMarginals:
+    """An adjustment's covariances where it has targets.
+
+    Attributes:
+        block: of poses and lenses.
+        points: (t,) the block's rows of the targets. point: (t, 3, 3) their covariances.
+        marks, survey: residuals, in the order of `featuredb.adjust.terms.Targets`.
+    """
+
+    block: Marginals
+    points: NDArray[np.int64]
+    point: FloatArray
+    marks: Whitened
+    survey: Whitened
+
+
 def marginals(
     jacobian: Any,
     points: NDArray[np.int64],
@@ -87,15 +132,66 @@ def marginals(
         jacobian: columns three for each of `points`, six for each of `poses` in COLMAP's perturbation, then
             the parameters of `lenses`.
     """
-    size = tuple(len(camera.params) for camera in block.cameras)
-    n = 3 * len(points)
+    return _marginals(_without_points(jacobian, len(points)), poses, lenses, block)
+
+
+def target_marginals(
+    jacobian: Any,
+    own: Any,
+    residual: FloatArray,
+    targets: NDArray[np.int64],
+    marks: int,
+    free: tuple[Sequence[int], Sequence[int]],
+    block: Block,
+) -> TargetMarginals:
+    """From the Jacobian of whitened residuals, of whose points the last are targets.
+
+    Args:
+        own: Jacobian of the targets' residuals, marks before surveyed points, by targets, poses and lenses.
+        residual: (r,) the targets' residuals, whitened.
+        targets: (t,) rows of the block's points. marks: how many.
+        free: photos and cameras that are not held.
+    """
+    size = 3 * len(targets)
+    plain = jacobian.shape[1] - own.shape[1]
+    covariance = _without_points(jacobian, plain // 3)
+    spread = own @ covariance
+
+    def whitened(first: int, last: int, axes: int) -> Whitened:
+        """Rows of observations of so many axes."""
+        taken = own[first:last].toarray().reshape(-1, axes, own.shape[1])
+        across = spread[first:last].reshape(taken.shape)
+        return Whitened(
+            residual=residual[first:last].reshape(-1, axes),
+            covariance=np.eye(axes) - np.einsum("cik,cjk->cij", across, taken),
+        )
+
+    return TargetMarginals(
+        block=_marginals(covariance[size:, size:], *free, block),
+        points=targets,
+        point=np.array([covariance[i : i + 3, i : i + 3] for i in range(0, size, 3)]),
+        marks=whitened(0, 2 * marks, 2),
+        survey=whitened(2 * marks, len(residual), 3),
+    )
+
+
+def _without_points(jacobian: Any, points: int) -> FloatArray:
+    """(q, q) covariance of all but the first `points`, which are eliminated."""
+    n = 3 * points
     by_point, by_shared = jacobian[:, :n].tocsc(), jacobian[:, n:].tocsc()
-    inverse = _inverse_blocks((by_point.T @ by_point).tocoo(), len(points))
+    inverse = _inverse_blocks((by_point.T @ by_point).tocoo(), points)
     across = (by_point.T @ by_shared).tocsr()
     normal = (by_shared.T @ by_shared).toarray() - (across.T @ (inverse @ across)).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled = normal * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
-    covariance = cho_solve(cho_factor(scaled), np.eye(len(scale))) * scale[:, None] * scale
+    return np.asarray(cho_solve(cho_factor(scaled), np.eye(len(scale))) * scale[:, None] * scale)
+
+
+def _marginals(
+    covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block
+) -> Marginals:
+    """Of the covariance of poses, in COLMAP's perturbation, and lenses."""
+    size = tuple(len(camera.params) for camera in block.cameras)
     turn = _house_from_colmap([block.cam_from_block[k].translation for k in poses], len(covariance))
     pose_start = np.full(len(block.names), -1, dtype=np.int64)
     pose_start[list(poses)] = 6 * np.arange(len(poses))

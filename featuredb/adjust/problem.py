@@ -1,6 +1,7 @@
 """A block and its terms as COLMAP's bundle adjustment, to whose Ceres problem pyceres adds the terms."""
 
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,14 +12,23 @@ from pycolmap import cost_functions
 from scipy import sparse
 
 from featuredb.adjust.block import Block
-from featuredb.adjust.marginals import Marginals, marginals
-from featuredb.adjust.terms import CenterPriors, LensPrior, Marks, PointPriors, Terms
+from featuredb.adjust.marginals import Marginals, TargetMarginals, marginals, target_marginals
+from featuredb.adjust.terms import (
+    CenterPriors,
+    LensPrior,
+    Marks,
+    Orientations,
+    PointPriors,
+    Targets,
+    Terms,
+)
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 
 _LOG = logging.getLogger(__name__)
 _MAX_RADIUS = 1e10  # of Levenberg-Marquardt; without any damping what nothing determines is singular
 _LETS_GO = 2.0  # sigmas beyond which a lens prior loses to photos that know: EXIF of a cropped photo
+_ANYWHERE = 1e6  # units of the block: sigma of a position of which nothing is known
 _DENSE_SIZE = 1500  # shared parameters; above, the reduced system is factorised sparsely
 
 
@@ -60,6 +70,7 @@ class Problem:
         seen = np.unique(block.point_of)
         self._points = {int(p): self._reconstruction.point3D(int(p) + 1).xyz for p in seen}
         self._loss = pyceres.CauchyLoss(terms.keypoint_px)
+        self._targets: list[Any] = []  # residual blocks: the marks, then the surveyed points
         self._add_lenses(terms.lenses)
         if terms.marks is not None:
             self._add_marks(terms.marks)
@@ -67,10 +78,21 @@ class Problem:
             self._add_centers(terms.centers)
         if terms.points is not None:
             self._add_points(terms.points)
+        if terms.orientations is not None:
+            self._add_orientations(terms.orientations)
+        if terms.targets is not None:
+            self._add_targets(terms.targets)
 
-    def solve(self, max_iterations: int, function_tolerance: float) -> Any:
-        """Minimise; returns Ceres' summary."""
+    def solve(self, max_iterations: int, function_tolerance: float, radius: float | None = None) -> Any:
+        """Minimise; returns Ceres' summary.
+
+        Args:
+            radius: of the trust region to begin with. What hangs on a few terms, such as a whole block on its
+                control points, does not move before it is large.
+        """
         options = pyceres.SolverOptions()
+        if radius is not None:
+            options.initial_trust_region_radius = radius
         options.max_num_iterations = max_iterations
         options.function_tolerance = function_tolerance
         options.num_threads = self._threads
@@ -104,40 +126,63 @@ class Problem:
 
     def marginals(self) -> Marginals:
         """Covariances at the parameters as they are now, for independent residuals of the stated sigmas."""
-        photos = [
+        poses, lenses = self._free()
+        rows = list(self._points)
+        return marginals(
+            self._jacobian(rows, ()), np.array(rows, dtype=np.int64), poses, lenses, self.block()
+        )
+
+    def target_marginals(self) -> TargetMarginals:
+        """The same with the targets, and what their residuals may be."""
+        assert self._terms.targets is not None
+        poses, lenses = self._free()
+        targets = np.unique(self._terms.targets.point_of)
+        rows = [*np.setdiff1d(list(self._points), targets).tolist(), *targets.tolist()]
+        residual = self._ceres.evaluate_residuals(self._targets)
+        return target_marginals(
+            self._jacobian(rows, ()),
+            self._jacobian(targets.tolist(), self._targets),
+            np.asarray(residual) / self._terms.keypoint_px,
+            targets,
+            len(self._terms.targets.xy),
+            (poses, lenses),
+            self.block(),
+        )
+
+    def _free(self) -> tuple[list[int], list[int]]:
+        """Photos and cameras that are not held, and of which anything is observed."""
+        poses = [
             k for k, pose in enumerate(self._poses) if k not in self._terms.held_photos and self._has(pose)
         ]
-        cameras = [
+        lenses = [
             c
             for c, prior in enumerate(self._terms.lenses)
             if prior is not None and self._has(self._lenses[c])
         ]
-        rows = list(self._points)
-        order = pyceres.EvaluateOptions()
-        order.num_threads = self._threads
-        order.set_parameter_blocks(
-            [
-                *self._points.values(),
-                *(self._poses[k] for k in photos),
-                *(self._lenses[c] for c in cameras),
-            ]
-        )
-        found = self._ceres.evaluate_jacobian(order)
-        jacobian = sparse.csr_matrix(
-            (np.asarray(found.values), np.asarray(found.cols), np.asarray(found.rows)),
-            shape=(found.num_rows, found.num_cols),
-        )
-        return marginals(
-            jacobian / self._terms.keypoint_px,
-            np.array(rows, dtype=np.int64),
-            photos,
-            cameras,
-            self.block(),
-        )
+        return poses, lenses
 
     def _has(self, parameters: FloatArray) -> bool:
         """Whether anything is observed of them."""
         return bool(self._ceres.has_parameter_block(parameters))
+
+    def _jacobian(self, points: Sequence[int], residuals: Sequence[Any]) -> Any:
+        """Of the whitened residuals, or of some; columns of points, free poses and free lenses."""
+        poses, lenses = self._free()
+        order = pyceres.EvaluateOptions()
+        order.num_threads = self._threads
+        order.set_parameter_blocks(
+            [
+                *(self._points[row] for row in points),
+                *(self._poses[k] for k in poses),
+                *(self._lenses[c] for c in lenses),
+            ]
+        )
+        if residuals:
+            order.set_residual_blocks(list(residuals))
+        found = self._ceres.evaluate_jacobian(order)
+        shape = (found.num_rows, found.num_cols)
+        values, rows, columns = (np.asarray(v) for v in (found.values, found.rows, found.cols))
+        return sparse.csr_matrix((values, columns, rows), shape=shape) / self._terms.keypoint_px
 
     def _add_lenses(self, priors: tuple[LensPrior | None, ...]) -> None:
         unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
@@ -173,6 +218,38 @@ class Problem:
         ):
             cost = cost_functions.AbsolutePosePositionPriorCost(unit * covariance, xyz)
             self._ceres.add_residual_block(cost, self._loss, [self._poses[photo]])
+
+    def _add_orientations(self, priors: Orientations) -> None:
+        unit = 1.0 / self._terms.keypoint_px**2
+        for photo, rotation, covariance in zip(
+            priors.photo_of.tolist(), priors.cam_from_block, priors.covariance, strict=True
+        ):
+            whole = np.eye(6) * _ANYWHERE**2
+            whole[:3, :3] = unit * rotation @ covariance @ rotation.T
+            expected = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), self._poses[photo][4:])
+            cost = cost_functions.AbsolutePosePriorCost(whole, expected)
+            self._ceres.add_residual_block(cost, self._loss, [self._poses[photo]])
+
+    def _add_targets(self, targets: Targets) -> None:
+        for row in targets.point_of.tolist():
+            self._points.setdefault(row, self._block.xyz[row].copy())
+        unit = 1.0 / self._terms.keypoint_px**2
+        for point, photo, xy in zip(
+            targets.point_of.tolist(), targets.photo_of.tolist(), targets.xy, strict=True
+        ):
+            lens = int(self._block.camera_of[photo])
+            model = pycolmap.CameraModelId.__members__[self._block.cameras[lens].model]
+            cost = cost_functions.ReprojErrorCost(
+                camera_model_id=model, point2D_cov=unit * targets.sigma_px**2 * np.eye(2), point2D=xy
+            )
+            parameters = [self._points[point], self._poses[photo], self._lenses[lens]]
+            self._targets.append(self._ceres.add_residual_block(cost, None, parameters))
+        survey = targets.survey
+        for point, xyz, covariance in zip(
+            survey.point_of.tolist(), survey.xyz, unit * survey.covariance, strict=True
+        ):
+            cost = pyceres.factors.NormalPrior(xyz, covariance)
+            self._targets.append(self._ceres.add_residual_block(cost, None, [self._points[point]]))
 
 
 def _pose(params: FloatArray) -> Rigid3:

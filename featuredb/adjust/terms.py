@@ -83,17 +83,52 @@ class CenterPriors:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Orientations:
+    """Measured or assumed orientations of cameras.
+
+    Attributes:
+        photo_of: (c,) rows of the block's photos. cam_from_block: (c, 3, 3) rotations.
+        covariance: (c, 3, 3) square radians, of a turn about the block's axes; wide about an axis of which
+            nothing is known.
+    """
+
+    photo_of: NDArray[np.int64]
+    cam_from_block: FloatArray
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Targets:
+    """Points of the block that people marked in photos, and where a survey has them.
+
+    They keep a quadratic loss: tests on their residuals find the wrong ones (`Problem.target_marginals`).
+
+    Attributes:
+        point_of, photo_of: (c,) what each mark shows, and in which photo. xy: (c, 2) full-size pixels.
+        sigma_px: of a pixel coordinate.
+        survey: of some or all of the marked points.
+    """
+
+    point_of: NDArray[np.int64]
+    photo_of: NDArray[np.int64]
+    xy: FloatArray
+    sigma_px: float
+    survey: PointPriors
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Terms:
     """All that an adjustment is made of beside the block.
 
-    Everything counts with a Cauchy loss on its whitened residual, of one sigma, for lenses of two.
+    Everything but targets counts with a Cauchy loss on its whitened residual, of one sigma, for lenses of
+    two.
 
     Attributes:
         keypoint_px: standard deviation of a keypoint's coordinate.
         dilution: so many observations count as one against priors of lenses: what a lens model leaves over
             is common to whole photos.
         lenses: prior of each camera; a camera without one is held.
-        marks, points, centers: see there.
+        marks, points, centers, orientations, targets: see there.
         held_photos: rows of photos whose poses stay.
     """
 
@@ -103,6 +138,8 @@ class Terms:
     marks: Marks | None = None
     points: PointPriors | None = None
     centers: CenterPriors | None = None
+    orientations: Orientations | None = None
+    targets: Targets | None = None
     held_photos: tuple[int, ...] = field(default=())
 
 

@@ -72,7 +72,8 @@ def test_a_map_moves_to_its_control_points_and_back(
     assert np.linalg.norm(before.points_local() - truth, axis=1).min() > 5.0
     assert np.median(np.linalg.norm(after.points_local(FRAME) - truth, axis=1)) < 0.05
     centers = np.array([image.cam_from_local.center for image in after.images])
-    assert np.abs(centers - world.local_from_block.act(world.block.centers())).max() < 0.15
+    # The principal point is not known either, and trades against where the cameras stand.
+    assert np.abs(centers - world.local_from_block.act(world.block.centers())).max() < 0.2
     assert after.points.error_px.mean() < 0.6
     evidence = json.loads((tmp_path / "report" / "control.json").read_text())
     assert [m["used"] for m in evidence["marks"]].count(False) == 1

@@ -12,7 +12,9 @@ from featuredb.adjust.terms import (
     CenterPriors,
     LensWidths,
     Marks,
+    Orientations,
     PointPriors,
+    Targets,
     Terms,
     lens_prior,
     surface_priors,
@@ -261,3 +263,82 @@ def test_a_whole_lens_is_the_same_lens() -> None:
         np.testing.assert_allclose(whole.project(rays), lens.project(rays), atol=1e-9)
     fisheye = Camera.from_focal(800, 600, 400.0, "OPENCV_FISHEYE")
     assert whole_lens(replace(_block(), cameras=(fisheye,))).cameras == (fisheye,)
+
+
+def _with_targets(rng: np.random.Generator, without: int | None = None) -> tuple[Block, Terms, FloatArray]:
+    """A block whose first six points are marked in three photos each and surveyed, but for one perhaps."""
+    block = _block(points=80, noise_px=0.3)
+    photo_of, point_of = (a.ravel() for a in np.meshgrid(np.arange(3), np.arange(6)))
+    seen = [TRUE.project(block.cam_from_block[k].act(block.xyz[:6])) for k in range(3)]
+    xy = np.array(seen)[photo_of, point_of] + rng.normal(0, 1.0, (18, 2))
+    surveyed = block.xyz[:6] + rng.normal(0, 0.05, (6, 3))
+    kept = np.array([i for i in range(6) if i != without])
+    targets = Targets(
+        point_of=len(block.xyz) + point_of,
+        photo_of=photo_of,
+        xy=xy,
+        sigma_px=1.0,
+        survey=PointPriors(
+            point_of=len(block.xyz) + kept,
+            xyz=surveyed[kept],
+            covariance=np.tile(np.eye(3) * 0.05**2, (len(kept), 1, 1)),
+        ),
+    )
+    terms = Terms(keypoint_px=0.3, lenses=(lens_prior(TRUE, WIDTHS),), targets=targets)
+    start = block.xyz[:6] + rng.normal(0, 0.1, (6, 3))
+    return replace(block, xyz=np.concatenate([block.xyz, start])), terms, surveyed
+
+
+def test_a_residual_says_what_it_would_be_without_its_observation() -> None:
+    block, terms, surveyed = _with_targets(np.random.default_rng(3))
+    problem = Problem(block, terms)
+    problem.solve(100, 1e-14, 1e9)
+    found = problem.target_marginals()
+    # Of 18 marks of two and 6 points of three coordinates, less those points, a similarity and the lens.
+    redundancy = np.trace(found.marks.covariance, axis1=1, axis2=2).sum()
+    redundancy += np.trace(found.survey.covariance, axis1=1, axis2=2).sum()
+    assert 54 - 18 - 7 - 8 < redundancy < 54 - 18 - 7 + 0.1
+    told = found.survey.without_it()[2] * 0.05
+    assert np.linalg.norm(told) > np.linalg.norm(found.survey.residual[2] * 0.05)
+    block, terms, _ = _with_targets(np.random.default_rng(3), without=2)
+    problem = Problem(block, terms)
+    problem.solve(100, 1e-14, 1e9)
+    again = problem.block().xyz[80 + 2] - surveyed[2]
+    np.testing.assert_allclose(told, again, atol=0.003)
+    spread = np.sqrt(np.diag(problem.target_marginals().point[2]))
+    assert (np.abs(problem.block().xyz[82] - block.xyz[2]) < 4 * spread).all()
+
+
+def test_a_wrong_mark_has_the_largest_statistic() -> None:
+    block, terms, _ = _with_targets(np.random.default_rng(5))
+    assert terms.targets is not None
+    xy = terms.targets.xy.copy()
+    xy[7] += [9.0, -12.0]
+    problem = Problem(block, replace(terms, targets=replace(terms.targets, xy=xy)))
+    problem.solve(100, 1e-14, 1e9)
+    marks = problem.target_marginals().marks
+    assert int(np.argmax(marks.statistic())) == 7
+    np.testing.assert_allclose(marks.without_it()[7], [-9.0, 12.0], atol=5.0)
+
+
+def test_orientations_turn_a_block_that_nothing_else_holds() -> None:
+    """A tilt of five degrees that is known to one, from positions that know it to far less."""
+    block = _block(points=100)
+    turn = Rigid3.exp([np.radians(5.0), 0.0, 0.0, 0.0, 0.0, 0.0]).rotation
+    covariance = np.diag([np.radians(1.0) ** 2, np.radians(1.0) ** 2, 100.0])
+    terms = Terms(
+        keypoint_px=0.3,
+        lenses=(None,),
+        centers=CenterPriors(
+            photo_of=np.arange(8), xyz=block.centers(), covariance=np.tile(np.eye(3) * 1e4, (8, 1, 1))
+        ),
+        orientations=Orientations(
+            photo_of=np.arange(8),
+            cam_from_block=np.array([pose.rotation @ turn.T for pose in block.cam_from_block]),
+            covariance=np.tile(covariance, (8, 1, 1)),
+        ),
+    )
+    problem = Problem(block, terms)
+    problem.solve(200, 1e-14, 1e9)
+    up = problem.block().cam_from_block[0].rotation.T @ block.cam_from_block[0].rotation @ [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(up, turn @ [0.0, 0.0, 1.0], atol=1e-4)

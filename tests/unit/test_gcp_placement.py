@@ -43,7 +43,11 @@ def test_points_with_heights_place_the_block(world: SurveyedBlock) -> None:
     assert all(m.used for m in placed.marks)
     assert placed.local_from_block is not None
     difference = (placed.local_from_block @ LOCAL_FROM_BLOCK.inverse()).log()
-    assert np.abs(difference[:4]).max() < 0.004
+    # Over 4 m of relief the lens trades against the cameras' height, and the covariance says so.
+    assert placed.covariance is not None
+    assert (np.abs(difference) < 3.5 * np.sqrt(np.diag(placed.covariance))).all()
+    assert np.abs(difference[1:4]).max() < 0.004
+    assert abs(difference[0]) < 0.01
     # Surveyed 20 mm off: the residuals must show about that, and more for a point that takes no part.
     assert 0.01 < placed.residual_rms_m < 0.05
     for p in placed.points:

@@ -1,44 +1,44 @@
-"""Bundle adjustment of a block with control points (Triggs et al., 2000; sections 4 and 6).
+"""A block adjusted with control points as targets, in metres in the local frame.
 
-Unknowns: poses, lenses that enough photos share, control points, and a sample of the block's own points,
-which are eliminated (Schur complement). Observations: keypoints (Cauchy loss), marks, surveyed coordinates,
-and what is known of the vertical where heights are not. Surveyed coordinates are taken as distributed by
-Student's t with four degrees of freedom: a file does not tell how good they are, and satellite positions
-have long tails (Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989). Marks
-keep a quadratic loss: wrong ones are found by tests and left out (`ingest.register.control.snooping`).
+A file does not tell wrong marks and coordinates from right ones: they keep a quadratic loss here, and tests
+name and leave out the wrong ones (`ingest.register.control.snooping`).
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from featuredb.adjust.block import Block
-from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import point_jacobian
-from ingest.register.control.fit import Vertical
-from ingest.register.control.marks import Control
-from ingest.register.control.normal_system import (
-    Problem,
-    State,
-    Weights,
-    common_change,
-    cost_of,
-    linear_of,
-    mark_equations,
-    moved,
-    solve,
-    system_of,
-    trust_of,
+from featuredb.adjust.block import Block, whole_lens
+from featuredb.adjust.marginals import Whitened
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import (
+    LensPrior,
+    LensWidths,
+    Orientations,
+    PointPriors,
+    Targets,
+    Terms,
+    lens_prior,
 )
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.precision import linearise, shared_variance_px2
+from ingest.register.control.fit import Vertical, refine
+from ingest.register.control.marks import Control
+from ingest.register.control.rays import on_ground
 
-# Damping over the diagonal of the normal matrix. The block as a whole hangs on a few coordinates, a billionth
-# of what holds its photos together, so that any damping would keep it where it is: none to begin with.
-_MIN_DAMPING, _MAX_DAMPING = 1e-9, 1e4
-
-
-def _less(damping: float) -> float:
-    return 0.0 if damping <= 10.0 * _MIN_DAMPING else damping / 10.0
+_LOOSE_M = 1e4  # of a coordinate that nobody surveyed
+_LOOSE_RAD = 10.0  # of a heading
+_NEAREST = 20  # points of the block, of which that of most photos carries the height
+_LEAST_PX2 = 0.05**2  # of a variance: exact observations
+_TOLERANCE = 1e-7  # of the cost, relative: a hundredth of what a tenth of a sigma in all coordinates is
+_FOLLOW = (10, 1e-4)  # steps and relative cost: single points settle in three or four
+# A block hangs on a few coordinates, a billionth of what holds its photos together.
+_RADIUS = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,19 +46,42 @@ class AdjustOptions:
     """How the block is adjusted.
 
     Attributes:
-        points_per_photo: of the block's own points that take part, long tracks first; the others follow
-            the cameras afterwards. With 150 of a photo, a block is held as firmly as with all of them.
-        min_photos_of_camera: lenses of fewer photos are kept as they are.
         keep_lens: keep all lenses.
+        lens: around the lenses as the block has them.
+        dilution: so many observations of the size that residuals have with what neighbours share count as
+            one: what lens models leave over is common to whole photos.
+        ground_share: standard deviation of the ground's height under a single mark, over its distance.
+        points_per_photo: of the block's own points that take part, long tracks first, with the weight of all;
+            the others follow the cameras afterwards.
         max_iterations: of one adjustment.
-        tolerance: of the cost, a sum of squares over variances; a smaller step is far below one sigma.
     """
 
-    points_per_photo: int = 150
-    min_photos_of_camera: int = 8
     keep_lens: bool = False
-    max_iterations: int = 15
-    tolerance: float = 0.03
+    lens: LensWidths = field(
+        default_factory=lambda: LensWidths(
+            focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.1, tangential=0.003
+        )
+    )
+    dilution: float = 50.0
+    ground_share: float = 0.01
+    points_per_photo: int = 150
+    max_iterations: int = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weights:
+    """Standard deviations, and what takes part.
+
+    Attributes:
+        mark_px: of a mark's pixel coordinate. control_m: (3,) of a surveyed coordinate.
+        marks: (m,) bool: those that take part.
+        points: (n,) bool: those whose surveyed coordinates take part; the others only tie photos together.
+    """
+
+    mark_px: float
+    control_m: FloatArray
+    marks: NDArray[np.bool_]
+    points: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,97 +89,255 @@ class Adjusted:
     """An adjusted block, in metres in the local frame.
 
     Attributes:
-        block: with all its points.
-        control_xyz: (n, 3) of the control points; those that took no part lie where their marks say.
-        covariance: of the unknowns (poses, lenses, control points), in that order.
-        similarity: (7, 6 k) the similarity that a change of poses amounts to.
-        lens_columns: number of lens unknowns.
-        keypoint_px: robust standard deviation of a keypoint's coordinate.
-        mark_spread: (m, 2, 2) covariance of where the block shows the point of each mark, used or not.
-        trust: (n,) weight of each point's surveyed coordinates, 0 for those that took no part.
-        state: of the unknowns, to go on from.
+        block: as it is now. change: the similarity nearest to what became of it.
+        covariance: (7, 7) of its left perturbation.
+        control_xyz: (n, 3) of the control points, spread: (n, 3, 3) their covariances; NaN where no mark
+            that took part shows them.
+        marks: of the marks that took part, in their order.
+        survey: (n, 3) of the control points, found minus surveyed over sigma; 0 where nothing was surveyed.
+        weights: of this adjustment.
     """
 
     block: Block
-    control_xyz: FloatArray
+    change: Sim3
     covariance: FloatArray
-    similarity: FloatArray
-    lens_columns: int
+    control_xyz: FloatArray
+    spread: FloatArray
+    marks: Whitened
+    survey: Whitened
+    weights: Weights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Task:
+    """What all adjustments of a block have in common.
+
+    Attributes:
+        block: those points that take part; metres, in place but for small changes.
+        control_xyz: (n, 3) where the control points lie in it.
+        ground: (m, 3) where the ray of each mark meets the block's ground, NaN where that is not known;
+            ground_m: (m,) how well. It holds points that one photo shows.
+        vertical: what is known of it in that frame.
+        keypoint_px: standard deviation of a keypoint's coordinate; weight_px: with which keypoints count.
+    """
+
+    block: Block
+    control: Control
+    control_xyz: FloatArray
+    ground: FloatArray
+    ground_m: FloatArray
+    vertical: Vertical | None
     keypoint_px: float
-    mark_spread: FloatArray
-    trust: FloatArray
-    state: State
-
-    def control_covariance(self, point: int) -> FloatArray:
-        """(3, 3) of a control point."""
-        start = 6 * len(self.block.names) + self.lens_columns + 3 * point
-        return np.asarray(self.covariance[start : start + 3, start : start + 3])
-
-    def placement_covariance(self) -> FloatArray:
-        """(7, 7) of the similarity that places the block."""
-        poses = 6 * len(self.block.names)
-        return np.asarray(self.similarity @ self.covariance[:poses, :poses] @ self.similarity.T)
+    weight_px: float
+    options: AdjustOptions
 
 
-def adjust(
-    block: Block,
+def task_of(
+    placed: Block,
     control: Control,
     control_xyz: FloatArray,
-    weights: Weights,
     vertical: Vertical | None,
     options: AdjustOptions,
-    previous: "Adjusted | None" = None,
-) -> Adjusted:
-    """Adjust a block that is in place already but for small changes.
+) -> Task:
+    """For a block in metres in the local frame, in place but for small changes."""
+    chosen = _sample(placed, options.points_per_photo)
+    variance_px2 = _shared_variance_px2(chosen)
+    share = len(chosen.xy) / len(placed.xy)
+    ground = np.full((len(control.marks), 3), np.nan)
+    for row, (photo, xy) in enumerate(zip(control.photo_of.tolist(), control.xy, strict=True)):
+        met = on_ground(placed, photo, xy)
+        ground[row] = np.nan if met is None else met
+    centers = placed.centers()[control.photo_of]
+    return Task(
+        block=chosen if options.keep_lens else whole_lens(chosen),
+        control=control,
+        control_xyz=control_xyz,
+        ground=ground,
+        ground_m=options.ground_share * np.linalg.norm(ground - centers, axis=1),
+        vertical=vertical,
+        keypoint_px=float(np.sqrt(variance_px2)),
+        weight_px=float(np.sqrt(variance_px2 * max(1.0, options.dilution * share))),
+        options=options,
+    )
+
+
+def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Adjusted:
+    """Adjust a block.
 
     Args:
-        block: metres, local frame; `vertical` is in that frame, too.
-        control_xyz: (n, 3) where the control points lie in the block.
-        previous: of the same block under other weights, to go on from.
+        previous: under other weights, to go on from.
     """
-    problem = _problem(block, control, control_xyz, weights, vertical, options)
-    state, damping = problem.start if previous is None else previous.state, 0.0
-    cost = cost_of(problem, state)
-    for _ in range(options.max_iterations):
-        system, accepted = system_of(problem, state), False
-        while not accepted and damping < _MAX_DAMPING:
-            candidate = moved(problem, state, *solve(system, damping))
-            new_cost = cost_of(problem, candidate)
-            accepted = new_cost <= cost
-            damping = _less(damping) if accepted else max(10.0 * damping, _MIN_DAMPING)
-        if not accepted:
-            break
-        converged = cost - new_cost <= options.tolerance
-        state, cost = candidate, new_cost
-        if converged:
-            break
-    covariance = _inverse(system_of(problem, state).reduced)
-    everything = replace(
-        block,
-        cameras=state.cameras,
-        cam_from_block=state.poses,
-        xyz=block.xyz,
+    control, options, used = task.control, task.options, weights.points
+    block, xyz, vertical, change = task.block, task.control_xyz, task.vertical, Sim3.identity()
+    if previous is not None:
+        block, change = previous.block, previous.change
+        lost = np.isnan(previous.control_xyz)
+        xyz = np.where(lost, change.act(xyz), previous.control_xyz)
+        vertical = None if vertical is None else vertical.moved(change)
+    move = refine(Sim3.identity(), xyz[used], control.surveyed[used], vertical, weights.control_m)
+    start, xyz, vertical = (
+        block.moved(move),
+        move.act(xyz),
+        None if vertical is None else vertical.moved(move),
     )
+    count = len(start.xyz)
+    located = np.unique(control.point_of[weights.marks])
+    terms = Terms(
+        keypoint_px=task.weight_px,
+        lenses=tuple(_lens_prior(camera, options) for camera in task.block.cameras),
+        orientations=None if vertical is None else _upright(start, vertical),
+        points=None if vertical is None else _anchor(start, vertical),
+        targets=Targets(
+            point_of=count + control.point_of[weights.marks],
+            photo_of=control.photo_of[weights.marks],
+            xy=control.xy[weights.marks],
+            sigma_px=weights.mark_px,
+            survey=_survey(task, move @ change, xyz, weights),
+        ),
+    )
+    problem = Problem(replace(start, xyz=np.concatenate([start.xyz, xyz])), terms)
+    problem.solve(options.max_iterations, _TOLERANCE, _RADIUS)
+    everything, found = problem.block(), problem.target_marginals()
+    adjusted = replace(everything, xyz=everything.xyz[:count])
+    by_poses = similarity_of_change(adjusted)
+    poses = 6 * len(adjusted.names)
     return Adjusted(
-        block=_with_all_points(everything, problem, state),
-        control_xyz=state.control,
-        covariance=covariance,
-        similarity=problem.similarity,
-        lens_columns=sum(len(columns) for _, columns in problem.free),
-        keypoint_px=problem.keypoint_px,
-        mark_spread=_mark_spread(problem, state, covariance),
-        trust=np.where(weights.points, trust_of(problem, state), 0.0),
-        state=state,
+        block=adjusted,
+        change=_common_change(start, adjusted) @ move @ change,
+        covariance=by_poses @ found.block.shared[:poses, :poses] @ by_poses.T,
+        control_xyz=_of_all(everything.xyz[count:][located], located, len(used), np.nan),
+        spread=_of_all(found.point, located, len(used), np.nan),
+        marks=found.marks,
+        survey=Whitened(
+            residual=_of_all(found.survey.residual, located, len(used), 0.0),
+            covariance=_of_all(found.survey.covariance, located, len(used), 0.0),
+        ),
+        weights=weights,
     )
 
 
-def _mark_spread(problem: Problem, state: State, covariance: FloatArray) -> FloatArray:
-    everything = replace(
-        problem, weights=replace(problem.weights, marks=np.ones(len(problem.control.marks), dtype=bool))
+def with_all_points(placed: Block, adjusted: Adjusted, task: Task) -> Block:
+    """All of the block: points that took no part follow the cameras."""
+    start = replace(
+        adjusted.block,
+        xyz=adjusted.change.act(placed.xyz),
+        point_of=placed.point_of,
+        photo_of=placed.photo_of,
+        xy=placed.xy,
     )
-    _, jacobian = mark_equations(everything, state, len(covariance))
-    rows = np.asarray(jacobian.todense()).reshape(-1, 2, len(covariance))
-    return np.asarray(np.einsum("mik,kl,mjl->mij", rows, covariance, rows, optimize=True))
+    held = Terms(
+        keypoint_px=task.weight_px,
+        lenses=(None,) * len(start.cameras),
+        held_photos=tuple(range(len(start.names))),
+    )
+    problem = Problem(start, held)
+    problem.solve(*_FOLLOW)
+    return problem.block()
+
+
+def _sample(block: Block, per_photo: int) -> Block:
+    """The block with so many points of each photo only, those of its longest tracks."""
+    lengths = np.bincount(block.point_of, minlength=len(block.xyz))
+    kept = np.zeros(len(block.xyz), dtype=bool)
+    order = np.argsort(-lengths[block.point_of], kind="stable")
+    for photo in range(len(block.names)):
+        mine = order[block.photo_of[order] == photo]
+        kept[block.point_of[mine[:per_photo]]] = True
+    kept &= lengths >= 2
+    rows = kept[block.point_of]
+    index = np.cumsum(kept) - 1
+    return replace(
+        block,
+        xyz=block.xyz[kept],
+        point_of=index[block.point_of[rows]],
+        photo_of=block.photo_of[rows],
+        xy=block.xy[rows],
+    )
+
+
+def _lens_prior(camera: Camera, options: AdjustOptions) -> LensPrior | None:
+    return None if options.keep_lens else lens_prior(camera, options.lens)
+
+
+def _of_all(values: FloatArray, rows: NDArray[np.int64], count: int, otherwise: float) -> FloatArray:
+    """Values (r, ...) of some rows among those of all."""
+    result = np.full((count, *values.shape[1:]), otherwise)
+    result[rows] = values
+    return result
+
+
+def _survey(task: Task, change: Sim3, xyz: FloatArray, weights: Weights) -> PointPriors:
+    """Surveyed coordinates of the located points (n, 3), else the ground's height, else next to nothing."""
+    expected, sigma = xyz.copy(), np.full(xyz.shape, _LOOSE_M)
+    rows = np.flatnonzero(weights.marks)
+    point_of = task.control.point_of[rows]
+    alone = (np.bincount(point_of)[point_of] == 1) & np.isfinite(task.ground_m[rows])
+    expected[point_of[alone], 2] = change.act(task.ground[rows[alone]])[:, 2]
+    sigma[point_of[alone], 2] = task.ground_m[rows[alone]]
+    known = np.isfinite(task.control.surveyed) & weights.points[:, None]
+    expected = np.where(known, task.control.surveyed, expected)
+    sigma = np.where(known, weights.control_m, sigma)
+    located = np.unique(point_of)
+    return PointPriors(
+        point_of=len(task.block.xyz) + located,
+        xyz=expected[located],
+        covariance=np.array([np.diag(s**2) for s in sigma[located]]),
+    )
+
+
+def _upright(start: Block, vertical: Vertical) -> Orientations:
+    """The tilt of the whole block, shared out among its photos."""
+    up = vertical.up_block
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(axis))
+    upright = so3_exp(axis * (np.arctan2(length, up[2]) / length)) if length > 0 else np.eye(3)
+    by_tilt = np.array([[0.0, -1.0], [1.0, 0.0]])  # the turn about east and north that tilts so
+    covariance = np.diag([0.0, 0.0, _LOOSE_RAD**2])
+    covariance[:2, :2] = len(start.names) * by_tilt @ vertical.tilt_covariance @ by_tilt.T
+    return Orientations(
+        photo_of=np.arange(len(start.names)),
+        cam_from_block=np.array([pose.rotation @ upright.T for pose in start.cam_from_block]),
+        covariance=np.tile(covariance, (len(start.names), 1, 1)),
+    )
+
+
+def _anchor(start: Block, vertical: Vertical) -> PointPriors:
+    """The height of the block, at a point near to where it is known."""
+    anchor = vertical.anchor_block
+    seen = np.bincount(start.point_of, minlength=len(start.xyz))
+    rows = np.flatnonzero(seen > 0)
+    near = rows[cKDTree(start.xyz[rows]).query(anchor, k=min(_NEAREST, len(rows)))[1]]
+    row = int(near[np.argmax(seen[near])])
+    lift = np.array([0.0, 0.0, vertical.anchor_up_m - anchor[2]])
+    return PointPriors(
+        point_of=np.array([row]),
+        xyz=(start.xyz[row] + lift)[None],
+        covariance=np.diag([_LOOSE_M**2, _LOOSE_M**2, vertical.sigma_up_m**2])[None],
+    )
+
+
+def _shared_variance_px2(block: Block) -> float:
+    residuals = linearise(
+        block.cameras,
+        block.camera_of,
+        block.cam_from_block,
+        block.xyz,
+        block.point_of,
+        block.photo_of,
+        block.xy,
+    ).residual
+    seen = np.isfinite(residuals).all(axis=1)
+    side = max(max(camera.width, camera.height) for camera in block.cameras)
+    return max(shared_variance_px2(residuals[seen], block.xy[seen], block.photo_of[seen], side), _LEAST_PX2)
+
+
+def _common_change(before: Block, after: Block) -> Sim3:
+    """The similarity nearest to what became of all poses."""
+    changes = [
+        (now @ old.inverse()).log()
+        for now, old in zip(after.cam_from_block, before.cam_from_block, strict=True)
+    ]
+    return Sim3.exp(similarity_of_change(before) @ np.concatenate(changes))
 
 
 def similarity_of_change(block: Block) -> FloatArray:
@@ -193,92 +374,3 @@ def _depths(block: Block) -> FloatArray:
             for k in range(len(block.names))
         ]
     )
-
-
-def _problem(
-    block: Block,
-    control: Control,
-    control_xyz: FloatArray,
-    weights: Weights,
-    vertical: Vertical | None,
-    options: AdjustOptions,
-) -> Problem:
-    chosen = _sample(block, options.points_per_photo)
-    counts = np.bincount(block.camera_of, minlength=len(block.cameras))
-    free = tuple(
-        (index, camera.lens_parameters())
-        for index, camera in enumerate(block.cameras)
-        if counts[index] >= options.min_photos_of_camera and not options.keep_lens
-    )
-    lens_start = np.full(len(block.cameras), -1)
-    column = 6 * len(block.names)
-    for index, columns in free:
-        lens_start[index] = column
-        column += len(columns)
-    residual = linear_of(block.cameras, block.cam_from_block, chosen.xyz, chosen).residual
-    return Problem(
-        block=chosen,
-        control=control,
-        weights=weights,
-        vertical=vertical,
-        free=free,
-        lens_start=lens_start,
-        start=State(
-            poses=block.cam_from_block, cameras=block.cameras, control=control_xyz, points=chosen.xyz
-        ),
-        similarity=similarity_of_change(block),
-        keypoint_px=max(1.4826 * float(np.median(np.abs(residual))), 0.05),
-    )
-
-
-def _sample(block: Block, per_photo: int) -> Block:
-    """The block with so many points of each photo only, those of its longest tracks."""
-    lengths = np.bincount(block.point_of, minlength=len(block.xyz))
-    kept = np.zeros(len(block.xyz), dtype=bool)
-    order = np.argsort(-lengths[block.point_of], kind="stable")
-    for photo in range(len(block.names)):
-        mine = order[block.photo_of[order] == photo]
-        kept[block.point_of[mine[:per_photo]]] = True
-    kept &= lengths >= 2
-    rows = kept[block.point_of]
-    index = np.cumsum(kept) - 1
-    return replace(
-        block,
-        xyz=block.xyz[kept],
-        point_of=index[block.point_of[rows]],
-        photo_of=block.photo_of[rows],
-        xy=block.xy[rows],
-    )
-
-
-def _inverse(normal: FloatArray) -> FloatArray:
-    """Inverse of a positive definite matrix whose unknowns differ by orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    scaled = normal * scale[:, None] * scale
-    inverse = cho_solve(cho_factor(scaled + 1e-13 * np.eye(len(scaled))), np.eye(len(scaled)))
-    inverse = inverse * scale[:, None] * scale
-    return np.asarray((inverse + inverse.T) / 2)
-
-
-def _with_all_points(block: Block, problem: Problem, state: State) -> Block:
-    """The block with every point where the adjusted cameras see it.
-
-    Points first move with the cameras' common change and then by least squares on their own observations.
-    """
-    xyz = common_change(problem.similarity, problem.start.poses, state.poses).act(block.xyz)
-    for _ in range(3):
-        linear = linear_of(block.cameras, block.cam_from_block, xyz, block)
-        usable = np.isfinite(linear.residual).all(axis=1)
-        scaled = (linear.residual**2).sum(axis=1) / problem.keypoint_px**2
-        weight = np.where(usable, 1.0 / (1.0 + np.where(usable, scaled, 0.0)), 0.0)
-        by_point = np.nan_to_num(linear.by_point)
-        normal = np.zeros((len(xyz), 3, 3))
-        np.add.at(normal, linear.point_of, np.swapaxes(by_point, 1, 2) @ by_point * weight[:, None, None])
-        gradient = np.zeros((len(xyz), 3))
-        moment = np.einsum("mij,mi->mj", by_point, np.nan_to_num(linear.residual)) * weight[:, None]
-        np.add.at(gradient, linear.point_of, moment)
-        # Damped, so that points on nearly parallel rays keep their place along them.
-        trace = np.trace(normal, axis1=1, axis2=2)
-        normal += np.eye(3) * (1e-6 * np.maximum(trace, 1e-12))[:, None, None]
-        xyz = xyz + np.einsum("nij,nj->ni", np.linalg.inv(normal), gradient)
-    return replace(block, xyz=xyz)

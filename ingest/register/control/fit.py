@@ -10,7 +10,7 @@ Where heights are unknown only horizontal distances count; tilt and height come 
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,14 @@ class Vertical:
         rows[:2, 1:4] = self._whiten() @ by_rotation
         rows[2] = point_jacobian(local_from_block.act(self.anchor_block))[2] / self.sigma_up_m
         return rows
+
+    def moved(self, target_from_block: Sim3) -> "Vertical":
+        """The same of a block that has moved."""
+        return replace(
+            self,
+            up_block=target_from_block.rotation @ self.up_block,
+            anchor_block=target_from_block.act(self.anchor_block),
+        )
 
     def _whiten(self) -> FloatArray:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.tilt_covariance)))
@@ -177,7 +185,7 @@ def fit_similarity(
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical, options)
         chosen = _choose(found, lengths, len(surveyed), options.outlier_sigmas * sigma)
         inliers = lengths[chosen] <= options.outlier_sigmas * sigma
-        refined = _refine(sim, xyz[chosen][inliers], surveyed[inliers], vertical, sigma)
+        refined = refine(sim, xyz[chosen][inliers], surveyed[inliers], vertical, sigma)
         moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
         sim = refined
         if moved < 1e-6:
@@ -306,28 +314,25 @@ def _choose(
     return chosen
 
 
-def _refine(
-    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float
+def refine(
+    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float | FloatArray
 ) -> Sim3:
-    """Least squares on the tangent, with what is known of the vertical."""
+    """Least squares on the tangent, with what is known of the vertical.
+
+    Args:
+        xyz, surveyed: (n, 3), surveyed NaN where unknown. sigma_m: of surveyed coordinates, one or (3,).
+    """
     for _ in range(20):
-        normal, gradient = normal_equations(sim, xyz, surveyed, vertical, sigma_m)
-        step = np.linalg.lstsq(normal, gradient, rcond=1e-14)[0]
+        placed = sim.act(xyz)
+        known = np.isfinite(surveyed).ravel()
+        weight = np.broadcast_to(1.0 / np.asarray(sigma_m), surveyed.shape).ravel()[known]
+        jacobian = point_jacobian(placed).reshape(-1, 7)[known] * weight[:, None]
+        residual = (surveyed - placed).ravel()[known] * weight
+        if vertical is not None:
+            jacobian = np.vstack([jacobian, vertical.jacobian(sim)])
+            residual = np.concatenate([residual, -vertical.residual(sim)])
+        step = np.linalg.lstsq(jacobian, residual, rcond=1e-14)[0]
         sim = Sim3.exp(step) @ sim
         if np.abs(step).max() < 1e-10:
             break
     return sim
-
-
-def normal_equations(
-    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float
-) -> tuple[FloatArray, FloatArray]:
-    """Normal matrix (7, 7) and right-hand side (7,) of the left perturbation."""
-    placed = sim.act(xyz)
-    known = np.isfinite(surveyed).ravel()
-    jacobian = point_jacobian(placed).reshape(-1, 7)[known] / sigma_m
-    residual = (surveyed - placed).ravel()[known] / sigma_m
-    if vertical is not None:
-        jacobian = np.vstack([jacobian, vertical.jacobian(sim)])
-        residual = np.concatenate([residual, -vertical.residual(sim)])
-    return jacobian.T @ jacobian, jacobian.T @ residual

@@ -18,7 +18,7 @@ import numpy as np
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.adjust import Adjusted, AdjustOptions, adjust
+from ingest.register.control.adjust import Adjusted, AdjustOptions, Task, adjust, task_of, with_all_points
 from ingest.register.control.fit import (
     ControlFit,
     FitOptions,
@@ -29,7 +29,6 @@ from ingest.register.control.fit import (
 )
 from ingest.register.control.level import LevelOptions, level_ground
 from ingest.register.control.marks import Control
-from ingest.register.control.normal_system import common_change
 from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
 from ingest.register.control.snooping import Outcome, TestOptions, improve, initial_weights
 
@@ -219,31 +218,27 @@ def _adjusted_placement(
     placed = block.moved(fit.local_from_block)
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
     weights, xyz = initial_weights(placed, control, fit, options.sigma_m, options.test)
+    task = task_of(placed, control, xyz, local_vertical, options.adjust)
     outcome = improve(
-        placed,
         control,
-        xyz,
         weights,
-        lambda b, x, w, last: adjust(b, control, x, w, local_vertical, options.adjust, last),
+        lambda w, last: adjust(task, w, last),
         options.sigma_m is not None,
         options.test,
     )
     adjusted = outcome.adjusted
-    points, marks = residuals_of(adjusted, control, outcome)
+    points, marks = residuals_of(adjusted, control)
     covariance = _covariance(adjusted, free_height_m, outcome.freedom)
     placement = GcpPlacement(
         reason=None,
         message="placed by control points",
-        local_from_block=common_change(
-            adjusted.similarity, placed.cam_from_block, adjusted.block.cam_from_block
-        )
-        @ fit.local_from_block,
+        local_from_block=adjusted.change @ fit.local_from_block,
         covariance=covariance,
-        block=adjusted.block,
+        block=with_all_points(placed, adjusted, task),
         points=points,
         marks=marks,
         notes=tuple(notes),
-        figures=_figures(fit, outcome, adjusted, covariance, local_vertical, options),
+        figures=_figures(fit, outcome, covariance, task, options),
     )
     return _gate(placement, gps_local, gps_sigma_m, options)
 
@@ -259,21 +254,14 @@ def _in_place(
     if vertical is None:
         return None, 0.0
     free = not np.isfinite(control.surveyed[:, 2]).any()
-    return (
-        replace(
-            vertical,
-            up_block=local_from_block.rotation @ vertical.up_block,
-            anchor_block=local_from_block.act(vertical.anchor_block),
-            sigma_up_m=0.01 if free else vertical.sigma_up_m,
-        ),
-        vertical.sigma_up_m if free else 0.0,
-    )
+    sigma_up_m = 0.01 if free else vertical.sigma_up_m
+    placed = replace(vertical.moved(local_from_block), sigma_up_m=sigma_up_m)
+    return placed, vertical.sigma_up_m if free else 0.0
 
 
 def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> FloatArray:
     """(7, 7); a sigma estimated from few residuals is itself uncertain: Student's t instead of the normal."""
-    covariance = adjusted.placement_covariance()
-    covariance = covariance * (freedom / (freedom - 2.0) if freedom > 4 else 2.0)
+    covariance = adjusted.covariance * (freedom / (freedom - 2.0) if freedom > 4 else 2.0)
     covariance[6, 6] += free_height_m**2
     return np.asarray((covariance + covariance.T) / 2)
 
@@ -281,29 +269,29 @@ def _covariance(adjusted: Adjusted, free_height_m: float, freedom: float) -> Flo
 def _figures(
     fit: ControlFit,
     outcome: Outcome,
-    adjusted: Adjusted,
     covariance: FloatArray,
-    vertical: Vertical | None,
+    task: Task,
     options: GcpOptions,
 ) -> dict[str, Any]:
+    weights = outcome.adjusted.weights
     figures: dict[str, Any] = {
-        "points_used": int(outcome.weights.points.sum()),
-        "marks_used": int(outcome.weights.marks.sum()),
+        "points_used": int(weights.points.sum()),
+        "marks_used": int(weights.marks.sum()),
         "rounds": outcome.rounds,
         "degrees_of_freedom": outcome.freedom,
-        "control_sigma_m": outcome.weights.control_m.tolist(),
+        "control_sigma_m": weights.control_m.tolist(),
         "control_sigma_from": "options" if options.sigma_m is not None else "residuals",
-        "mark_sigma_px": outcome.weights.mark_px,
-        "keypoint_sigma_px": adjusted.keypoint_px,
+        "mark_sigma_px": weights.mark_px,
+        "keypoint_sigma_px": task.keypoint_px,
         "fit_sigma_m": fit.sigma_m,
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
-        "heights": "surveyed" if vertical is None else "unknown or too few",
+        "heights": "surveyed" if task.vertical is None else "unknown or too few",
         "options": asdict(options),
     }
-    if vertical is not None:
-        residual = vertical.residual(Sim3.identity())
-        figures["vertical"] = {"source": vertical.source, "tilt_at_fit_sigmas": residual[:2].tolist()}
+    if task.vertical is not None:
+        residual = task.vertical.residual(Sim3.identity())
+        figures["vertical"] = {"source": task.vertical.source, "tilt_at_fit_sigmas": residual[:2].tolist()}
     return figures
 
 

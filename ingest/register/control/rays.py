@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from ingest.precision import linearise
+from ingest.register.control.marks import Control
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near
 _MAX_DISTANCE_SHARE = 0.1  # of the photo's diagonal; further away the ground may be anything
@@ -56,14 +57,25 @@ def intersect(
     return xyz if _in_front(block, photos, xyz) else None
 
 
+def shown(block: Block, photos: NDArray[np.int64], xyz: FloatArray) -> FloatArray:
+    """Pixels (m, 2) at which m photos show places (m, 3) or one (3,); NaN behind a camera."""
+    places = np.broadcast_to(xyz, (len(photos), 3))
+    return np.array(
+        [
+            block.camera(p).project(block.cam_from_block[p].act(place[None]))[0]
+            for p, place in zip(photos.tolist(), places, strict=True)
+        ]
+    ).reshape(-1, 2)
+
+
 def mark_errors(block: Block, photos: NDArray[np.int64], xy: FloatArray, xyz: FloatArray) -> FloatArray:
     """Pixels (m,) from marks (m, 2) to where their photos show a place (3,); infinity behind a camera."""
-    errors = np.full(len(photos), np.inf)
-    for k, photo in enumerate(photos):
-        pixel = block.camera(int(photo)).project(block.cam_from_block[int(photo)].act(xyz))[0]
-        if np.isfinite(pixel).all():
-            errors[k] = np.linalg.norm(pixel - xy[k])
-    return errors
+    return np.asarray(np.nan_to_num(np.linalg.norm(shown(block, photos, xyz) - xy, axis=1), nan=np.inf))
+
+
+def mark_residuals(block: Block, control: Control, xyz: FloatArray) -> FloatArray:
+    """(m, 2) marks minus where the block shows their points (n, 3); NaN where it does not."""
+    return control.xy - shown(block, control.photo_of, xyz[control.point_of])
 
 
 def on_ground(block: Block, photo: int, xy: FloatArray) -> FloatArray | None:

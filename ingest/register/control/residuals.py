@@ -8,7 +8,8 @@ from featuredb.geometry.arrays import FloatArray
 from ingest.register.control.adjust import Adjusted
 from ingest.register.control.control_file import Mark
 from ingest.register.control.marks import Control
-from ingest.register.control.snooping import Outcome, leave_one_out, mark_linear
+from ingest.register.control.rays import mark_residuals, shown
+from ingest.register.control.snooping import left_out
 
 _SAME_TARGET_PX = 10.0  # a mark that near to where another point shows is that point's target
 
@@ -64,39 +65,26 @@ class MarkResidual:
 
 
 def residuals_of(
-    adjusted: Adjusted, control: Control, outcome: Outcome
+    adjusted: Adjusted, control: Control
 ) -> tuple[tuple[PointResidual, ...], tuple[MarkResidual, ...]]:
     """All residuals, those of what was left out included."""
-    points = tuple(_point(adjusted, control, outcome, p) for p in range(len(control.names)))
-    linear = mark_linear(adjusted, control)
-    places = np.array([p.found_m for p in points])
-    marks = tuple(
-        _mark(
-            adjusted,
-            control,
-            row,
-            linear.residual[row],
-            bool(outcome.weights.marks[row]),
-            places,
-        )
-        for row in range(len(control.marks))
-    )
-    return points, marks
+    points = tuple(_point(adjusted, control, p) for p in range(len(control.names)))
+    residuals = mark_residuals(adjusted.block, control, adjusted.control_xyz)
+    return points, tuple(_mark(adjusted, control, row, residuals[row]) for row in range(len(control.marks)))
 
 
-def _point(adjusted: Adjusted, control: Control, outcome: Outcome, point: int) -> PointResidual:
-    weights = outcome.weights
+def _point(adjusted: Adjusted, control: Control, point: int) -> PointResidual:
+    weights = adjusted.weights
     rows = control.marks_of(point)
     used = bool(weights.points[point])
-    located = bool(weights.marks[rows].any())
-    found = adjusted.control_xyz[point] if located else np.full(3, np.nan)
+    found = adjusted.control_xyz[point]
     residual = control.surveyed[point] - found
     single = np.array(residual)
     remark = ""
     if used:
         known = np.isfinite(control.surveyed[point])
         single = np.full(3, np.nan)
-        single[known] = leave_one_out(adjusted, control, weights, point).residual
+        single[known] = -left_out(adjusted, control, point)[0]
     elif np.isfinite(found).all():
         remark = (
             f"{control.names[point]} is {np.hypot(*residual[:2]):.2f} m off: probably wrong coordinates, or "
@@ -117,38 +105,24 @@ def _point(adjusted: Adjusted, control: Control, outcome: Outcome, point: int) -
     )
 
 
-def _mark(
-    adjusted: Adjusted,
-    control: Control,
-    row: int,
-    residual: FloatArray,
-    used: bool,
-    places: FloatArray,
-) -> MarkResidual:
-    mark, photo, point = control.marks[row], int(control.photo_of[row]), int(control.point_of[row])
-    pose, camera = adjusted.block.cam_from_block[photo], adjusted.block.camera(photo)
-    shown = np.full((len(places), 2), np.nan)
-    in_front = np.isfinite(places).all(axis=1)
-    shown[in_front] = camera.project(pose.act(places[in_front]))
+def _mark(adjusted: Adjusted, control: Control, row: int, residual: FloatArray) -> MarkResidual:
+    mark, used = control.marks[row], bool(adjusted.weights.marks[row])
     remark = ""
-    if not used and np.isfinite(places[point]).all():
+    if not used and np.isfinite(adjusted.control_xyz[control.point_of[row]]).all():
         remark = (
             f"mark of {mark.point} in {mark.photo} (line {mark.line}) is {np.hypot(*residual):.0f} px off: "
-            + _likely(control, row, shown)
+            + _likely(adjusted, control, row)
         )
-    return MarkResidual(
-        mark=mark,
-        residual_px=residual if np.isfinite(places[point]).all() else np.full(2, np.nan),
-        used=used,
-        remark=remark,
-    )
+    return MarkResidual(mark=mark, residual_px=residual, used=used, remark=remark)
 
 
-def _likely(control: Control, row: int, shown: FloatArray) -> str:
+def _likely(adjusted: Adjusted, control: Control, row: int) -> str:
     """What a wrong mark may be."""
-    distance = np.linalg.norm(shown - control.xy[row], axis=1)
+    photo = np.full(len(control.names), control.photo_of[row])
+    away = shown(adjusted.block, photo, adjusted.control_xyz) - control.xy[row]
+    distance = np.nan_to_num(np.linalg.norm(away, axis=1), nan=np.inf)
     distance[control.point_of[row]] = np.inf
-    other = int(np.nanargmin(np.where(np.isfinite(distance), distance, np.inf)))
+    other = int(np.argmin(distance))
     if distance[other] <= _SAME_TARGET_PX:
         return f"it lies on {control.names[other]}"
     return "probably the wrong target"
