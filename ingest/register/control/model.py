@@ -4,11 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import Placement
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
@@ -18,7 +15,7 @@ from ingest.register.control.control_file import ControlFile
 from ingest.register.control.evidence import gcp_evidence
 from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
-from ingest.register.control.registered_map import datum_of, vertical_of
+from ingest.register.control.registered_map import datum_of, gps_in, vertical_of
 from ingest.register.gps import GpsPlacement
 
 
@@ -78,7 +75,7 @@ def place_by_survey(
     vertical = None
     if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
         vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
-    gps, sigma = _gps(photos, where)
+    gps, sigma = gps_in(where, [photo.gps for photo in photos])
     placement = place_by_gcp(
         block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma
     )
@@ -110,13 +107,3 @@ def _map_placement(placement: GcpPlacement, evidence: dict[str, Any]) -> Placeme
         residual_rms_m=placement.residual_rms_m,
         evidence=evidence,
     )
-
-
-def _gps(photos: Sequence[Photo], frame: LocalFrame) -> tuple[FloatArray, float]:
-    gps = np.full((len(photos), 3), np.nan)
-    for row, photo in enumerate(photos):
-        if photo.gps is not None:
-            height = frame.height_m if photo.gps.height_m is None else photo.gps.height_m
-            gps[row] = frame.enu_from_geodetic((photo.gps.latitude_deg, photo.gps.longitude_deg, height))
-    sigmas = [p.gps.sigma_horizontal_m for p in photos if p.gps is not None]
-    return gps, float(np.median(sigmas)) if sigmas else 0.0

@@ -1,6 +1,6 @@
 """Control points place a map that is in the database already, or a reconstruction on its way there."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,7 @@ from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.control.control_file import ControlFile
@@ -61,7 +61,7 @@ def register_by_gcp(
     block = block_of_map(feature_map)
     control = meet(file, block, frame, other_photos)
     frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-    gps, sigma = gps_of_map(feature_map, frame)
+    gps, sigma = gps_in(frame, [image.gps for image in feature_map.images])
     placement = place_by_gcp(
         block,
         control,
@@ -139,15 +139,14 @@ def vertical_of(
     )
 
 
-def gps_of_map(feature_map: FeatureMap, frame: LocalFrame) -> tuple[FloatArray, float]:
+def gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, float]:
     """The photos' own positions (k, 3) in a frame, NaN where there is none, and their median sigma."""
-    gps = np.full((len(feature_map.images), 3), np.nan)
-    for row, image in enumerate(feature_map.images):
-        if image.gps is not None:
-            prior = image.gps
+    gps = np.full((len(priors), 3), np.nan)
+    for row, prior in enumerate(priors):
+        if prior is not None:
             height = frame.height_m if prior.height_m is None else prior.height_m
             gps[row] = frame.enu_from_geodetic((prior.latitude_deg, prior.longitude_deg, height))
-    sigmas = [i.gps.sigma_horizontal_m for i in feature_map.images if i.gps is not None]
+    sigmas = [prior.sigma_horizontal_m for prior in priors if prior is not None]
     return gps, float(np.median(sigmas)) if sigmas else 0.0
 
 
