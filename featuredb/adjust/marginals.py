@@ -84,22 +84,37 @@ class Whitened:
 
     Attributes:
         residual: (c, d) adjusted minus observed.
-        covariance: (c, d, d) of the residual; the unit matrix less what the adjusted unknowns take up.
+        together: (c d, c d) covariance of all; the unit matrix less what the adjusted unknowns take up.
     """
 
     residual: FloatArray
-    covariance: FloatArray
+    together: FloatArray
 
-    def without_it(self) -> FloatArray:
-        """(c, d) the residual, had the observation taken no part; 0 where nothing else controls it."""
-        share, axes = np.linalg.eigh(self.covariance)
-        along = np.einsum("cij,ci->cj", axes, self.residual)
-        along = np.where(share > _CONTROLLED, along / np.maximum(share, _CONTROLLED), 0.0)
-        return np.asarray(np.einsum("cij,cj->ci", axes, along))
+    @property
+    def covariance(self) -> FloatArray:
+        """(c, d, d) of each."""
+        count, axes = self.residual.shape
+        blocks = self.together.reshape(count, axes, count, axes)
+        return np.asarray(blocks[np.arange(count), :, np.arange(count)])
 
-    def statistic(self) -> FloatArray:
-        """(c,) chi-square of d degrees of freedom where the observation is as good as stated."""
-        return np.asarray((self.residual * self.without_it()).sum(axis=1))
+    def of(self, used: NDArray[np.bool_]) -> "Whitened":
+        """The used coordinates (c, d), each as an observation of its own."""
+        rows = np.flatnonzero(used)
+        return Whitened(
+            residual=self.residual.reshape(-1, 1)[rows], together=self.together[np.ix_(rows, rows)]
+        )
+
+    def left_out(self, rows: NDArray[np.int64]) -> tuple[FloatArray, "Whitened"]:
+        """Of observations of one coordinate: some had they taken no part, and then the others."""
+        others = np.setdiff1d(np.arange(len(self.residual)), rows)
+        share, axes = np.linalg.eigh(self.together[np.ix_(rows, rows)])
+        inverse = np.where(share > _CONTROLLED, 1.0 / np.maximum(share, _CONTROLLED), 0.0)
+        alone = axes @ (inverse * (axes.T @ self.residual[rows, 0]))
+        across = self.together[np.ix_(others, rows)]
+        return alone, Whitened(
+            residual=self.residual[others] - (across @ alone)[:, None],
+            together=self.together[np.ix_(others, others)] - (across @ axes * inverse) @ (across @ axes).T,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,11 +174,9 @@ def target_marginals(
 
     def whitened(first: int, last: int, axes: int) -> Whitened:
         """Rows of observations of so many axes."""
-        taken = own[first:last].toarray().reshape(-1, axes, own.shape[1])
-        across = spread[first:last].reshape(taken.shape)
         return Whitened(
             residual=residual[first:last].reshape(-1, axes),
-            covariance=np.eye(axes) - np.einsum("cik,cjk->cij", across, taken),
+            together=np.eye(last - first) - (own[first:last] @ spread[first:last].T),
         )
 
     return TargetMarginals(

@@ -298,7 +298,7 @@ def test_a_residual_says_what_it_would_be_without_its_observation() -> None:
     redundancy = np.trace(found.marks.covariance, axis1=1, axis2=2).sum()
     redundancy += np.trace(found.survey.covariance, axis1=1, axis2=2).sum()
     assert 54 - 18 - 7 - 8 < redundancy < 54 - 18 - 7 + 0.1
-    told = found.survey.without_it()[2] * 0.05
+    told = found.survey.of(np.ones((6, 3), bool)).left_out(np.arange(6, 9))[0] * 0.05
     assert np.linalg.norm(told) > np.linalg.norm(found.survey.residual[2] * 0.05)
     block, terms, _ = _with_targets(np.random.default_rng(3), without=2)
     problem = Problem(block, terms)
@@ -317,8 +317,14 @@ def test_a_wrong_mark_has_the_largest_statistic() -> None:
     problem = Problem(block, replace(terms, targets=replace(terms.targets, xy=xy)))
     problem.solve(100, 1e-14, 1e9)
     marks = problem.target_marginals().marks
-    assert int(np.argmax(marks.statistic())) == 7
-    np.testing.assert_allclose(marks.without_it()[7], [-9.0, 12.0], atol=5.0)
+    single = marks.of(np.ones((18, 2), bool))
+    alone = [single.left_out(2 * k + np.arange(2))[0] for k in range(18)]
+    assert int(np.argmax([a @ v for a, v in zip(alone, marks.residual, strict=True)])) == 7
+    np.testing.assert_allclose(alone[7], [-9.0, 12.0], atol=5.0)
+    # Without it the others fit each other: a chi-square of as many degrees as their redundancy.
+    others = single.left_out(14 + np.arange(2))[1]
+    assert (others.residual**2).sum() < 2.0 * np.trace(others.together)
+    assert (marks.residual**2).sum() > 4.0 * np.trace(marks.together)
 
 
 def test_orientations_turn_a_block_that_nothing_else_holds() -> None:

@@ -208,10 +208,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
         control_xyz=_of_all(everything.xyz[count:][located], located, len(used), np.nan),
         spread=_of_all(found.point, located, len(used), np.nan),
         marks=found.marks,
-        survey=Whitened(
-            residual=_of_all(found.survey.residual, located, len(used), 0.0),
-            covariance=_of_all(found.survey.covariance, located, len(used), 0.0),
-        ),
+        survey=_of_points(found.survey, located, len(used)),
         weights=weights,
     )
 
@@ -264,6 +261,14 @@ def _of_all(values: FloatArray, rows: NDArray[np.int64], count: int, otherwise: 
     result = np.full((count, *values.shape[1:]), otherwise)
     result[rows] = values
     return result
+
+
+def _of_points(survey: Whitened, located: NDArray[np.int64], count: int) -> Whitened:
+    """The same among all points."""
+    rows = (3 * located[:, None] + np.arange(3)).ravel()
+    together = np.zeros((3 * count, 3 * count))
+    together[np.ix_(rows, rows)] = survey.together
+    return Whitened(residual=_of_all(survey.residual, located, count, 0.0), together=together)
 
 
 def _survey(task: Task, change: Sim3, xyz: FloatArray, weights: Weights) -> PointPriors:

@@ -1,8 +1,8 @@
 """Which marks and points contradict the others: tests on the residuals of an adjustment.
 
 Baarda's data snooping with the variance estimated from the other residuals (Pope, The statistics of residuals
-and the detection of outliers, 1976): a residual is judged against its own standard deviation, which is small
-where nothing else controls it, and one observation is left out at a time.
+and the detection of outliers, 1976): an observation is compared with what the others predict for it, by the
+covariance of all residuals, and one is left out at a time.
 """
 
 import logging
@@ -125,14 +125,26 @@ def improve(
 
 
 def left_out(adjusted: Adjusted, control: Control, point: int) -> tuple[FloatArray, float]:
-    """A point's known coordinates, had they taken no part: (d,) found minus surveyed in metres, and by how
-    much the weighted sum of squares would be smaller."""
-    known = np.isfinite(control.surveyed[point])
-    part = Whitened(
-        residual=adjusted.survey.residual[point, known][None],
-        covariance=adjusted.survey.covariance[point][np.ix_(known, known)][None],
-    )
-    return adjusted.weights.control_m[known] * part.without_it()[0], float(part.statistic()[0])
+    """A point's known coordinates, had they taken no part: (d,) found minus surveyed in metres; and the
+    chance of a contradiction as large."""
+    used = np.isfinite(control.surveyed) & adjusted.weights.points[:, None]
+    rows = np.flatnonzero(np.flatnonzero(used) // 3 == point)
+    alone, chance = chance_of(adjusted.survey.of(used), rows)
+    return adjusted.weights.control_m[used[point]] * alone, chance
+
+
+def chance_of(residuals: Whitened, rows: NDArray[np.int64]) -> tuple[FloatArray, float]:
+    """Some residuals, had their observations taken no part, and the chance of one as large.
+
+    The variance is that of the others: an F test, exact for one variance of all (Pope).
+    """
+    alone, others = residuals.left_out(rows)
+    freedom = float(np.trace(others.together))
+    if freedom < 1.0:
+        return alone, 1.0  # nothing is left to judge by
+    variance = max(float((others.residual**2).sum()) / freedom, 1e-9)
+    statistic = float(alone @ residuals.residual[rows, 0]) / len(rows)
+    return alone, float(f_distribution.sf(statistic / variance, len(rows), freedom))
 
 
 def _mark_sigma(adjusted: Adjusted, options: TestOptions) -> float:
@@ -174,7 +186,7 @@ def _tested(adjusted: Adjusted, control: Control, freedom: float, options: TestO
         point = int(control.point_of[mark])
         points[point] &= marks[control.marks_of(point)].any()
         return replace(weights, marks=marks, points=points)
-    worst = _worst_point(adjusted, control, freedom, options)
+    worst = _worst_point(adjusted, control, options)
     if worst is not None:
         points[worst] = False
     return replace(weights, points=points)
@@ -195,28 +207,23 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float, options: Test
 
 
 def _worst_mark(adjusted: Adjusted, options: TestOptions) -> int | None:
-    weights, tested = adjusted.weights, adjusted.marks
-    rows = np.flatnonzero(weights.marks)
-    total = float((tested.residual**2).sum())
-    freedom = float(np.trace(tested.covariance, axis1=1, axis2=2).sum())
-    far = weights.mark_px * np.linalg.norm(tested.without_it(), axis=1) > options.min_mark_px
-    chances = [_chance(statistic, 2, total, freedom) for statistic in tested.statistic()]
-    return _least(
-        [(c, int(row)) for c, row, is_far in zip(chances, rows, far, strict=True) if is_far],
-        len(rows),
-        options,
-    )
+    rows = np.flatnonzero(adjusted.weights.marks)
+    residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
+    tests = []
+    for k, row in enumerate(rows.tolist()):
+        alone, chance = chance_of(residuals, 2 * k + np.arange(2))
+        if adjusted.weights.mark_px * float(np.linalg.norm(alone)) > options.min_mark_px:
+            tests.append((chance, row))
+    return _least(tests, len(rows), options)
 
 
-def _worst_point(adjusted: Adjusted, control: Control, freedom: float, options: TestOptions) -> int | None:
-    used = np.isfinite(control.surveyed) & adjusted.weights.points[:, None]
-    total = float((adjusted.survey.residual[used] ** 2).sum())
+def _worst_point(adjusted: Adjusted, control: Control, options: TestOptions) -> int | None:
     rows = np.flatnonzero(adjusted.weights.points)
     tests = []
     for point in rows.tolist():
-        residual, statistic = left_out(adjusted, control, point)
+        residual, chance = left_out(adjusted, control, point)
         if float(np.linalg.norm(residual)) > options.min_point_m:
-            tests.append((_chance(statistic, len(residual), total, freedom), point))
+            tests.append((chance, point))
     return _least(tests, len(rows), options)
 
 
@@ -224,18 +231,3 @@ def _least(tests: list[tuple[float, int]], count: int, options: TestOptions) -> 
     """The row of the least chance, where it is too small for so many tests."""
     chance, row = min(tests, default=(1.0, -1))
     return row if chance < options.significance / count else None
-
-
-def _chance(statistic: float, dimensions: int, total: float, freedom: float) -> float:
-    """Probability of a residual that large, the variance being estimated from the others.
-
-    Args:
-        statistic: squared residual over its covariance: by so much the sum of squares would be smaller, were
-            the observation left out.
-        total: sum of the squares of all; freedom: their redundancy.
-    """
-    rest = freedom - dimensions
-    if rest < 1.0:
-        return 1.0  # nothing is left to judge by
-    others = max(total - statistic, 1e-9)
-    return float(f_distribution.sf(statistic / dimensions / (others / rest), dimensions, rest))
