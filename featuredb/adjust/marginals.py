@@ -47,7 +47,7 @@ class Marginals:
             lens_dilution: so much less than their number says do the observations tell of lenses: what comes
                 from lenses grows by it.
         """
-        by_lens = self._from_lenses() if lens_dilution > 1.0 else np.zeros_like(self.shared)
+        by_lens = self.by_lenses()
         result = np.zeros((len(self.pose_start), 6, 6))
         for photo, start in enumerate(self.pose_start.tolist()):
             if start >= 0:
@@ -55,19 +55,13 @@ class Marginals:
                 result[photo] = self.shared[rows, rows] + (lens_dilution - 1.0) * by_lens[rows, rows]
         return result
 
-    def _from_lenses(self) -> FloatArray:
-        """What would be gone of the poses' covariance if the lenses were exact."""
+    def by_lenses(self) -> FloatArray:
+        """(6 k, 6 k) of the free poses' covariance: what would be gone if the lenses were exact."""
         first = 6 * int((self.pose_start >= 0).sum())
-        if first == len(self.shared):
-            return np.zeros_like(self.shared)
         across, lenses = self.shared[:first, first:], self.shared[first:, first:]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(lenses), 1e-300))
-        factor = cho_factor(lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale)))
-        return np.asarray((across * scale) @ cho_solve(factor, (across * scale).T))
-
-    def lens(self, camera: int) -> FloatArray:
-        """(p, p) of a camera's parameters; zero where they are held."""
-        return self._part(int(self.lens_start[camera]), self.lens_size[camera])
+        factor = lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
+        return np.asarray((across * scale) @ np.linalg.solve(factor, (across * scale).T))
 
     def _part(self, start: int, size: int) -> FloatArray:
         if start < 0:

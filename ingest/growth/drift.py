@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from featuredb.adjust.block import Block
-from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import Marks, Terms
 from featuredb.geometry.arrays import FloatArray
@@ -87,7 +86,7 @@ def photo_covariances(
         marks=replace(marks, sigma_px=sigma_px),
     )
     found = Problem(block, terms).marginals()
-    by_lenses = _by_lenses(found)
+    by_lenses = found.by_lenses()
     size = len(by_lenses)
     covariance = (found.shared[:size, :size] - by_lenses) / dilution + by_lenses
     seen = np.flatnonzero(found.pose_start >= 0)
@@ -109,15 +108,6 @@ def _variance_px2(block: Block, marks: Marks, options: DriftOptions) -> float:
     residuals, pixels, photo_of = residuals_of(block, marks)
     shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
     return max(float((residuals**2).mean()) * shared / freedom, options.least_px**2)
-
-
-def _by_lenses(found: Marginals) -> FloatArray:
-    """(6 k, 6 k) what poses lack because lenses do; gone if lenses are true."""
-    size = 6 * int((found.pose_start >= 0).sum())
-    if size == len(found.shared):
-        return np.zeros((size, size))
-    across = found.shared[:size, size:]
-    return np.asarray(across @ np.linalg.solve(found.shared[size:, size:], across.T))
 
 
 def _thinned(model: Model, options: DriftOptions) -> Model:

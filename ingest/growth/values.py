@@ -76,12 +76,6 @@ class LocalisedPhoto:
         if k and not 0 <= self.map_of.min() <= self.map_of.max() < len(self.map_ids):
             raise InvalidValueError("LocalisedPhoto.map_of: names a map that map_ids does not have")
 
-    def inliers_of(self, map_id: str) -> int:
-        """Number of inliers that are points of that map."""
-        if map_id not in self.map_ids:
-            return 0
-        return int((self.map_of == self.map_ids.index(map_id)).sum())
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edge:

@@ -72,11 +72,6 @@ class ControlFile:
         places.setflags(write=False)
         object.__setattr__(self, "lat_lon_h", places)
 
-    @property
-    def heights_known(self) -> int:
-        """Number of points whose height is known."""
-        return int(np.isfinite(self.lat_lon_h[:, 2]).sum())
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:

@@ -6,7 +6,6 @@ pairs by their own covariance and knows that all pairs of a frame share its pose
 not leave the evidence.
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -18,6 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
+from featuredb.stage_clock import StageClock
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
@@ -119,7 +119,7 @@ def project_structure(
         registered: frames with their poses in the cloud's local frame; one is enough.
     """
     options = options or StructureOptions()
-    clock = _Clock()
+    clock = StageClock()
     count = len(feature_map.points)
     if not registered:
         return _refused("NO_FRAMES", "no frame is registered to the scan", count, clock)
@@ -158,7 +158,7 @@ def _onto_surface(
     fit: SimilarityFit,
     cloud: PointCloud,
     figures: dict[str, Any],
-    clock: "_Clock",
+    clock: StageClock,
     options: StructureOptions,
 ) -> StructurePlacement:
     """The last step of an accepted similarity: GICP under its guard, and the residuals before and after."""
@@ -352,24 +352,11 @@ def _gicp_figures(outcome: GicpOutcome) -> dict[str, Any]:
     return {"accepted": outcome.accepted, "message": outcome.message, **outcome.figures}
 
 
-class _Clock:
-    """Wall time by step."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, step: str) -> None:
-        now = time.perf_counter()
-        self.seconds[step] = now - self._last
-        self._last = now
-
-
 def _refused(
     reason: StructureReason,
     message: str,
     points: int,
-    clock: _Clock,
+    clock: StageClock,
     pairs: Pairs | None = None,
     figures: dict[str, Any] | None = None,
     inliers: NDArray[np.bool_] | None = None,
