@@ -33,9 +33,8 @@ def lens_doubt(
     found = Problem(block, terms, options.threads).marginals()
     # Priors count `dilution` times in the problem; in truth observations count so much less.
     lenses = [options.dilution * found.lens(c) for c in range(len(block.cameras))]
-    return doubt_of_lenses(
-        block.cameras, lenses, np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    )
+    photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
+    return doubt_of_lenses(block.cameras, lenses, photos, options.dilution)
 
 
 def _any_scale(block: Block) -> CenterPriors:

@@ -20,10 +20,13 @@ class LensPrior:
 
     Attributes:
         mean, sigma: (4,) of SIMPLE_RADIAL's parameters or (8,) of OPENCV's.
+        dilution: so many observations count as one against it: what lens models leave over is common to whole
+            photos.
     """
 
     mean: FloatArray
     sigma: FloatArray
+    dilution: float = 1.0
 
     def __post_init__(self) -> None:
         for name in ("mean", "sigma"):
@@ -38,8 +41,8 @@ class LensPrior:
 
     @property
     def information(self) -> FloatArray:
-        """Inverse variances."""
-        return np.asarray(1.0 / self.sigma**2)
+        """Inverse variances, against observations that count in full."""
+        return np.asarray(self.dilution / self.sigma**2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,7 +128,7 @@ def seen_by_a_map(camera: Camera, doubt: LensDoubt) -> tuple[Camera, LensPrior] 
     sigma = np.array(
         [doubt.focal_rel * fx, cx, cy, doubt.radial[0], doubt.aspect, doubt.radial[1], *doubt.tangential]
     )
-    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT))
+    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT), dilution=doubt.dilution)
 
 
 def lens_of(camera: Camera) -> FloatArray:

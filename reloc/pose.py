@@ -241,8 +241,12 @@ def pose_uncertainty(
     information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
     if lens is not None:
         information[6:, 6:] += np.diag(lens.information)
+    covariance = covariance_from_information(information)
+    if lens is not None and lens.dilution > 1.0:
+        by_lens = covariance[:6, 6:] @ np.linalg.solve(covariance[6:, 6:], covariance[6:, :6])
+        covariance[:6, :6] += (lens.dilution - 1.0) * by_lens
     return PoseUncertainty(
-        covariance=covariance_from_information(information)[:6, :6],
+        covariance=covariance[:6, :6],
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
         variance_factor=factor,
     )

@@ -35,6 +35,8 @@ class LocaliseRequest:
         camera: intrinsics for the image's full size; None: see the next two.
         camera_prior: how well its intrinsics are known, which are then estimated with the pose; None:
             exactly.
+        camera_is_true: the intrinsics are the true ones, and not lent by a map: they are estimated with the
+            pose within what the map's own lenses leave open, which has bent the map.
         camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
             key lends its calibrated intrinsics.
         film: of a film that does not name its camera, `featuredb.features.film_lens.unnamed_model`; the
@@ -49,6 +51,7 @@ class LocaliseRequest:
 
     camera: Camera | None = None
     camera_prior: LensPrior | None = None
+    camera_is_true: bool = False
     camera_key: str | None = None
     film: str | None = None
     exif_focal_px: float | None = None

@@ -199,7 +199,7 @@ class LensProblem:
 
 def prior_cost(prior: LensPrior, camera: Camera) -> float:
     """Half the chi-square of a lens under what was known of it."""
-    return 0.5 * float(np.sum(((lens_of(camera) - prior.mean) / prior.sigma) ** 2))
+    return 0.5 * float(np.sum((lens_of(camera) - prior.mean) ** 2 * prior.information))
 
 
 def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:

@@ -63,6 +63,10 @@ class Marginals:
         factor = lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
         return np.asarray((across * scale) @ np.linalg.solve(factor, (across * scale).T))
 
+    def lens(self, camera: int) -> FloatArray:
+        """(p, p) of a camera's parameters; zero where they are held."""
+        return self._part(int(self.lens_start[camera]), self.lens_size[camera])
+
     def _part(self, start: int, size: int) -> FloatArray:
         if start < 0:
             return np.zeros((size, size))

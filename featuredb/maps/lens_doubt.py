@@ -25,6 +25,7 @@ class LensDoubt:
         focal_rel: of the focal length. aspect: of the second focal length over the first.
         center_rel: (x, y) of the principal point, as shares of the longer side.
         radial, tangential: of the two coefficients of each.
+        dilution: so many observations counted as one against what was known of the lenses.
     """
 
     focal_rel: float
@@ -32,10 +33,18 @@ class LensDoubt:
     center_rel: tuple[float, float]
     radial: tuple[float, float]
     tangential: tuple[float, float]
+    dilution: float
 
     def as_provenance(self) -> dict[str, Any]:
         """To be merged into a map's provenance."""
-        numbers = (self.focal_rel, self.aspect, *self.center_rel, *self.radial, *self.tangential)
+        numbers = (
+            self.focal_rel,
+            self.aspect,
+            *self.center_rel,
+            *self.radial,
+            *self.tangential,
+            self.dilution,
+        )
         return {_KEY: [float(f"{number:.4g}") for number in numbers]}
 
     @classmethod
@@ -44,17 +53,24 @@ class LensDoubt:
         numbers = provenance.get(_KEY)
         if numbers is None:
             return None
-        f, aspect, cx, cy, k1, k2, p1, p2 = numbers
-        return cls(focal_rel=f, aspect=aspect, center_rel=(cx, cy), radial=(k1, k2), tangential=(p1, p2))
+        f, aspect, cx, cy, k1, k2, p1, p2, dilution = numbers
+        return cls(
+            focal_rel=f,
+            aspect=aspect,
+            center_rel=(cx, cy),
+            radial=(k1, k2),
+            tangential=(p1, p2),
+            dilution=dilution,
+        )
 
 
 def doubt_of_lenses(
-    cameras: Sequence[Camera], covariances: Sequence[FloatArray], photos: Sequence[int]
+    cameras: Sequence[Camera], covariances: Sequence[FloatArray], photos: Sequence[int], dilution: float
 ) -> LensDoubt | None:
     """Of independent lenses that have so many photos each; None where none is of OPENCV's parameters.
 
     Args:
-        covariances: (8, 8) of OPENCV's parameters.
+        covariances: (8, 8) of OPENCV's parameters. dilution: that they were found with.
     """
     rows = [c for c, camera in enumerate(cameras) if camera.model == "OPENCV" and photos[c]]
     if not rows:
@@ -70,4 +86,11 @@ def doubt_of_lenses(
         by[1, :2] = -fy / fx**2, 1.0 / fx
         variance += weight**2 * np.diag(by @ covariances[c] @ by.T)
     f, aspect, cx, cy, k1, k2, p1, p2 = np.sqrt(np.maximum(variance, 0.0)).tolist()
-    return LensDoubt(focal_rel=f, aspect=aspect, center_rel=(cx, cy), radial=(k1, k2), tangential=(p1, p2))
+    return LensDoubt(
+        focal_rel=f,
+        aspect=aspect,
+        center_rel=(cx, cy),
+        radial=(k1, k2),
+        tangential=(p1, p2),
+        dilution=dilution,
+    )

@@ -23,21 +23,26 @@ def test_the_doubt_is_that_of_drawn_lenses() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(8, 8)) * np.array([3.0, 3.0, 1.0, 1.0, 1e-3, 1e-3, 1e-4, 1e-4])[:, None]
     drawn = np.array(_LENS.params) + rng.normal(size=(200_000, 8)) @ root.T
-    doubt = doubt_of_lenses([_LENS], [root @ root.T], [5])
+    doubt = doubt_of_lenses([_LENS], [root @ root.T], [5], 50.0)
     assert doubt is not None
     assert doubt.focal_rel == pytest.approx(np.std(drawn[:, 0]) / 1200.0, rel=0.02)
     assert doubt.aspect == pytest.approx(np.std(drawn[:, 1] / drawn[:, 0]), rel=0.02)
     assert doubt.center_rel[1] == pytest.approx(np.std(drawn[:, 3]) / 1600.0, rel=0.02)
     assert doubt.tangential[0] == pytest.approx(np.std(drawn[:, 6]), rel=0.02)
     # Two lenses of as many photos each: the map's points are bent by their mean.
-    both = doubt_of_lenses([_LENS, _LENS], [root @ root.T] * 2, [5, 5])
+    both = doubt_of_lenses([_LENS, _LENS], [root @ root.T] * 2, [5, 5], 50.0)
     assert both is not None
     assert both.focal_rel == pytest.approx(doubt.focal_rel / 2**0.5)
 
 
 def test_a_provenance_keeps_it_and_old_ones_have_none() -> None:
     doubt = LensDoubt(
-        focal_rel=1e-3, aspect=2e-3, center_rel=(3e-3, 4e-3), radial=(5e-3, 6e-3), tangential=(7e-4, 8e-4)
+        focal_rel=1e-3,
+        aspect=2e-3,
+        center_rel=(3e-3, 4e-3),
+        radial=(5e-3, 6e-3),
+        tangential=(7e-4, 8e-4),
+        dilution=50.0,
     )
     assert LensDoubt.of_provenance(json.loads(json.dumps(doubt.as_provenance()))) == doubt
     assert LensDoubt.of_provenance({"version": "1"}) is None
@@ -50,8 +55,10 @@ def test_lenses_of_other_models_have_none() -> None:
         height=1200,
         params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
     )
-    assert doubt_of_lenses([fisheye], [np.eye(8)], [3]) is None
-    doubt = LensDoubt(focal_rel=1e-3, aspect=1e-3, center_rel=(0, 0), radial=(0, 0), tangential=(0, 0))
+    assert doubt_of_lenses([fisheye], [np.eye(8)], [3], 50.0) is None
+    doubt = LensDoubt(
+        focal_rel=1e-3, aspect=1e-3, center_rel=(0, 0), radial=(0, 0), tangential=(0, 0), dilution=50.0
+    )
     assert seen_by_a_map(fisheye, doubt) is None
 
 
@@ -63,7 +70,12 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
     pixels = told.project(scene) + rng.normal(0, 0.3, (400, 2))
     bent = scene * [1.0, 1.003, 1.0] + [0.0, 0.0, 0.0]
     doubt = LensDoubt(
-        focal_rel=1e-3, aspect=2e-3, center_rel=(1e-3, 1e-3), radial=(1e-3, 1e-3), tangential=(2e-4, 2e-4)
+        focal_rel=1e-3,
+        aspect=2e-3,
+        center_rel=(1e-3, 1e-3),
+        radial=(1e-3, 1e-3),
+        tangential=(2e-4, 2e-4),
+        dilution=50.0,
     )
     seen = seen_by_a_map(told, doubt)
     assert seen is not None

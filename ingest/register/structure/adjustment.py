@@ -306,7 +306,7 @@ def _left_open(
     factor = max(float(structure.figures["neighbours_factor"]), shared)
     lenses = [factor * options.lens_dilution * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    doubt = doubt_of_lenses(block.cameras, lenses, photos)
+    doubt = doubt_of_lenses(block.cameras, lenses, photos, options.lens_dilution)
     return tuple(factor * found.poses(options.lens_dilution)), doubt
 
 
