@@ -78,7 +78,7 @@ def _laser(name: str, photos: int, form: Form) -> Row:
             Limit(figure="worst", most=1.5),
         ),
         needs=(f"strecha/{name}",),
-        minutes=2,
+        minutes=1,
     )
 
 
