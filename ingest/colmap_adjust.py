@@ -170,20 +170,7 @@ def _bundle(reconstruction: Any, known: Known, loss_scale_px: float, options: Ad
     camera_ids = sorted({reconstruction.image(i).camera_id for i in image_ids})
     point_ids = sorted(reconstruction.point3D_ids())
     keypoints = [np.array([p.xy for p in reconstruction.image(i).points2D]).reshape(-1, 2) for i in image_ids]
-    xy = np.empty((len(model.point_of), 2))
-    for k, pixels in enumerate(keypoints):
-        mine = model.photo_of == k
-        xy[mine] = pixels[model.keypoint_of[mine]]
-    block = Block(
-        names=tuple(str(i) for i in image_ids),
-        cameras=model.cameras,
-        camera_of=model.camera_of,
-        cam_from_block=model.cam_from_sfm,
-        xyz=model.xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        xy=xy,
-    )
+    block = model.block(model.pixels(keypoints))
     if options.whole_lens and options.refine_focal:
         block = whole_lens(block)
     centers = _center_priors(block, image_ids, known.photos) if options.use_positions else None

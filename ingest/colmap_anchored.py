@@ -190,21 +190,11 @@ def block_and_marks(
         held_points: of the model, those that stay.
     """
     held = np.isin(np.arange(len(model.xyz)), held_points)
-    xy = np.zeros((len(model.point_of), 2))
-    for k, pixels in enumerate(keypoints):
-        mine = model.photo_of == k
-        xy[mine] = pixels[model.keypoint_of[mine]]
+    xy = model.pixels(keypoints)
     free = np.flatnonzero(observation & ~held[model.point_of])
     stays = np.flatnonzero(observation & held[model.point_of] & ~np.isin(model.photo_of, held_photos))
-    block = Block(
-        names=tuple(str(r) for r in model.rows),
-        cameras=model.cameras,
-        camera_of=model.camera_of,
-        cam_from_block=model.cam_from_sfm,
-        xyz=model.xyz,
-        point_of=model.point_of[free],
-        photo_of=model.photo_of[free],
-        xy=xy[free],
+    block = replace(
+        model.block(xy), point_of=model.point_of[free], photo_of=model.photo_of[free], xy=xy[free]
     )
     marks = Marks(
         xyz=np.concatenate([fixed.xyz[fixed.point_of[kept]], model.xyz[model.point_of[stays]]]),

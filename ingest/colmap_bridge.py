@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -95,6 +96,27 @@ class Model:
     def centers(self) -> FloatArray:
         """Camera centres (k, 3)."""
         return np.array([pose.center for pose in self.cam_from_sfm]).reshape(-1, 3)
+
+    def pixels(self, keypoints: Sequence[NDArray[np.floating[Any]]]) -> FloatArray:
+        """Pixels (m, 2) of the observations, from those of each photo's keypoints (n, 2)."""
+        xy = np.zeros((len(self.point_of), 2))
+        for k, pixels in enumerate(keypoints):
+            mine = self.photo_of == k
+            xy[mine] = pixels[self.keypoint_of[mine]]
+        return xy
+
+    def block(self, xy: FloatArray) -> Block:
+        """The block of the model, in its frame, with pixels (m, 2) of the observations."""
+        return Block(
+            names=tuple(str(row) for row in self.rows),
+            cameras=self.cameras,
+            camera_of=self.camera_of,
+            cam_from_block=self.cam_from_sfm,
+            xyz=self.xyz,
+            point_of=self.point_of,
+            photo_of=self.photo_of,
+            xy=xy,
+        )
 
     def track_lengths(self) -> NDArray[np.int64]:
         """Number of observations (n,) of each point."""

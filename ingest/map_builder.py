@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.adjust.block import Block
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
@@ -155,33 +154,21 @@ def _parts(
             "licence": identity.licence,
             "provenance": identity.provenance
             | {"residual_sigma_px": variance**0.5}
-            | _lens_doubt(model, poses, xyz, xy, photos),
+            | _lens_doubt(model, xy, photos),
         },
     )
 
 
-def _lens_doubt(
-    model: Model, poses: Sequence[Rigid3], xyz: FloatArray, xy: FloatArray, photos: Sequence[Photo]
-) -> dict[str, Any]:
+def _lens_doubt(model: Model, xy: FloatArray, photos: Sequence[Photo]) -> dict[str, Any]:
     """What the map's lenses leave open, for its provenance; nothing of what is too large or too small."""
-    if not 2 <= len(poses) <= _MOST_PHOTOS:
+    if not 2 <= len(photos) <= _MOST_PHOTOS:
         return {}
-    block = Block(
-        names=tuple(photo.name for photo in photos),
-        cameras=model.cameras,
-        camera_of=model.camera_of,
-        cam_from_block=tuple(poses),
-        xyz=xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        xy=xy,
-    )
     focal_px = {
         int(c): photo.focal_px
         for photo, c in zip(photos, model.camera_of, strict=True)
         if photo.focal_px is not None
     }
-    doubt = lens_doubt(block, focal_px)
+    doubt = lens_doubt(model.block(xy), focal_px)
     return {} if doubt is None else doubt.as_provenance()
 
 

@@ -150,7 +150,7 @@ def _decide(
         pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
     )
     pose = best.pose
-    if request.camera_is_true and request.camera is not None:
+    if request.camera_is_exact and request.camera is not None:
         pose = replace(pose, camera=request.camera)  # exact, whatever the map's bend made of it
     answer = make_answer(best.area, pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
     against = contradicts_prior(answer, request.prior)

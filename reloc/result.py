@@ -35,7 +35,7 @@ class LocaliseRequest:
         camera: intrinsics for the image's full size; None: see the next two.
         camera_prior: how well its intrinsics are known, which are then estimated with the pose; None:
             exactly.
-        camera_is_true: the intrinsics are the true ones, and not lent by a map: they are estimated with the
+        camera_is_exact: the intrinsics are the true ones, and not lent by a map: they are estimated with the
             pose within what the map's own lenses leave open, which has bent the map.
         camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
             key lends its calibrated intrinsics.
@@ -51,7 +51,7 @@ class LocaliseRequest:
 
     camera: Camera | None = None
     camera_prior: LensPrior | None = None
-    camera_is_true: bool = False
+    camera_is_exact: bool = False
     camera_key: str | None = None
     film: str | None = None
     exif_focal_px: float | None = None

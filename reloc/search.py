@@ -197,7 +197,7 @@ def _with_lens_prior(
     pose: PoseHypothesis, area: Area, matches: Matches, request: LocaliseRequest
 ) -> PoseHypothesis:
     """What is known of the lens: as the request says; of one that is known exactly, as the map shows it."""
-    if not request.camera_is_true:
+    if not request.camera_is_exact:
         return replace(pose, lens_prior=request.camera_prior)
     counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
     doubt = LensDoubt.of_provenance(area.maps[int(np.argmax(counts))].provenance)

@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 
-_KEY = "lens_doubt"
+_KEY, _NUMBERS = "lens_doubt", 9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,10 +50,22 @@ class LensDoubt:
 
     @classmethod
     def of_provenance(cls, provenance: dict[str, Any]) -> "LensDoubt | None":
-        """None for maps that were made before it was kept, or of lenses that have no such parameters."""
+        """None for maps that were made before it was kept, or of lenses that have no such parameters.
+
+        Raises:
+            InvalidValueError: it is not what `as_provenance` writes.
+        """
         numbers = provenance.get(_KEY)
         if numbers is None:
             return None
+        if (
+            not isinstance(numbers, list)
+            or len(numbers) != _NUMBERS
+            or not all(isinstance(n, int | float) and 0.0 <= n < np.inf for n in numbers)
+        ):
+            raise InvalidValueError(
+                f"provenance {_KEY}: expected {_NUMBERS} numbers of at least 0, found {numbers!r}"
+            )
         f, aspect, cx, cy, k1, k2, p1, p2, dilution = numbers
         return cls(
             focal_rel=f,

@@ -23,20 +23,8 @@ from ingest.precision import (
 
 def block_of_model(model: Model, photos: Sequence[Photo], features: Sequence[PhotoFeatures]) -> Block:
     """The block of a reconstruction, in its own frame; photos and features in the order of `model.rows`."""
-    xy = np.zeros((len(model.point_of), 2))
-    for k, found in enumerate(features):
-        rows = model.photo_of == k
-        xy[rows] = found.features.xy[model.keypoint_of[rows]]
-    return Block(
-        names=tuple(photo.name for photo in photos),
-        cameras=model.cameras,
-        camera_of=model.camera_of,
-        cam_from_block=model.cam_from_sfm,
-        xyz=model.xyz,
-        point_of=model.point_of,
-        photo_of=model.photo_of,
-        xy=xy,
-    )
+    block = model.block(model.pixels([found.features.xy for found in features]))
+    return replace(block, names=tuple(photo.name for photo in photos))
 
 
 def model_of_block(model: Model, block: Block) -> Model:

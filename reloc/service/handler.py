@@ -94,7 +94,7 @@ def localise_request(
     return LocaliseRequest(
         camera=camera,
         camera_prior=None if lens is None or camera is None else _camera_prior(lens, camera),
-        camera_is_true=lens is not None and lens.sigmas is None,
+        camera_is_exact=lens is not None and lens.sigmas is None,
         camera_key=exif.camera_key or None,
         exif_focal_px=exif.focal_px,
         prior=prior,

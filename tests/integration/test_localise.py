@@ -18,6 +18,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
+from featuredb.maps.lens_doubt import LensDoubt
 from featuredb.store import Database
 from reloc import search
 from reloc.candidates import IndexedArea
@@ -99,6 +100,31 @@ def test_a_known_camera_within_centimetres(
     np.testing.assert_allclose(pose.utm, area.area.frame.utm_from_enu(truth.center, EPSG), atol=0.05)
     assert pose.camera_source == "request"
     assert pose.horizontal_68_m < 0.1
+
+
+def test_a_camera_told_as_exact_is_as_sure_as_the_lenses_of_the_map(
+    field_map: FeatureMap, texture: NDArray[np.uint8]
+) -> None:
+    """From above a lens that is 0.3 % off passes for a height that is."""
+    truth = view(0, 0, 45, 10, 20)
+    doubt = LensDoubt(
+        focal_rel=0.003, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
+        tangential=(1e-5,) * 2, dilution=50.0,
+    )  # fmt: skip
+    knows = replace(field_map, provenance=field_map.provenance | doubt.as_provenance())
+    photo, exact = render(texture, truth, seed=5), replace(KNOWN, camera_is_exact=True)
+    plain, told = (localise(photo, exact, [indexed(one)]) for one in (field_map, knows))
+    assert plain.pose is not None
+    assert told.pose is not None
+    assert told.pose.camera == CAMERA  # as it was told
+    assert pose_errors(told, truth)[0] < 0.2
+    # 0.3 % of 45 m, and not the centimetres that the pixels alone tell.
+    assert plain.pose.vertical_68_m < 0.05
+    assert 0.1 < told.pose.vertical_68_m < 0.3
+    # What is lent by a map goes with that map's points.
+    lent = localise(photo, KNOWN, [indexed(knows)])
+    assert lent.pose is not None
+    assert lent.pose.vertical_68_m == pytest.approx(plain.pose.vertical_68_m)
 
 
 @pytest.mark.parametrize("tilt_deg", [45.0, 55.0])

@@ -7,6 +7,7 @@ import pytest
 
 from featuredb.adjust.block import Block
 from featuredb.adjust.marginals import Marginals
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
@@ -48,6 +49,12 @@ def test_a_provenance_keeps_it_and_old_ones_have_none() -> None:
     assert LensDoubt.of_provenance({"version": "1"}) is None
 
 
+@pytest.mark.parametrize("written", [[0.1] * 8, [0.1] * 8 + [float("nan")], [-1.0] * 9, "0.1", {}])
+def test_a_provenance_that_is_not_ours_is_an_error(written: object) -> None:
+    with pytest.raises(InvalidValueError, match="expected 9 numbers"):
+        LensDoubt.of_provenance({"lens_doubt": written})
+
+
 def test_lenses_of_other_models_have_none() -> None:
     fisheye = Camera(
         model="OPENCV_FISHEYE",
@@ -68,7 +75,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
     told = Camera(model="PINHOLE", width=1600, height=1200, params=(1200.0, 1200.0, 800.0, 600.0))
     scene = rng.uniform([-4, -3, 8], [4, 3, 14], (400, 3))
     pixels = told.project(scene) + rng.normal(0, 0.3, (400, 2))
-    bent = scene * [1.0, 1.003, 1.0] + [0.0, 0.0, 0.0]
+    bent = scene * [1.0, 1.003, 1.0]
     doubt = LensDoubt(
         focal_rel=1e-3,
         aspect=2e-3,

@@ -26,7 +26,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.precision import linearise, shared_variance_px2
+from ingest.colmap_adjust import block_variance_px2
 from ingest.register.control.fit import Vertical, refine
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import on_ground
@@ -141,7 +141,7 @@ def task_of(
 ) -> Task:
     """For a block in metres in the local frame, in place but for small changes."""
     chosen = _sample(placed, options.points_per_photo)
-    variance_px2 = _shared_variance_px2(chosen)
+    variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)
     ground = np.full((len(control.marks), 3), np.nan)
     for row, (photo, xy) in enumerate(zip(control.photo_of.tolist(), control.xy, strict=True)):
@@ -319,21 +319,6 @@ def _anchor(start: Block, vertical: Vertical) -> PointPriors:
         xyz=(start.xyz[row] + lift)[None],
         covariance=np.diag([_LOOSE_M**2, _LOOSE_M**2, vertical.sigma_up_m**2])[None],
     )
-
-
-def _shared_variance_px2(block: Block) -> float:
-    residuals = linearise(
-        block.cameras,
-        block.camera_of,
-        block.cam_from_block,
-        block.xyz,
-        block.point_of,
-        block.photo_of,
-        block.xy,
-    ).residual
-    seen = np.isfinite(residuals).all(axis=1)
-    side = max(max(camera.width, camera.height) for camera in block.cameras)
-    return max(shared_variance_px2(residuals[seen], block.xy[seen], block.photo_of[seen], side), _LEAST_PX2)
 
 
 def _common_change(before: Block, after: Block) -> Sim3:
