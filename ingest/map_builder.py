@@ -17,7 +17,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, Ma
 from featuredb.maps.unplaced_map import NoPlace, OwnPoints, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
-from ingest.lens_doubt import lens_doubt
+from ingest.lens_uncertainty import lens_uncertainty
 from ingest.own_frame import own_frame_of
 from ingest.photo import Photo
 from ingest.precision import (
@@ -154,12 +154,12 @@ def _parts(
             "licence": identity.licence,
             "provenance": identity.provenance
             | {"residual_sigma_px": variance**0.5}
-            | _lens_doubt(model, xy, photos),
+            | _lens_uncertainty(model, xy, photos),
         },
     )
 
 
-def _lens_doubt(model: Model, xy: FloatArray, photos: Sequence[Photo]) -> dict[str, Any]:
+def _lens_uncertainty(model: Model, xy: FloatArray, photos: Sequence[Photo]) -> dict[str, Any]:
     """What the map's lenses leave open, for its provenance; nothing of what is too large or too small."""
     if not 2 <= len(photos) <= _MOST_PHOTOS:
         return {}
@@ -168,8 +168,8 @@ def _lens_doubt(model: Model, xy: FloatArray, photos: Sequence[Photo]) -> dict[s
         for photo, c in zip(photos, model.camera_of, strict=True)
         if photo.focal_px is not None
     }
-    doubt = lens_doubt(model.block(xy), focal_px)
-    return {} if doubt is None else doubt.as_provenance()
+    uncertainty = lens_uncertainty(model.block(xy), focal_px)
+    return {} if uncertainty is None else uncertainty.as_provenance()
 
 
 def _camera_keys(model: Model, photos: Sequence[Photo]) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ from featuredb.adjust.block import whole_camera
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
-from featuredb.maps.lens_doubt import LensDoubt
+from featuredb.maps.lens_uncertainty import LensUncertainty
 
 # An exact parameter has a sigma that no photo can tell from 0.
 _EXACT = np.array([1e-6, 1e-6, 1e-6, 1e-8, 1e-8, 1e-8, 1e-8, 1e-8])
@@ -114,21 +114,19 @@ def known_within(camera: Camera, sigmas: FloatArray) -> LensPrior:
     return LensPrior(mean=mean, sigma=np.maximum(sigma, _EXACT[: len(mean)]))
 
 
-def seen_by_a_map(camera: Camera, doubt: LensDoubt) -> tuple[Camera, LensPrior] | None:
-    """An exactly known lens as a map shows it whose points are bent by what its own lenses leave open.
+def seen_by_a_map(camera: Camera, lenses: LensUncertainty) -> tuple[Camera, LensPrior] | None:
+    """An exactly known lens as photos of a map show it, whose points are bent by its own lenses' errors.
 
     Returns:
-        The same lens as OPENCV and what is known of it; None for lenses that are no OPENCV.
+        The same lens as OPENCV, and its prior; None for lenses that are no OPENCV.
     """
     whole = whole_camera(camera)
     if whole.model != "OPENCV":
         return None
     longer, fx = max(camera.width, camera.height), whole.params[0]
-    cx, cy = (longer * share for share in doubt.center_rel)
-    sigma = np.array(
-        [doubt.focal_rel * fx, cx, cy, doubt.radial[0], doubt.aspect, doubt.radial[1], *doubt.tangential]
-    )
-    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT), dilution=doubt.dilution)
+    center_px, (k1, k2) = (longer * share for share in lenses.center_rel), lenses.radial
+    sigma = np.array([lenses.focal_rel * fx, *center_px, k1, lenses.aspect, k2, *lenses.tangential])
+    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT), dilution=lenses.dilution)
 
 
 def lens_of(camera: Camera) -> FloatArray:

@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lens_doubt import LensDoubt
+from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
 from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa, spread
 from reloc.candidates import Cluster, IndexedArea, find_clusters
@@ -200,8 +200,8 @@ def _with_lens_prior(
     if not request.camera_is_exact:
         return replace(pose, lens_prior=request.camera_prior)
     counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
-    doubt = LensDoubt.of_provenance(area.maps[int(np.argmax(counts))].provenance)
-    seen = None if doubt is None else seen_by_a_map(pose.camera, doubt)
+    uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
+    seen = None if uncertainty is None else seen_by_a_map(pose.camera, uncertainty)
     return pose if seen is None else replace(pose, camera=seen[0], lens_prior=seen[1])
 
 

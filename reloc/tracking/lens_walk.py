@@ -11,7 +11,7 @@ import numpy as np
 
 from featuredb.geometry.camera import Camera
 from reloc.tracking.options import LensWalkOptions
-from reloc.tracking.pose_fit import LensDoubt
+from reloc.tracking.pose_fit import LensUncertainty
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -37,12 +37,12 @@ class LensWalk:
         return float(np.hypot(max(self.rel, self.options.floor_rel), walk))
 
     @property
-    def doubt(self) -> LensDoubt:
+    def doubt(self) -> LensUncertainty:
         """What is not known of the lens before the next frame is looked at."""
         if self.lent:
-            return LensDoubt(focal_rel=self.before_rel)
+            return LensUncertainty(focal_rel=self.before_rel)
         longer = max(self.camera.width, self.camera.height)
-        return LensDoubt(
+        return LensUncertainty(
             focal_rel=self.before_rel,
             center_px=self.options.center_rel * longer,
             radial=self.options.radial,

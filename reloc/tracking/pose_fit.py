@@ -39,7 +39,7 @@ class FittedPose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LensDoubt:
+class LensUncertainty:
     """Standard deviations of what is not known of a lens; all 0: it is given.
 
     Attributes:
@@ -53,7 +53,7 @@ class LensDoubt:
     radial: float = 0.0
 
 
-GIVEN = LensDoubt()
+GIVEN = LensUncertainty()
 
 
 def fit_pose(
@@ -62,7 +62,7 @@ def fit_pose(
     points: FloatArray,
     start: Rigid3,
     options: FitOptions,
-    doubt: LensDoubt = GIVEN,
+    doubt: LensUncertainty = GIVEN,
 ) -> FittedPose | None:
     """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
 

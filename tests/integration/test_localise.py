@@ -18,7 +18,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
-from featuredb.maps.lens_doubt import LensDoubt
+from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from reloc import search
 from reloc.candidates import IndexedArea
@@ -107,11 +107,11 @@ def test_a_camera_told_as_exact_is_as_sure_as_the_lenses_of_the_map(
 ) -> None:
     """From above a lens that is 0.3 % off passes for a height that is."""
     truth = view(0, 0, 45, 10, 20)
-    doubt = LensDoubt(
+    uncertainty = LensUncertainty(
         focal_rel=0.003, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
         tangential=(1e-5,) * 2, dilution=50.0,
     )  # fmt: skip
-    knows = replace(field_map, provenance=field_map.provenance | doubt.as_provenance())
+    knows = replace(field_map, provenance=field_map.provenance | uncertainty.as_provenance())
     photo, exact = render(texture, truth, seed=5), replace(KNOWN, camera_is_exact=True)
     plain, told = (localise(photo, exact, [indexed(one)]) for one in (field_map, knows))
     assert plain.pose is not None

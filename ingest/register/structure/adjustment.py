@@ -22,7 +22,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
-from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
+from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
 from ingest.colmap_adjust import AdjustOptions
 from ingest.precision import design_effect, linearise
@@ -107,7 +107,7 @@ class LidarAdjustment:
     block: Block | None
     covariance: FloatArray | None
     poses: tuple[FloatArray, ...]
-    lenses: LensDoubt | None
+    lenses: LensUncertainty | None
     before_m: FloatArray
     after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
@@ -200,11 +200,11 @@ def adjusted_map(feature_map: FeatureMap, adjustment: LidarAdjustment, cloud: Po
     )
     placed = map_of_block(feature_map, block, feature_map.frame, placement, cloud.height_datum)
     images = zip(placed.images, adjustment.poses, strict=True)
-    doubt = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
+    uncertainty = {} if adjustment.lenses is None else adjustment.lenses.as_provenance()
     return replace(
         placed,
         images=tuple(replace(image, covariance=c) for image, c in images),
-        provenance=placed.provenance | doubt,
+        provenance=placed.provenance | uncertainty,
     )
 
 
@@ -293,7 +293,7 @@ def _left_open(
     structure: StructurePlacement,
     start: Block,
     options: AdjustLidarOptions,
-) -> tuple[tuple[FloatArray, ...], LensDoubt | None]:
+) -> tuple[tuple[FloatArray, ...], LensUncertainty | None]:
     """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
@@ -306,8 +306,8 @@ def _left_open(
     factor = max(float(structure.figures["neighbours_factor"]), shared)
     lenses = [factor * options.lens_dilution * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    doubt = doubt_of_lenses(block.cameras, lenses, photos, options.lens_dilution)
-    return tuple(factor * found.poses(options.lens_dilution)), doubt
+    uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, options.lens_dilution)
+    return tuple(factor * found.poses(options.lens_dilution)), uncertainty
 
 
 def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:

@@ -1,8 +1,7 @@
-"""How well the lenses of a map are known, as far as they bend the map.
+"""Standard deviations of the lenses that a map was made with, stored in its provenance.
 
-Points that were reconstructed with a lens that is a little off are bent by as much. Whoever is localised by
-them and knows the own lens exactly sees the bend as a lens that is off; so a map's provenance keeps what its
-adjustment left open.
+An error of a lens bends the points that were reconstructed with it. A photo whose own lens is known exactly sees
+this as an error of its lens; so localisation needs to know how large it may be.
 """
 
 from collections.abc import Sequence
@@ -15,11 +14,11 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 
-_KEY, _NUMBERS = "lens_doubt", 9
+_KEY, _NUMBERS = "lens_uncertainty", 9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LensDoubt:
+class LensUncertainty:
     """Standard deviations of a map's lenses, of all together.
 
     Attributes:
@@ -49,7 +48,7 @@ class LensDoubt:
         return {_KEY: [float(f"{number:.4g}") for number in numbers]}
 
     @classmethod
-    def of_provenance(cls, provenance: dict[str, Any]) -> "LensDoubt | None":
+    def of_provenance(cls, provenance: dict[str, Any]) -> "LensUncertainty | None":
         """None for maps that were made before it was kept, or of lenses that have no such parameters.
 
         Raises:
@@ -77,9 +76,9 @@ class LensDoubt:
         )
 
 
-def doubt_of_lenses(
+def uncertainty_of_lenses(
     cameras: Sequence[Camera], covariances: Sequence[FloatArray], photos: Sequence[int], dilution: float
-) -> LensDoubt | None:
+) -> LensUncertainty | None:
     """Of independent lenses that have so many photos each; None where none is of OPENCV's parameters.
 
     Args:
@@ -99,7 +98,7 @@ def doubt_of_lenses(
         by[1, :2] = -fy / fx**2, 1.0 / fx
         variance += weight**2 * np.diag(by @ covariances[c] @ by.T)
     f, aspect, cx, cy, k1, k2, p1, p2 = np.sqrt(np.maximum(variance, 0.0)).tolist()
-    return LensDoubt(
+    return LensUncertainty(
         focal_rel=f,
         aspect=aspect,
         center_rel=(cx, cy),

@@ -8,13 +8,13 @@ from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import CenterPriors, Terms
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
+from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from ingest.colmap_adjust import AdjustOptions, block_variance_px2, lens_prior_of
 
 
-def lens_doubt(
+def lens_uncertainty(
     block: Block, focal_px: Mapping[int, float], options: AdjustOptions | None = None
-) -> LensDoubt | None:
+) -> LensUncertainty | None:
     """Of a block that nothing but its photos and what is known of lenses holds.
 
     Args:
@@ -34,7 +34,7 @@ def lens_doubt(
     # Priors count `dilution` times in the problem; in truth observations count so much less.
     lenses = [options.dilution * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    return doubt_of_lenses(block.cameras, lenses, photos, options.dilution)
+    return uncertainty_of_lenses(block.cameras, lenses, photos, options.dilution)
 
 
 def _any_scale(block: Block) -> CenterPriors:

@@ -10,8 +10,8 @@ from featuredb.adjust.marginals import Marginals
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.maps.lens_doubt import LensDoubt, doubt_of_lenses
-from ingest.lens_doubt import lens_doubt
+from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
+from ingest.lens_uncertainty import lens_uncertainty
 from reloc.lens_prior import LensPrior, seen_by_a_map
 from reloc.self_calibration import calibrate
 
@@ -24,20 +24,20 @@ def test_the_doubt_is_that_of_drawn_lenses() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(8, 8)) * np.array([3.0, 3.0, 1.0, 1.0, 1e-3, 1e-3, 1e-4, 1e-4])[:, None]
     drawn = np.array(_LENS.params) + rng.normal(size=(200_000, 8)) @ root.T
-    doubt = doubt_of_lenses([_LENS], [root @ root.T], [5], 50.0)
-    assert doubt is not None
-    assert doubt.focal_rel == pytest.approx(np.std(drawn[:, 0]) / 1200.0, rel=0.02)
-    assert doubt.aspect == pytest.approx(np.std(drawn[:, 1] / drawn[:, 0]), rel=0.02)
-    assert doubt.center_rel[1] == pytest.approx(np.std(drawn[:, 3]) / 1600.0, rel=0.02)
-    assert doubt.tangential[0] == pytest.approx(np.std(drawn[:, 6]), rel=0.02)
+    uncertainty = uncertainty_of_lenses([_LENS], [root @ root.T], [5], 50.0)
+    assert uncertainty is not None
+    assert uncertainty.focal_rel == pytest.approx(np.std(drawn[:, 0]) / 1200.0, rel=0.02)
+    assert uncertainty.aspect == pytest.approx(np.std(drawn[:, 1] / drawn[:, 0]), rel=0.02)
+    assert uncertainty.center_rel[1] == pytest.approx(np.std(drawn[:, 3]) / 1600.0, rel=0.02)
+    assert uncertainty.tangential[0] == pytest.approx(np.std(drawn[:, 6]), rel=0.02)
     # Two lenses of as many photos each: the map's points are bent by their mean.
-    both = doubt_of_lenses([_LENS, _LENS], [root @ root.T] * 2, [5, 5], 50.0)
+    both = uncertainty_of_lenses([_LENS, _LENS], [root @ root.T] * 2, [5, 5], 50.0)
     assert both is not None
-    assert both.focal_rel == pytest.approx(doubt.focal_rel / 2**0.5)
+    assert both.focal_rel == pytest.approx(uncertainty.focal_rel / 2**0.5)
 
 
 def test_a_provenance_keeps_it_and_old_ones_have_none() -> None:
-    doubt = LensDoubt(
+    uncertainty = LensUncertainty(
         focal_rel=1e-3,
         aspect=2e-3,
         center_rel=(3e-3, 4e-3),
@@ -45,14 +45,14 @@ def test_a_provenance_keeps_it_and_old_ones_have_none() -> None:
         tangential=(7e-4, 8e-4),
         dilution=50.0,
     )
-    assert LensDoubt.of_provenance(json.loads(json.dumps(doubt.as_provenance()))) == doubt
-    assert LensDoubt.of_provenance({"version": "1"}) is None
+    assert LensUncertainty.of_provenance(json.loads(json.dumps(uncertainty.as_provenance()))) == uncertainty
+    assert LensUncertainty.of_provenance({"version": "1"}) is None
 
 
 @pytest.mark.parametrize("written", [[0.1] * 8, [0.1] * 8 + [float("nan")], [-1.0] * 9, "0.1", {}])
 def test_a_provenance_that_is_not_ours_is_an_error(written: object) -> None:
     with pytest.raises(InvalidValueError, match="expected 9 numbers"):
-        LensDoubt.of_provenance({"lens_doubt": written})
+        LensUncertainty.of_provenance({"lens_uncertainty": written})
 
 
 def test_lenses_of_other_models_have_none() -> None:
@@ -62,11 +62,11 @@ def test_lenses_of_other_models_have_none() -> None:
         height=1200,
         params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
     )
-    assert doubt_of_lenses([fisheye], [np.eye(8)], [3], 50.0) is None
-    doubt = LensDoubt(
+    assert uncertainty_of_lenses([fisheye], [np.eye(8)], [3], 50.0) is None
+    uncertainty = LensUncertainty(
         focal_rel=1e-3, aspect=1e-3, center_rel=(0, 0), radial=(0, 0), tangential=(0, 0), dilution=50.0
     )
-    assert seen_by_a_map(fisheye, doubt) is None
+    assert seen_by_a_map(fisheye, uncertainty) is None
 
 
 def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told() -> None:
@@ -76,7 +76,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
     scene = rng.uniform([-4, -3, 8], [4, 3, 14], (400, 3))
     pixels = told.project(scene) + rng.normal(0, 0.3, (400, 2))
     bent = scene * [1.0, 1.003, 1.0]
-    doubt = LensDoubt(
+    uncertainty = LensUncertainty(
         focal_rel=1e-3,
         aspect=2e-3,
         center_rel=(1e-3, 1e-3),
@@ -84,7 +84,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
         tangential=(2e-4, 2e-4),
         dilution=50.0,
     )
-    seen = seen_by_a_map(told, doubt)
+    seen = seen_by_a_map(told, uncertainty)
     assert seen is not None
     by_doubt = calibrate(pixels, bent, Rigid3.identity(), *seen, 1.0).cam_from_local
     exact = LensPrior(mean=seen[1].mean, sigma=np.full(8, 1e-7))
@@ -93,7 +93,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
 
 
 def test_more_photos_leave_less_open() -> None:
-    few, many = lens_doubt(_block(4), {0: 1200.0}), lens_doubt(_block(12), {0: 1200.0})
+    few, many = lens_uncertainty(_block(4), {0: 1200.0}), lens_uncertainty(_block(12), {0: 1200.0})
     assert few is not None
     assert many is not None
     assert many.focal_rel < few.focal_rel
