@@ -1,7 +1,7 @@
 """Standard deviations of the lenses that a map was made with, stored in its provenance.
 
-An error of a lens bends the points that were reconstructed with it. A photo whose own lens is known exactly sees
-this as an error of its lens; so localisation needs to know how large it may be.
+An error of a lens bends the points that were reconstructed with it. A photo whose own lens is known exactly
+sees this as an error of its lens; so localisation needs to know how large it may be.
 """
 
 from collections.abc import Sequence
