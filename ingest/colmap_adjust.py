@@ -46,9 +46,9 @@ class AdjustOptions:
             28 mm), nominal focal lengths are met within 1 to 2 %.
         lens: of what is not known of any camera; its focal length is COLMAP's, from the photos.
         dilution: so many observations of the size that residuals have with what neighbours share
-            (`ingest.precision.shared_variance_px2`) count as one against these priors: a lens model's faults
-            are common to whole photos too. On `brighton`, from above, EXIF's focal length of 2311 px comes to
-            2602 with 1, 2357 with 10, 2322 with 50, where its scan says 2296.
+            (`ingest.precision.shared_variance_px2`) count as one against these priors and positions: a lens
+            model's faults are common to whole photos too. On `brighton`, from above, EXIF's focal length of
+            2311 px comes to 2602 with 1, 2357 with 10, 2322 with 50, where its scan says 2296.
         use_positions: GPS positions take part, robustly, each with its own sigma.
         max_iterations: of Ceres.
         threads: one gives the same numbers in every run.

@@ -16,7 +16,7 @@ from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
 from reloc.acceptance import agreement, coverage, expected_cells, independent_inliers, log_nfa, spread
 from reloc.candidates import Cluster, IndexedArea, find_clusters
-from reloc.lens_prior import seen_by_a_map
+from reloc.lens_prior import is_lens_of_a_map, seen_by_a_map
 from reloc.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
@@ -196,12 +196,21 @@ def _poses(
 def _with_lens_prior(
     pose: PoseHypothesis, area: Area, matches: Matches, request: LocaliseRequest
 ) -> PoseHypothesis:
-    """What is known of the lens: as the request says; of one that is known exactly, as the map shows it."""
+    """What is known of the lens: as the request says; of one that is known exactly, as the map shows it.
+
+    The map's own estimate of the same camera fits its points, which are bent by what that is off.
+    """
     if not request.camera_is_exact:
         return replace(pose, lens_prior=request.camera_prior)
     counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
     uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
-    seen = None if uncertainty is None else seen_by_a_map(pose.camera, uncertainty)
+    if uncertainty is None:
+        return pose
+    own = None if request.camera_key is None else area.camera_for_key(request.camera_key)
+    own = None if own is None else _resampled(own, pose.camera.width, pose.camera.height)
+    if own is not None and is_lens_of_a_map(pose.camera, own, uncertainty):
+        return replace(pose, camera=own)
+    seen = seen_by_a_map(pose.camera, uncertainty)
     return pose if seen is None else replace(pose, camera=seen[0], lens_prior=seen[1])
 
 

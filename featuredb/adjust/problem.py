@@ -212,12 +212,13 @@ class Problem:
             self._ceres.add_residual_block(cost, self._loss, [self._poses[photo], self._lenses[lens]])
 
     def _add_centers(self, priors: CenterPriors) -> None:
-        unit = 1.0 / self._terms.keypoint_px**2
+        unit = 1.0 / (self._terms.keypoint_px**2 * self._terms.dilution)
+        loss = pyceres.CauchyLoss(1.0 / np.sqrt(unit))
         for photo, xyz, covariance in zip(
             priors.photo_of.tolist(), priors.xyz, priors.covariance, strict=True
         ):
             cost = cost_functions.AbsolutePosePositionPriorCost(unit * covariance, xyz)
-            self._ceres.add_residual_block(cost, self._loss, [self._poses[photo]])
+            self._ceres.add_residual_block(cost, loss, [self._poses[photo]])
 
     def _add_orientations(self, priors: Orientations) -> None:
         unit = 1.0 / self._terms.keypoint_px**2

@@ -125,8 +125,8 @@ class Terms:
 
     Attributes:
         keypoint_px: standard deviation of a keypoint's coordinate.
-        dilution: so many observations count as one against priors of lenses: what a lens model leaves over
-            is common to whole photos.
+        dilution: so many observations count as one against priors of lenses and centres: what a lens model
+            leaves over is common to whole photos.
         lenses: prior of each camera; a camera without one is held.
         marks, points, centers, orientations, targets: see there.
         held_photos: rows of photos whose poses stay.

@@ -127,6 +127,38 @@ def test_a_camera_told_as_exact_is_as_sure_as_the_lenses_of_the_map(
     assert lent.pose.vertical_68_m == pytest.approx(plain.pose.vertical_68_m)
 
 
+def test_a_camera_told_as_exact_that_made_the_map_goes_with_its_points(
+    field_map: FeatureMap, texture: NDArray[np.uint8]
+) -> None:
+    """A map whose lens is 1 % too long has its ground 1 % too deep, for photos of its camera, too."""
+    truth = view(0, 0, 45, 10, 20)
+    longer = replace(CAMERA, params=(*(1.01 * f for f in CAMERA.params[:2]), *CAMERA.params[2:]))
+    uncertainty = LensUncertainty(
+        focal_rel=0.005, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
+        tangential=(1e-5,) * 2, dilution=50.0,
+    )  # fmt: skip
+    provenance = field_map.provenance | uncertainty.as_provenance()
+    made = replace(field_map, cameras=(longer,), camera_keys=("DJI",), provenance=provenance)
+    photo, exact = render(texture, truth, seed=5), replace(KNOWN, camera_is_exact=True)
+    heights = {}
+    for name, request in {
+        "of another camera": exact,
+        "of the map's": replace(exact, camera_key="DJI"),
+        "far from the map's": replace(
+            exact,
+            camera_key="DJI",
+            camera=replace(CAMERA, params=(longer.params[0] * 0.96,) * 2 + CAMERA.params[2:]),
+        ),
+    }.items():
+        pose = localise(photo, request, [indexed(made)]).pose
+        assert pose is not None
+        assert pose.camera == request.camera
+        heights[name] = float(pose.cam_from_local.center[2] - truth.center[2])
+    assert heights["of another camera"] == pytest.approx(0.0, abs=0.2)
+    assert heights["of the map's"] == pytest.approx(0.01 * 45.0, abs=0.05)
+    assert heights["far from the map's"] == pytest.approx(-0.03 * 45.0, abs=0.2)
+
+
 @pytest.mark.parametrize("tilt_deg", [45.0, 55.0])
 def test_a_view_far_aside_from_those_of_the_map(
     area: IndexedArea, texture: NDArray[np.uint8], tilt_deg: float

@@ -147,6 +147,19 @@ def test_a_focal_length_that_is_far_off_loses_to_photos_that_know() -> None:
     assert problem.block().cameras[0].focal_px == pytest.approx(TRUE.focal_px, rel=0.01)
 
 
+def test_positions_that_are_known_exactly_outweigh_what_the_lens_model_leaves_over() -> None:
+    """A distortion that is held at zero bends the block; diluted, it stays where its positions are."""
+    bent = replace(TRUE, params=(*TRUE.params[:4], 0.0, 0.0, 0.0, 0.0))
+    block = replace(_block(points=200, noise_px=0.2), cameras=(bent,))
+    off = []
+    for dilution in (1.0, 1000.0):
+        terms = replace(_terms(block, bent, 0.2), lenses=(None,), marks=None, points=None, dilution=dilution)
+        problem = Problem(block, terms)
+        problem.solve(50, 1e-12)
+        off.append(float(np.linalg.norm(problem.block().centers() - block.centers(), axis=1).max()))
+    assert off[1] < 0.3 * off[0]
+
+
 def test_covariances_hold_what_draws_scatter() -> None:
     """Sixty draws of all measurements: errors of pose and lens over their covariance are chi-square."""
     squares: list[tuple[float, float]] = []

@@ -1,6 +1,7 @@
 """What a map's lenses leave open, and what that makes of a lens that is known exactly."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from featuredb.adjust.marginals import Marginals
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from ingest.lens_uncertainty import lens_uncertainty
 from reloc.lens_prior import LensPrior, seen_by_a_map
@@ -109,6 +111,31 @@ def test_what_lenses_leave_open_counts_as_often_as_it_is_told_to() -> None:
     by_lens = shared[:6, :6] - exact
     np.testing.assert_allclose(found.poses(9.0)[0], exact + 9.0 * by_lens, rtol=1e-6)
     np.testing.assert_allclose(found.poses()[0], shared[:6, :6])
+
+
+def test_of_a_block_with_photos_that_share_no_points() -> None:
+    """As in a grown map, some of whose photos are held by the points of others alone."""
+    block, photos = _block(8), 8
+    whole = lens_uncertainty(block, {0: 1200.0})
+    without = block.photo_of < photos - 2
+    less = lens_uncertainty(
+        replace(
+            block,
+            point_of=block.point_of[without],
+            photo_of=block.photo_of[without],
+            xy=block.xy[without],
+        ),
+        {0: 1200.0},
+    )
+    assert whole is not None
+    assert less is not None
+    assert 0.0 < whole.focal_rel < less.focal_rel < 0.03  # as EXIF says, loosely
+    # Neither depends on the unit of length.
+    moved = block.moved(Sim3(scale=1e-3, rotation=np.eye(3), translation=np.zeros(3)))
+    again = lens_uncertainty(moved, {0: 1200.0})
+    assert again is not None
+    assert again.focal_rel == pytest.approx(whole.focal_rel, rel=1e-3)
+    assert again.tangential == pytest.approx(whole.tangential, rel=1e-3)
 
 
 def _block(photos: int) -> Block:
