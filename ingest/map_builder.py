@@ -1,12 +1,14 @@
 """Stage: a reconstruction and the photos' features become a map, with a place or without."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block
+from featuredb.adjust.terms import CenterPriors
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
@@ -17,9 +19,10 @@ from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, Ma
 from featuredb.maps.unplaced_map import NoPlace, OwnPoints, UnplacedMap
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
-from ingest.lens_uncertainty import lens_uncertainty
+from ingest.map_errors import MapErrors, map_errors
 from ingest.own_frame import own_frame_of
 from ingest.photo import Photo
+from ingest.photo_positions import gps_priors
 from ingest.precision import (
     Linearised,
     linearise,
@@ -74,7 +77,8 @@ def build_map(
         photos, features: of the model's registered photos, in the order of `model.rows`; features are read
             once, photo by photo.
     """
-    parts = _parts(model, placement.local_from_sfm, photos, features, identity, options)
+    positions = _positions(photos, frame) if placement.method == "gps" else None
+    parts = _parts(model, placement.local_from_sfm, photos, features, identity, options, positions)
     if parts is None:
         return None
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
@@ -126,6 +130,7 @@ def _parts(
     features: Sequence[PhotoFeatures],
     identity: MapIdentity,
     options: MapOptions,
+    positions: CenterPriors | None = None,
 ) -> _Parts | None:
     """The model in its frame; None if no point is placed well enough."""
     used = _used_features(features, model)
@@ -135,7 +140,14 @@ def _parts(
     linear = linearise(model.cameras, model.camera_of, poses, xyz, model.point_of, model.photo_of, xy)
     variance = residual_variance(linear, len(poses), len(xyz))
     covariances = point_covariances(linear, len(xyz), variance)
-    pose_spread = pose_covariances(linear, len(poses), covariances, variance)
+    errors = _errors(replace(model, cam_from_sfm=tuple(poses), xyz=xyz).block(xy), photos, model, positions)
+    provenance = identity.provenance | {"residual_sigma_px": variance**0.5}
+    if errors is None:
+        pose_spread = pose_covariances(linear, len(poses), covariances, variance)
+    else:
+        pose_spread = errors.poses
+        provenance |= errors.modes.as_provenance()
+        provenance |= {} if errors.lenses is None else errors.lenses.as_provenance()
     kept = _well_placed(xyz, poses, covariances, model, options)
     if not kept.any():
         return None
@@ -152,24 +164,34 @@ def _parts(
             "extractor_fingerprint": used.fingerprint,
             "source": identity.source,
             "licence": identity.licence,
-            "provenance": identity.provenance
-            | {"residual_sigma_px": variance**0.5}
-            | _lens_uncertainty(model, xy, photos),
+            "provenance": provenance,
         },
     )
 
 
-def _lens_uncertainty(model: Model, xy: FloatArray, photos: Sequence[Photo]) -> dict[str, Any]:
-    """What the map's lenses leave open, for its provenance; nothing of what is too large or too small."""
+def _positions(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:
+    """Of the photos that say one."""
+    xyz, sigmas = gps_priors(photos, frame)
+    rows = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
+    if len(rows) < 3:
+        return None
+    return CenterPriors(
+        photo_of=rows, xyz=xyz[rows], covariance=np.array([np.diag(s**2) for s in sigmas[rows]])
+    )
+
+
+def _errors(
+    block: Block, photos: Sequence[Photo], model: Model, positions: CenterPriors | None
+) -> MapErrors | None:
+    """What the map's lenses, poses and shape leave open; None of what is too large or too small."""
     if not 2 <= len(photos) <= _MOST_PHOTOS:
-        return {}
+        return None
     focal_px = {
         int(c): photo.focal_px
         for photo, c in zip(photos, model.camera_of, strict=True)
         if photo.focal_px is not None
     }
-    uncertainty = lens_uncertainty(model.block(xy), focal_px)
-    return {} if uncertainty is None else uncertainty.as_provenance()
+    return map_errors(block, focal_px, positions)
 
 
 def _camera_keys(model: Model, photos: Sequence[Photo]) -> tuple[str, ...]:

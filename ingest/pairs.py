@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.index.photo_index import most_similar
 from ingest.photo import Photo
+from ingest.photo_positions import gps_positions
 
 Pair = tuple[int, int]
 _Ranked = tuple[int, int, int]  # rank among the proposals of one photo, the photo, the other
@@ -112,20 +112,6 @@ def more_pairs(
         best = sorted(common.items(), key=lambda item: (-item[1], item[0]))
         proposals += [(rank, i, k) for rank, (k, _) in enumerate(best[: options.more_neighbours])]
     return _bounded(proposals, options.pairs_per_photo, known)
-
-
-def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
-    """East, north, up (n, 3) in metres of photos with GPS; height 0 where the photo has none."""
-    geodetic = np.array(
-        [
-            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
-            for p in photos
-            if p.gps is not None
-        ]
-    )
-    if frame is None:
-        frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
-    return frame.enu_from_geodetic(geodetic)
 
 
 def _bounded(proposals: Sequence[_Ranked], most: int, tried: Iterable[Pair]) -> list[Pair]:

@@ -16,12 +16,8 @@ from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
-from ingest.reconstruction import (
-    MapMakingOptions,
-    Reconstructed,
-    gps_priors,
-    local_frame_of,
-)
+from ingest.photo_positions import gps_priors, local_frame_of
+from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.submodel import keep_photos, select_photos

@@ -14,8 +14,6 @@ from typing import Literal
 import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
-from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.stage_clock import StageClock
@@ -28,9 +26,10 @@ from ingest.extract import FeatureFiles, extract_photos, features_key, read_keyp
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapOptions
 from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
-from ingest.pairs import Pair, PairOptions, choose_pairs, gps_positions, more_pairs
+from ingest.pairs import Pair, PairOptions, choose_pairs, more_pairs
 from ingest.photo import Photo
 from ingest.photo_cameras import CameraSharing, photo_cameras
+from ingest.photo_positions import gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions
 from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm import SfmOptions, SfmView
@@ -172,25 +171,6 @@ def reconstruct_photos(
     return replace(done, reconstruction=made, lost=lost)
 
 
-def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
-    """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
-    gps = np.array(
-        [
-            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
-            for p in photos
-            if p.gps is not None
-        ]
-    )
-    if not len(gps):
-        return None
-    latitude, longitude, height = np.median(gps, axis=0)
-    return LocalFrame(
-        latitude_deg=round(float(latitude), 5),
-        longitude_deg=round(float(longitude), 5),
-        height_m=round(float(height)),
-    )
-
-
 def _views(
     photos: Sequence[Photo],
     features: FeatureFiles,
@@ -236,20 +216,6 @@ def _reconstruct(
         joining=options.joining,
         progress=progress,
     )
-
-
-def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 3) in the frame and sigmas (n, 3), NaN for photos without GPS or height."""
-    positions = np.full((len(photos), 3), np.nan)
-    sigmas = np.full((len(photos), 3), np.nan)
-    rows = [i for i, p in enumerate(photos) if p.gps is not None and p.gps.height_m is not None]
-    if frame is not None and rows:
-        positions[rows] = gps_positions([photos[i] for i in rows], frame)
-        for i in rows:
-            gps = photos[i].gps
-            assert gps is not None
-            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
-    return positions, sigmas
 
 
 def _matches_per_photo(photos: Sequence[Photo], inliers: Mapping[Pair, int]) -> dict[str, int]:

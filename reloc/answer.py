@@ -8,10 +8,13 @@ from scipy.special import gammaincinv
 
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import quaternion_from_matrix, skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
+from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
+from reloc.map_shape import shape_covariance
 from reloc.pose import PoseHypothesis, PoseUncertainty
 from reloc.result import Inliers, LocalisedPose
 
@@ -23,23 +26,28 @@ def make_answer(
     pixels: FloatArray,
     point_rows: NDArray[np.int64],
     want_inliers: bool,
+    told: Camera | None = None,
 ) -> LocalisedPose:
     """The pose in UTM and as a GeoPose, with covariance and radii.
 
     Args:
         pixels: (k, 2) of the inliers. point_rows: (k,) rows of the area's points.
+        told: the camera that the request gives as exact, whatever the map's errors made of it.
     """
     counts = np.bincount(area.point_map[point_rows], minlength=len(area.maps))
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
-    covariance = on_earth(area, main, center, uncertainty.covariance, point_rows)
+    modes = ErrorModes.of_provenance(main.provenance)
+    lent = pose.camera_source == "map" or (told is not None and pose.lens_prior is None)
+    shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes, lent)
+    covariance = on_earth(area, main, center, uncertainty.covariance, point_rows, shape)
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
         covariance=covariance,
-        camera=pose.camera,
+        camera=told or pose.camera,
         camera_source=pose.camera_source,
         epsg=main.epsg,
         utm=area.frame.utm_from_enu(center, main.epsg),
@@ -110,7 +118,12 @@ def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> F
 
 
 def on_earth(
-    area: Area, main: FeatureMap, center: FloatArray, measured: FloatArray, rows: NDArray[np.int64]
+    area: Area,
+    main: FeatureMap,
+    center: FloatArray,
+    measured: FloatArray,
+    rows: NDArray[np.int64],
+    shape: FloatArray | None = None,
 ) -> FloatArray:
     """Measured covariance (6, 6) plus those of the map and its placement, true east-north-up at the camera.
 
@@ -118,7 +131,8 @@ def on_earth(
         center: (3,) camera centre in the area's frame. measured: in the area's axes.
         rows: of the area's points that gave the pose.
     """
-    mapped = placement_covariance(area, main, center) + map_covariance(area, center, rows)
+    mapped = placement_covariance(area, main, center)
+    mapped += map_covariance(area, center, rows) if shape is None else shape
     to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
     covariance = to_true @ (measured + mapped) @ to_true.T
     return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)

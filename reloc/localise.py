@@ -149,10 +149,10 @@ def _decide(
     uncertainty = pose_uncertainty(
         pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
     )
-    pose = best.pose
-    if request.camera_is_exact and request.camera is not None:
-        pose = replace(pose, camera=request.camera)  # exact, whatever the map's bend made of it
-    answer = make_answer(best.area, pose, uncertainty, pixels[best.rows], rows, request.want_inliers)
+    told = request.camera if request.camera_is_exact else None
+    answer = make_answer(
+        best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers, told
+    )
     against = contradicts_prior(answer, request.prior)
     if against is not None:
         return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)

@@ -11,6 +11,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
+from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap_bridge import Model
@@ -149,7 +150,7 @@ def _with_covariances(feature_map: FeatureMap, spread: FloatArray) -> FeatureMap
         replace(image, covariance=own) if np.isfinite(own).all() else image
         for image, own in zip(feature_map.images, spread, strict=True)
     )
-    return replace(feature_map, images=images)
+    return replace(feature_map, images=images, provenance=without_modes(feature_map.provenance))
 
 
 def _meeting_place(

@@ -17,7 +17,7 @@ from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap_bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
-from ingest.reconstruction import gps_priors, local_frame_of
+from ingest.photo_positions import gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps, similarity_closed_form
 
 Axes = Literal["enu", "utm", "ecef"]

@@ -8,6 +8,7 @@ import numpy as np
 from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
+from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
@@ -53,7 +54,7 @@ def map_of_block(
 ) -> FeatureMap:
     """The map placed anew: poses, points and intrinsics of the block, which is in metres in `frame`.
 
-    Errors and covariances are computed again; ids, descriptors and attribution stay.
+    Errors and covariances are computed again, joint ones are lost; ids, descriptors and attribution stay.
     """
     poses, points = block.cam_from_block, block.xyz
     linear = linearise(
@@ -72,6 +73,7 @@ def map_of_block(
         epsg=epsg,
         height_datum=height_datum,
         frame=frame,
+        provenance=without_modes(feature_map.provenance),
         cameras=block.cameras,
         images=tuple(
             replace(image, cam_from_local=pose, covariance=covariance)

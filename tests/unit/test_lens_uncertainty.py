@@ -13,7 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
-from ingest.lens_uncertainty import lens_uncertainty
+from ingest.map_errors import map_errors
 from reloc.lens_prior import LensPrior, seen_by_a_map
 from reloc.self_calibration import calibrate
 
@@ -95,7 +95,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
 
 
 def test_more_photos_leave_less_open() -> None:
-    few, many = lens_uncertainty(_block(4), {0: 1200.0}), lens_uncertainty(_block(12), {0: 1200.0})
+    few, many = (map_errors(_block(photos), {0: 1200.0}).lenses for photos in (4, 12))
     assert few is not None
     assert many is not None
     assert many.focal_rel < few.focal_rel
@@ -116,9 +116,9 @@ def test_what_lenses_leave_open_counts_as_often_as_it_is_told_to() -> None:
 def test_of_a_block_with_photos_that_share_no_points() -> None:
     """As in a grown map, some of whose photos are held by the points of others alone."""
     block, photos = _block(8), 8
-    whole = lens_uncertainty(block, {0: 1200.0})
+    whole = map_errors(block, {0: 1200.0}).lenses
     without = block.photo_of < photos - 2
-    less = lens_uncertainty(
+    less = map_errors(
         replace(
             block,
             point_of=block.point_of[without],
@@ -126,13 +126,13 @@ def test_of_a_block_with_photos_that_share_no_points() -> None:
             xy=block.xy[without],
         ),
         {0: 1200.0},
-    )
+    ).lenses
     assert whole is not None
     assert less is not None
     assert 0.0 < whole.focal_rel < less.focal_rel < 0.03  # as EXIF says, loosely
     # Neither depends on the unit of length.
     moved = block.moved(Sim3(scale=1e-3, rotation=np.eye(3), translation=np.zeros(3)))
-    again = lens_uncertainty(moved, {0: 1200.0})
+    again = map_errors(moved, {0: 1200.0}).lenses
     assert again is not None
     assert again.focal_rel == pytest.approx(whole.focal_rel, rel=1e-3)
     assert again.tangential == pytest.approx(whole.tangential, rel=1e-3)

@@ -15,7 +15,8 @@ from ingest.colmap_bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.photo import Photo
 from ingest.photo_cameras import photo_cameras
-from ingest.reconstruction import MapMakingOptions, local_frame_of
+from ingest.photo_positions import local_frame_of
+from ingest.reconstruction import MapMakingOptions
 from ingest.sfm import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
 

@@ -3,6 +3,7 @@
 from tools.scoreboard.row import Limit, Row
 from tools.scoreboard.words import OUT, same
 
+_SIGMAS, _KINDS = ("2cm", "50cm", "300cm"), ("position", "orientation")
 _TRACKED = ("frames", "lost", "invented", "mean_m", "largest_m", "first_m", "last_m", "rate_hz")
 
 
@@ -70,6 +71,35 @@ SIMULATED: tuple[Row, ...] = (
         ),
         readme=True,
         minutes=4,
+    ),
+    Row(
+        name="lens-draws",
+        group="simulated",
+        form="full",
+        claim="900 flights with lenses that nobody knows and positions of 0.02, 0.5 and 3 m; 20 answers each: "
+        "errors inside the bounds of position and orientation",
+        commands=(("tools.lens_draws", "--draws", "300", *OUT),),
+        figures=same(
+            *(f"{kind}_{level}_{sigma}" for sigma in _SIGMAS for kind in _KINDS for level in (68, 95)),
+            *(f"{kind}_far_{sigma}" for sigma in _SIGMAS for kind in _KINDS),
+        ),
+        text="; ".join(
+            f"{sigma}: position {{position_68_{sigma}:.0%}} and {{position_95_{sigma}:.1%}}, "
+            f"orientation {{orientation_68_{sigma}:.0%}} and {{orientation_95_{sigma}:.1%}} "
+            "inside 68 and 95 % bounds"
+            for sigma in _SIGMAS
+        ),
+        limits=tuple(
+            limit
+            for sigma in _SIGMAS
+            for kind in _KINDS
+            for limit in (
+                Limit(figure=f"{kind}_68_{sigma}", least=0.63, most=0.73),
+                Limit(figure=f"{kind}_95_{sigma}", least=0.90),
+                Limit(figure=f"{kind}_far_{sigma}", most=0),
+            )
+        ),
+        minutes=15,
     ),
     Row(
         name="town-held-out",

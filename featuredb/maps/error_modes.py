@@ -1,0 +1,84 @@
+"""How a map may be off as a whole: joint displacements of its images and lenses, stored in its provenance.
+
+A lens that is slightly wrong bends all poses and points of a map together. Covariances of single images and
+points do not say so, and whoever is localised by those points is off with them.
+"""
+
+from base64 import b64decode, b64encode
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray, frozen_array
+
+_KEY = "error_modes"
+LENS_SIZE = 8  # parameters of OPENCV
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ErrorModes:
+    """Independent displacements of one standard deviation each, relative to the map's placement.
+
+    Attributes:
+        image_id: (k,) of the map's images.
+        poses: (k, 6, r) left perturbation of cam_from_local: rad, and shares of the image's `depth`.
+        lenses: (c, 8, r) of OPENCV's parameters of the map's cameras; zero for others.
+    """
+
+    image_id: NDArray[np.int64]
+    poses: FloatArray
+    lenses: FloatArray
+
+    def __post_init__(self) -> None:
+        poses = frozen_array("ErrorModes.poses", self.poses, (len(self.image_id), 6, None))
+        lenses = frozen_array("ErrorModes.lenses", self.lenses, (None, LENS_SIZE, poses.shape[2]))
+        object.__setattr__(self, "poses", poses)
+        object.__setattr__(self, "lenses", lenses)
+
+    def as_provenance(self) -> dict[str, Any]:
+        """To be merged into a map's provenance: numbers as base64 of little-endian float32."""
+        written = {
+            "image_id": self.image_id.tolist(),
+            "modes": int(self.poses.shape[2]),
+            "poses": _text(self.poses),
+            "lenses": _text(self.lenses),
+        }
+        return {_KEY: written}
+
+    @classmethod
+    def of_provenance(cls, provenance: dict[str, Any]) -> "ErrorModes | None":
+        """None for maps that keep none.
+
+        Raises:
+            InvalidValueError: it is not what `as_provenance` writes.
+        """
+        written = provenance.get(_KEY)
+        if written is None:
+            return None
+        try:
+            ids = np.array(written["image_id"], dtype=np.int64)
+            modes = int(written["modes"])
+            poses = _numbers(written["poses"]).reshape(len(ids), 6, modes)
+            return cls(
+                image_id=ids, poses=poses, lenses=_numbers(written["lenses"]).reshape(-1, LENS_SIZE, modes)
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InvalidValueError(
+                f"provenance {_KEY}: expected image_id, modes, poses and lenses as base64 of float32, {error}"
+            ) from error
+
+
+def without_modes(provenance: dict[str, Any]) -> dict[str, Any]:
+    """Of a map whose poses were adjusted anew: its images' own covariances count again."""
+    return {key: value for key, value in provenance.items() if key != _KEY}
+
+
+def _text(numbers: FloatArray) -> str:
+    return b64encode(numbers.astype("<f4").tobytes()).decode("ascii")
+
+
+def _numbers(text: str) -> FloatArray:
+    return np.frombuffer(b64decode(text, validate=True), dtype="<f4").astype(np.float64)

@@ -1,0 +1,56 @@
+"""Positions that photos tell, in a local frame."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from ingest.photo import Photo
+
+
+def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
+    """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
+    gps = np.array(
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
+    )
+    if not len(gps):
+        return None
+    latitude, longitude, height = np.median(gps, axis=0)
+    return LocalFrame(
+        latitude_deg=round(float(latitude), 5),
+        longitude_deg=round(float(longitude), 5),
+        height_m=round(float(height)),
+    )
+
+
+def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
+    """East, north, up (n, 3) in metres of photos with GPS; height 0 where the photo has none."""
+    geodetic = np.array(
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
+    )
+    if frame is None:
+        frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
+    return frame.enu_from_geodetic(geodetic)
+
+
+def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
+    """Positions (n, 3) in the frame and sigmas (n, 3), NaN for photos without GPS or height."""
+    positions = np.full((len(photos), 3), np.nan)
+    sigmas = np.full((len(photos), 3), np.nan)
+    rows = [i for i, p in enumerate(photos) if p.gps is not None and p.gps.height_m is not None]
+    if frame is not None and rows:
+        positions[rows] = gps_positions([photos[i] for i in rows], frame)
+        for i in rows:
+            gps = photos[i].gps
+            assert gps is not None
+            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
+    return positions, sigmas

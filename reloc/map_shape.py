@@ -1,0 +1,110 @@
+"""What a map's joint errors add to the covariance of a pose that was found by its points."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.index.area import Area
+from featuredb.maps.error_modes import ErrorModes
+from reloc.jacobians import pixel_jacobians
+from reloc.pose import PoseHypothesis
+from reloc.self_calibration import joint_jacobians
+
+_DAMPING = 1e-9
+
+
+def shape_covariance(
+    area: Area, main: int, pose: PoseHypothesis, rows: NDArray[np.int64], modes: ErrorModes, lent: bool
+) -> FloatArray | None:
+    """(6, 6) in the area's axes; None where the modes do not cover the images that see the points.
+
+    Args:
+        main: row of the map. rows: (k,) of the area's points that gave the pose.
+        lent: the pose's lens is the map's, and as wrong.
+    """
+    mine = rows[area.point_map[rows] == main]
+    moved = _moved_points(area, main, mine, modes)
+    if moved is None:
+        return None
+    points, shift = moved
+    own = pose.lens_prior
+    jacobians = pixel_jacobians if own is None else joint_jacobians
+    by_point, by_own = jacobians(pose.camera, pose.cam_from_local, area.points[points])
+    pixels = np.einsum("kij,kjr->kir", by_point, shift)
+    if lent:
+        camera = _camera_of(area, main, points)
+        _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
+        pixels += (
+            by_lens[:, :, 6:] @ _as_lens_of(pose.camera.params, modes.lenses[camera])[: by_lens.shape[2] - 6]
+        )
+    normal = np.einsum("kij,kil->jl", by_own, by_own)
+    if own is not None:
+        normal[6:, 6:] += np.diag(own.information)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    solved = np.linalg.solve(
+        normal * scale[:, None] * scale + _DAMPING * np.eye(len(scale)),
+        scale[:, None] * np.einsum("kij,kir->jr", by_own, pixels),
+    )
+    error = (scale[:, None] * solved)[:6]
+    return np.asarray(error @ error.T)
+
+
+def _moved_points(
+    area: Area, main: int, rows: NDArray[np.int64], modes: ErrorModes
+) -> tuple[NDArray[np.int64], FloatArray] | None:
+    """Points (n,) of the area and their displacements (n, 3, r), as the images that see them move."""
+    feature_map = area.maps[main]
+    first = int(np.searchsorted(area.image_map, main))
+    wanted = np.full(len(area.points), -1, dtype=np.int64)
+    points = np.unique(rows)
+    wanted[points] = np.arange(len(points))
+    seen = wanted[area.see_point] >= 0
+    images, of = area.see_image[seen], wanted[area.see_point[seen]]
+    place = {int(image_id): k for k, image_id in enumerate(modes.image_id)}
+    turn = area.frame.enu_from(feature_map.frame)
+    normal, right = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3, modes.poses.shape[2]))
+    for image in np.unique(images):
+        photo = feature_map.images[image - first]
+        if photo.image_id not in place:
+            return None
+        sees = of[images == image]
+        camera = feature_map.cameras[photo.camera_id]
+        pose = photo.cam_from_local @ turn.inverse()
+        if camera.model != "OPENCV":
+            return None
+        by_point, by_pose = joint_jacobians(camera, pose, area.points[points[sees]])
+        in_camera = pose.act(area.points[points[sees]])
+        by_camera = by_point @ pose.rotation.T
+        left = np.concatenate([-by_camera @ _skews(in_camera), by_camera], axis=2)
+        mode = modes.poses[place[photo.image_id]].copy()
+        mode[3:] *= area.image_reach[image]
+        pixels = left @ mode
+        pixels += by_pose[:, :, 6:] @ _as_lens_of(camera.params, modes.lenses[photo.camera_id])
+        normal[sees] += np.swapaxes(by_point, 1, 2) @ by_point
+        right[sees] -= np.swapaxes(by_point, 1, 2) @ pixels
+    trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+    return points, np.linalg.solve(normal + _DAMPING * trace * np.eye(3), right)
+
+
+def _camera_of(area: Area, main: int, points: NDArray[np.int64]) -> int:
+    """The map's camera that sees most of the points."""
+    wanted = np.zeros(len(area.points), dtype=np.bool_)
+    wanted[points] = True
+    first = int(np.searchsorted(area.image_map, main))
+    images = area.maps[main].images
+    cameras = [images[i - first].camera_id for i in area.see_image[wanted[area.see_point]]]
+    return int(np.argmax(np.bincount(cameras)))
+
+
+def _as_lens_of(params: tuple[float, ...], modes: FloatArray) -> FloatArray:
+    """(8, r) of OPENCV's parameters in the order of `reloc.lens_prior.lens_of`."""
+    fx, fy = params[0], params[1]
+    dfx, dfy, cx, cy, k1, k2, p1, p2 = modes
+    return np.stack([dfx, cx, cy, k1, dfy / fx - fy / fx**2 * dfx, k2, p1, p2])
+
+
+def _skews(vectors: FloatArray) -> FloatArray:
+    """(n, 3, 3) of vectors (n, 3)."""
+    x, y, z = vectors.T
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -1,0 +1,111 @@
+"""Joint errors of a map: their storage, and what they make of a pose that was found by its points."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import build_area
+from featuredb.maps.error_modes import ErrorModes, without_modes
+from reloc.map_shape import shape_covariance
+from reloc.pose import PoseHypothesis
+from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
+
+_LENS = Camera(
+    model="OPENCV", width=1000, height=800, params=(900.0, 901.0, 503.0, 398.0, 0.01, 0.002, 1e-4, -2e-4)
+)
+
+
+def test_provenance_keeps_them() -> None:
+    rng = np.random.default_rng(0)
+    modes = ErrorModes(
+        image_id=np.array([3, 0, 7]), poses=rng.normal(size=(3, 6, 5)), lenses=rng.normal(size=(2, 8, 5))
+    )
+    written = json.loads(json.dumps({"version": "1"} | modes.as_provenance()))
+    read = ErrorModes.of_provenance(written)
+    assert read is not None
+    np.testing.assert_array_equal(read.image_id, modes.image_id)
+    np.testing.assert_allclose(read.poses, modes.poses, rtol=1e-6)
+    np.testing.assert_allclose(read.lenses, modes.lenses, rtol=1e-6)
+    assert ErrorModes.of_provenance({"version": "1"}) is None
+    assert without_modes(written) == {"version": "1"}
+
+
+@pytest.mark.parametrize(
+    "wrong", [[], {"image_id": [0], "modes": 2, "poses": "AAAA", "lenses": ""}, {"image_id": [0]}, "text"]
+)
+def test_what_is_not_ours_is_an_error(wrong: object) -> None:
+    with pytest.raises(InvalidValueError, match="error_modes: expected"):
+        ErrorModes.of_provenance({"error_modes": wrong})
+
+
+@pytest.mark.parametrize("lent", [True, False])
+def test_a_pose_is_off_as_the_map_is(lent: bool) -> None:
+    """One mode, applied to the images and the lens of a map; its points triangulated and a photo located."""
+    rng = np.random.default_rng(4)
+    points, poses = box_points(rng, 80), ring(6)
+    feature_map = replace(
+        scene_map(points=points, descriptors=random_descriptors(rng, 80), poses=poses), cameras=(_LENS,)
+    )
+    area = build_area([feature_map])
+    rows = np.unique(area.see_point)
+    truth = looking_at(np.array([20.0, -30.0, 28.0]), np.array([0.0, 2.0, 4.0]))
+    seen = _LENS.project(truth.act(area.points))
+    step = 1e-4
+    mode = rng.normal(size=(6, 6)) * np.repeat([1e-3, 5e-4], 3) * step
+    lens = np.array([5.0, 4.0, 3.0, -2.0, 5e-3, 3e-3, 2e-4, 3e-4]) * step
+    off = replace(_LENS, params=tuple(np.array(_LENS.params) + lens))
+    reach = area.image_reach
+    moved = [
+        Rigid3.exp(np.concatenate([m[:3], m[3:] * far])) @ pose
+        for m, far, pose in zip(mode, reach, poses, strict=True)
+    ]
+    shifted = np.array([_triangulated(area.points[p], moved, off, poses, feature_map, area, p) for p in rows])
+    found = _located(truth, shifted, seen[rows], off if lent else _LENS)
+    modes = ErrorModes(
+        image_id=np.arange(6), poses=mode[:, :, None] / step, lenses=lens[None, :, None] / step
+    )
+    pose = PoseHypothesis(
+        cam_from_local=truth,
+        camera=_LENS,
+        camera_source="map" if lent else "request",
+        inliers=np.ones(len(rows), np.bool_),
+        prior_focal_px=None,
+    )
+    covariance = shape_covariance(area, 0, pose, rows, modes, lent)
+    assert covariance is not None
+    error = np.concatenate([_turn(truth.rotation.T @ found.rotation), truth.center - found.center])
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.abs(error) / step, rtol=0.02, atol=2e-6)
+    # Images that the modes do not know: nothing can be said.
+    fewer = ErrorModes(image_id=np.arange(5), poses=modes.poses[:5], lenses=modes.lenses)
+    assert shape_covariance(area, 0, pose, rows, fewer, lent) is None
+
+
+def _triangulated(start, moved, lens, poses, feature_map, area, row) -> FloatArray:  # type: ignore[no-untyped-def]
+    images = area.see_image[area.see_point == row]
+    xy = [_LENS.project(poses[i].act(start[None]))[0] for i in images]
+
+    def residual(x: FloatArray) -> FloatArray:
+        return np.concatenate(
+            [lens.project(moved[i].act(x[None]))[0] - p for i, p in zip(images, xy, strict=True)]
+        )
+
+    return np.asarray(least_squares(residual, start, xtol=1e-15, ftol=1e-15, gtol=1e-15).x)
+
+
+def _located(start: Rigid3, points: FloatArray, xy: FloatArray, lens: Camera) -> Rigid3:
+    def residual(twist: FloatArray) -> FloatArray:
+        return (lens.project((Rigid3.exp(twist) @ start).act(points)) - xy).ravel()
+
+    found = least_squares(residual, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale=[1e-3] * 6)
+    return Rigid3.exp(found.x) @ start
+
+
+def _turn(rotation: FloatArray) -> FloatArray:
+    return np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])

@@ -1,0 +1,345 @@
+"""Are the bounds of answers true when lenses are not known? Draws of lenses, positions and keypoints.
+
+    python -m tools.lens_draws --draws 300 [--sigma 0.02 0.5 3] [--workers 2] [--json FILE]
+
+Each draw is a flight over a made-up town whose lens differs from what EXIF says of it: focal length by 2 %,
+principal point by 1 % of the longer side, two radial and two tangential terms. Keypoints have half a pixel of
+noise, half of the variance of positions is shared by the flight, descriptors are made up. Everything after
+matching is what an ingest does: structure from motion, the adjustment, placement by positions of that sigma,
+the map. Then twenty photos that the map has not seen are localised by EXIF alone.
+
+For each sigma of the positions: shares of errors of position and orientation inside their 68 % and 95 %
+bounds, over all answers and over the quarter with fewest inliers, and how many lie outside twice their
+99.9 % bound. The answers of one draw share its lens and place, so the shares' own standard deviations are
+taken over draws. Exit code 0 if all shares are within five points (the quarter: within two of those standard
+deviations) and none is outside twice the 99.9 % bound.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from featuredb.features.extractor import rootsift_8bit
+from featuredb.features.features import Features
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index.area import build_area
+from featuredb.index.descriptor_index import build_index
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
+from ingest.colmap_bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
+from ingest.extract import PhotoFeatures
+from ingest.map_builder import MapIdentity, MapOptions, build_map
+from ingest.photo import Photo
+from ingest.placed_models import placed_by_gps
+from ingest.register.gps import GpsOptions
+from ingest.sfm import SfmOptions, mapping_settings
+from reloc.candidates import IndexedArea
+from reloc.localise import localise_features
+from reloc.options import LocaliseOptions
+from reloc.result import LocaliseRequest
+from tools.calibration import pose_offset
+from tools.figures import add_json_option, write_figures
+
+_WIDTH, _HEIGHT, _FOCAL_PX = 1200, 900, 1000.0
+_KEYPOINT_PX = 0.5
+_SHOWN = 0.7  # of the points in view
+_QUERIES = 20
+_LEVELS = (0.68, 0.95)
+_KEY = "drone"
+_EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """Squared errors over their covariance, of three axes each, and the pose's inliers."""
+
+    position: float
+    orientation: float
+    inliers: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scene:
+    """A draw: a town, its lens, and generator of all else.
+
+    Attributes:
+        xyz: (n, 3) points, metres. descriptors: (n, 128) of them. lens: the true one.
+    """
+
+    xyz: FloatArray
+    descriptors: NDArray[np.uint8]
+    lens: Camera
+    rng: np.random.Generator
+    fingerprint: str
+
+    def seen(self, pose: Rigid3) -> tuple[NDArray[np.int64], Features]:
+        """Points (k,) that a photo shows, with its features in the same order."""
+        local = pose.act(self.xyz)
+        pixels = self.lens.project(local) + self.rng.normal(0.0, _KEYPOINT_PX, (len(local), 2))
+        with np.errstate(invalid="ignore"):
+            inside = ((pixels > 0) & (pixels < [_WIDTH, _HEIGHT])).all(axis=1) & (local[:, 2] > 0)
+        rows = np.flatnonzero(inside & (self.rng.random(len(inside)) < _SHOWN))
+        noise = self.rng.normal(0.0, 5.0, (len(rows), 128))
+        return rows, Features(
+            xy=pixels[rows].astype(np.float32),
+            scale=np.full(len(rows), 5.0, np.float32),
+            angle=np.zeros(len(rows), np.float32),
+            response=np.ones(len(rows), np.float32),
+            descriptors=np.clip(self.descriptors[rows] + noise, 0, 255).astype(np.uint8),
+            width=_WIDTH,
+            height=_HEIGHT,
+            fingerprint=self.fingerprint,
+        )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    figures: dict[str, float] = {}
+    holds = True
+    for sigma in args.sigma:
+        with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
+            seeds = range(args.seed, args.seed + args.draws)
+            draws = list(pool.map(partial(drawn, sigma_m=sigma), seeds))
+        found, text, fine = judged(draws)
+        sys.stdout.write(f"positions of {sigma:g} m\n{text}\n")
+        sys.stdout.flush()
+        figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in found.items()}
+        holds &= fine
+    write_figures(args.json, figures | {"holds": float(holds)})
+    return 0 if holds else 1
+
+
+def judged(draws: Sequence[Sequence[Answer]]) -> tuple[dict[str, float], str, bool]:
+    """Figures of all draws, a table of them, and whether the bounds hold."""
+    answers = [answer for draw in draws for answer in draw]
+    quarter = np.quantile([a.inliers for a in answers], 0.25) if answers else 0.0
+    figures = {
+        "draws": float(len(draws)),
+        "empty": float(sum(not draw for draw in draws)),
+        "answers": float(len(answers)),
+    }
+    lines, fine = [], bool(answers)
+    for kind in ("position", "orientation"):
+        for level in _LEVELS:
+            bound = chi2.ppf(level, 3)
+            share, _ = _share(draws, kind, bound, 10**9)
+            hardest, deviation = _share(draws, kind, bound, quarter)
+            figures |= {f"{kind}_{level * 100:.0f}": share, f"{kind}_{level * 100:.0f}_hardest": hardest}
+            fine &= abs(share - level) <= 0.05 and abs(hardest - level) <= 2.0 * deviation
+            lines.append(
+                f"  {kind:<12}{level:>5.0%} bound holds {share:6.1%}, "
+                f"of the hardest quarter {hardest:6.1%} +- {deviation:.1%}"
+            )
+        far = sum(getattr(a, kind) > 4.0 * chi2.ppf(0.999, 3) for a in answers)
+        middle = float(np.median([getattr(a, kind) for a in answers])) if answers else float("nan")
+        figures |= {f"{kind}_far": float(far), f"{kind}_median": middle}
+        fine &= far == 0
+        lines.append(f"  {kind:<12}{far} outside twice the 99.9% bound; median {middle:.2f} (2.37 is right)")
+    lines.append(f"  {len(answers)} answers of {len(draws)} draws, {figures['empty']:.0f} without a map")
+    return figures, "\n".join(lines), fine
+
+
+def _share(
+    draws: Sequence[Sequence[Answer]], kind: str, bound: float, most_inliers: float
+) -> tuple[float, float]:
+    """Share of the answers inside, and its standard deviation over draws (of a ratio)."""
+    inside = np.array(
+        [sum(getattr(a, kind) <= bound for a in draw if a.inliers <= most_inliers) for draw in draws]
+    )
+    asked = np.array([sum(a.inliers <= most_inliers for a in draw) for draw in draws])
+    if not asked.sum():
+        return float("nan"), float("nan")
+    share = float(inside.sum() / asked.sum())
+    return share, float(np.sqrt(((inside - share * asked) ** 2).sum()) / asked.sum())
+
+
+def drawn(seed: int, sigma_m: float) -> list[Answer]:
+    """One draw; empty where no map is placed."""
+    scene = scene_of(seed)
+    frame = LocalFrame.from_utm(*_ORIGIN, _EPSG)
+    poses = flight(scene.rng)
+    made = _map_of(scene, poses, frame, sigma_m)
+    if made is None:
+        return []
+    area = build_area([made])
+    indexed = [IndexedArea(area=area, index=build_index(area.descriptors))]
+    answers = []
+    request = LocaliseRequest(camera_key=_KEY, exif_focal_px=_FOCAL_PX)
+    for _ in range(_QUERIES):
+        height, tilt = scene.rng.uniform(25.0, 60.0), scene.rng.uniform(0.0, 30.0)
+        pose = looking_down([*scene.rng.uniform(-35.0, 35.0, 2), height], tilt, scene.rng.uniform(0, 360))
+        result = localise_features(scene.seen(pose)[1], request, indexed).result
+        if result.pose is None:
+            continue
+        answer = result.pose
+        true = pose @ frame.enu_from(answer.frame)
+        turn = np.kron(np.eye(2), answer.frame.true_enu_from_enu(answer.cam_from_local.center))
+        error = turn @ pose_offset(answer.cam_from_local, true)
+        squares = [float(error[k] @ np.linalg.solve(answer.covariance[k, k], error[k])) for k in _PARTS]
+        answers.append(Answer(orientation=squares[0], position=squares[1], inliers=result.inliers))
+    return answers
+
+
+_PARTS = (slice(0, 3), slice(3, 6))
+
+
+def scene_of(seed: int) -> Scene:
+    """Ground with houses, and a lens."""
+    rng = np.random.default_rng((seed, 26))
+    ground = np.column_stack([rng.uniform(-75, 75, (2200, 2)), np.zeros(2200)])
+    ground[:, 2] = 1.5 * np.sin(ground[:, 0] / 25.0) * np.cos(ground[:, 1] / 30.0)
+    corners = rng.uniform(-60, 60, (14, 2))
+    houses = np.concatenate(
+        [
+            np.column_stack([c + rng.uniform(-6, 6, (60, 2)), rng.uniform(3.0, 9.0) + rng.normal(0, 0.3, 60)])
+            for c in corners
+        ]
+    )
+    xyz = np.concatenate([ground, houses])
+    focal = _FOCAL_PX * (1.0 + 0.02 * rng.normal())
+    center = np.array([_WIDTH, _HEIGHT]) / 2 + 0.01 * _WIDTH * rng.normal(size=2)
+    params = (focal, focal * (1 + 3e-4 * rng.normal()), *center, *rng.normal(0, [0.03, 0.02, 1e-3, 1e-3]))
+    return Scene(
+        xyz=xyz,
+        descriptors=rootsift_8bit(rng.gamma(0.4, size=(len(xyz), 128)).astype(np.float32)),
+        lens=Camera(model="OPENCV", width=_WIDTH, height=_HEIGHT, params=tuple(map(float, params))),
+        rng=rng,
+        fingerprint=LocaliseOptions().extractor.fingerprint,
+    )
+
+
+def looking_down(center: Sequence[float], tilt_deg: float, heading_deg: float) -> Rigid3:
+    """cam_from_local of a camera at `center`, tilted from straight down."""
+    tilt, heading = np.radians([tilt_deg, heading_deg])
+    turn = Rigid3.exp(np.array([0.0, 0.0, heading, 0.0, 0.0, 0.0])).rotation
+    lean = Rigid3.exp(np.array([tilt, 0.0, 0.0, 0.0, 0.0, 0.0])).rotation
+    rotation = lean @ np.diag([1.0, -1.0, -1.0]) @ turn
+    return Rigid3(rotation=rotation, translation=-rotation @ np.array(center))
+
+
+def flight(rng: np.random.Generator) -> list[Rigid3]:
+    """Four lines of six photos, there and back."""
+    poses = []
+    for line, y in enumerate(np.linspace(-33.0, 33.0, 4)):
+        for x in np.linspace(-40.0, 40.0, 6) * (1 if line % 2 == 0 else -1):
+            center = np.array([x, y, 45.0]) + rng.normal(0.0, [1.0, 1.0, 0.5])
+            poses.append(looking_down(center.tolist(), abs(rng.normal(0, 4)), 90.0 + 180.0 * (line % 2)))
+    return poses
+
+
+def _map_of(scene: Scene, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m: float) -> FeatureMap | None:
+    """What an ingest makes of the photos once their features are matched."""
+    shown = [scene.seen(pose) for pose in poses]
+    centers = np.array([pose.center for pose in poses])
+    part = sigma_m / np.sqrt(2.0)
+    measured = centers + scene.rng.normal(0.0, part, 3) + scene.rng.normal(0.0, part, centers.shape)
+    photos = [_photo(k, frame, position, sigma_m) for k, position in enumerate(measured)]
+    with tempfile.TemporaryDirectory() as scratch:
+        model = _model_of(scene, shown, measured, sigma_m, Path(scratch))
+    if model is None:
+        return None
+    chosen = [photos[row] for row in model.rows]
+    own, _, placed = placed_by_gps(model, chosen, GpsOptions())
+    if placed.local_from_sfm is None or placed.covariance is None or placed.reason or own is None:
+        return None
+    placement = Placement(
+        method="gps",
+        local_from_sfm=placed.local_from_sfm,
+        covariance=placed.covariance,
+        residual_rms_m=placed.residual_rms_m,
+    )
+    features = [
+        PhotoFeatures(features=shown[row][1], rgb=np.zeros((len(shown[row][1]), 3), np.uint8))
+        for row in model.rows
+    ]
+    identity = MapIdentity(map_id="draw", name="draw", source="", licence="", provenance={})
+    made = build_map(
+        model, placement, own, chosen, features, identity, MapOptions(height_datum="ellipsoidal")
+    )
+    return None if made is None else replace(made, status="active")
+
+
+def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float) -> Photo:
+    latitude, longitude, height = frame.geodetic_from_enu(position[None])[0]
+    return Photo(
+        name=f"{number:02d}.jpg",
+        path=Path(f"{number:02d}.jpg"),
+        sha256=f"{number:064x}",
+        width=_WIDTH,
+        height=_HEIGHT,
+        camera_key=_KEY,
+        focal_px=_FOCAL_PX,
+        gps=GeoPrior(
+            latitude_deg=float(latitude),
+            longitude_deg=float(longitude),
+            height_m=float(height),
+            sigma_horizontal_m=sigma_m,
+            sigma_vertical_m=sigma_m,
+        ),
+        altitude_reference="ellipsoid",
+    )
+
+
+def _model_of(
+    scene: Scene,
+    shown: Sequence[tuple[NDArray[np.int64], Features]],
+    measured: FloatArray,
+    sigma_m: float,
+    work: Path,
+) -> Model | None:
+    """Structure from motion, with a camera that starts as EXIF says."""
+    start = Camera.from_focal(_WIDTH, _HEIGHT, _FOCAL_PX)
+    photos = tuple(
+        SfmPhoto(
+            name=f"{k:02d}.jpg",
+            camera_row=0,
+            keypoints=features.xy,
+            prior_position=position,
+            prior_covariance=sigma_m**2 * np.eye(3),
+        )
+        for k, ((_, features), position) in enumerate(zip(shown, measured, strict=True))
+    )
+    pairs = {}
+    for i, j in combinations(range(len(photos)), 2):
+        both, a, b = np.intersect1d(shown[i][0], shown[j][0], return_indices=True)
+        if len(both) >= 30:
+            matches = np.column_stack([a, b]).astype(np.uint32)
+            pairs[i, j] = verify_pair(
+                start, shown[i][1].xy, start, shown[j][1].xy, matches,
+                focal_known=True, max_error_px=4.0, seed=0,
+            )  # fmt: skip
+    database, output = work / "colmap.db", work / "models"
+    output.mkdir()
+    write_database(database, [(start, True)], photos, pairs)
+    run_incremental(database, work, output, mapping_settings(SfmOptions(), _WIDTH), lambda: None)
+    known = Known(photos=photos, focal_px={1: _FOCAL_PX})
+    adjust_models(output, database, known, 0.5, AdjustOptions())
+    return max(read_models(output), key=lambda model: len(model.rows), default=None)
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--draws", type=int, default=300)
+    parser.add_argument("--sigma", type=float, nargs="+", default=[0.02, 0.5, 3.0], help="of positions, m")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
