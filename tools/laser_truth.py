@@ -7,8 +7,9 @@ database, with exact positions and the EXIF of one camera whose focal length is 
 millimetre of 35 mm film. The other photos are asked of a server twice: with their true camera, and with EXIF
 alone. Prints, for the map's cameras and for both kinds of answers: the median and largest error of position
 and orientation, the median of the 68 % radius that was reported, and the baseline's median
-(`tools.laser_baseline`). Exit code 0 if every median is at most 1.5 times the baseline's and at most 1.5
-times the reported radius.
+(`tools.laser_baseline`); and how far the map's lens is from the true one, over the standard deviations that
+the map stores of it (root mean square of its parameters: 1 is right). Exit code 0 if every median is at most
+1.5 times the baseline's and at most 1.5 times the reported radius.
 """
 
 import argparse
@@ -24,8 +25,10 @@ import numpy as np
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from reloc.answer import placement_covariance, radius_68
+from reloc.lens_prior import lens_of, seen_by_a_map
 from reloc.wire import CameraRequest
 from tools.figures import add_json_option, write_figures
 from tools.laser_baseline import colmap_given_the_lens
@@ -82,7 +85,7 @@ def judged(truth: LaserSet, work: Path) -> dict[str, float]:
         "map": pose_errors(baseline.mapped, truth.poses),
         "asked": pose_errors(baseline.asked, truth.poses),
     }
-    return figures_of(kinds, theirs)
+    return figures_of(kinds, theirs) | {"lens_off": lens_error(maps, truth)}
 
 
 def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dict[str, float]:
@@ -109,6 +112,17 @@ def figures_of(kinds: Mapping[str, Errors], theirs: Mapping[str, Errors]) -> dic
         ratios.append(1.0 if errors.metres and len(errors.metres) == errors.wanted else float("inf"))
     figures["worst"] = float(np.nan_to_num(ratios, nan=np.inf).max())
     return figures
+
+
+def lens_error(maps: Sequence[FeatureMap], truth: LaserSet) -> float:
+    """Root mean square of the lens's errors over their standard deviations, of the map with most images."""
+    largest = max(maps, key=lambda one: len(one.images))
+    uncertainty = LensUncertainty.of_provenance(largest.provenance)
+    seen = None if uncertainty is None else seen_by_a_map(truth.camera, uncertainty)
+    if seen is None:
+        return float("nan")
+    off = (lens_of(largest.cameras[0]) - seen[1].mean) / seen[1].sigma
+    return float(np.sqrt(np.mean(off**2)))
 
 
 def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
@@ -174,7 +188,8 @@ def text(figures: Mapping[str, Any]) -> str:
             )
             line += "".join(f"{v:>{w}.{digits}f}" for v, w in zip(values, (8, 9, 10, 8), strict=True))
         lines.append(line)
-    return "\n".join([*lines, f"  worst ratio {figures['worst']:.2f}"])
+    last = f"  worst ratio {figures['worst']:.2f}; lens off by {figures['lens_off']:.2f} of its sigmas (rms)"
+    return "\n".join([*lines, last])
 
 
 def _median(values: Sequence[float]) -> float:

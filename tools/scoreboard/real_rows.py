@@ -67,15 +67,16 @@ def _laser(name: str, photos: int, form: Form) -> Row:
         commands=(("tools.laser_truth", f"{{data}}/strecha/{name}", *OUT),),
         figures=same(
             *("map_found", "map_m", "told_m", "unknown_m", "map_colmap_m", "told_colmap_m", "map_deg"),
-            *("told_deg", "unknown_deg", "map_reported_deg", "told_reported_m", "worst"),
+            *("told_deg", "unknown_deg", "map_reported_deg", "told_reported_m", "worst", "lens_off"),
         ),
         text="{map_found} photos; map {map_m:.4f} m and {map_deg:.3f} degrees (COLMAP {map_colmap_m:.4f} m), "
         "told {told_m:.4f} m and {told_deg:.3f}, unknown {unknown_m:.4f} m and {unknown_deg:.3f} "
-        "(COLMAP {told_colmap_m:.4f} m); worst ratio {worst:.1f}",
+        "(COLMAP {told_colmap_m:.4f} m); worst ratio {worst:.1f}; lens off by {lens_off:.1f} of its sigmas",
         limits=(
             Limit(figure="map_found", least=photos),
             Limit(figure="map_deg", most=0.1),
             Limit(figure="worst", most=1.5),
+            Limit(figure="lens_off", most=1.8),  # 99.9 % of eight parameters
         ),
         needs=(f"strecha/{name}",),
         minutes=1,

@@ -76,7 +76,7 @@ SIMULATED: tuple[Row, ...] = (
         name="lens-draws",
         group="simulated",
         form="full",
-        claim="900 flights with lenses that nobody knows and positions of 0.02, 0.5 and 3 m; 20 answers each: "
+        claim="900 flights with lenses that nobody knows, positions of 0.02, 0.5 and 3 m; 20 answers each: "
         "errors inside the bounds of position and orientation",
         commands=(("tools.lens_draws", "--draws", "300", *OUT),),
         figures=same(
