@@ -32,6 +32,7 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
@@ -47,7 +48,6 @@ from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
 from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.register.gps import similarity_closed_form
 from ingest.scan import ScanOptions, require_usable, scan_folder
 from ingest.workspace import Workspace
 from reloc.localiser import Localiser

@@ -21,11 +21,11 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import pose_difference
 from featuredb.store import Database
 from featuredb.video.folder import natural_key
-from ingest.register.gps import similarity_closed_form
 from reloc.localiser import Localiser
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import track_video

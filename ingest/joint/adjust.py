@@ -19,6 +19,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap_anchored import Anchored, FixedPoints, Lenses, adjust_anchored
 from ingest.colmap_bridge import Model
@@ -28,7 +29,6 @@ from ingest.joint.joined import Joined, join_maps
 from ingest.joint.judge import describe, placement_sigma_m, refusal
 from ingest.joint.links import find_links
 from ingest.joint.values import JointAdjustment, JointOptions
-from ingest.register.gps import similarity_closed_form
 
 _AS_SURE = 2.0  # anchors up to so many times as uncertain as the surest hold the place of all
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints
 from featuredb.maps.subset import take_observations
 from ingest.colmap_anchored import Anchored
@@ -16,7 +17,6 @@ from ingest.colmap_bridge import Model
 from ingest.joint.joined import Joined, MapRows, observed_pixels
 from ingest.joint.values import JOINT, AdjustedMap
 from ingest.precision import linearise, point_covariances, residual_variance, upper_triangle
-from ingest.register.gps import similarity_closed_form
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,6 +6,7 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap_anchored import Anchored
 from ingest.colmap_bridge import Model
@@ -13,7 +14,6 @@ from ingest.growth.map_graph import place_sigmas_m
 from ingest.joint.adjusted_map import kept_observations
 from ingest.joint.joined import Joined, observed_pixels
 from ingest.joint.values import AdjustedMap, JointOptions
-from ingest.register.gps import similarity_closed_form
 
 
 def describe(

@@ -12,13 +12,14 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap_bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
 from ingest.photo_positions import gps_priors, local_frame_of
-from ingest.register.gps import GpsOptions, place_by_gps, similarity_closed_form
+from ingest.register.gps import GpsOptions, place_by_gps
 
 Axes = Literal["enu", "utm", "ecef"]
 # A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the

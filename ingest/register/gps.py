@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -107,7 +107,7 @@ def place_by_gps(
         )
     sim, inliers = start
     for _ in range(10):  # inliers settle in two or three rounds
-        sim = _refine(sim, centers_sfm[inliers], positions_local[inliers], sigmas_m[inliers])
+        sim = refined_similarity(sim, centers_sfm[inliers], positions_local[inliers], sigmas_m[inliers])
         again = _distances(sim, centers_sfm, positions_local, sigmas_m) <= options.outlier_sigmas
         if (again == inliers).all() or again.sum() < options.min_photos:
             break
@@ -256,48 +256,6 @@ def _samples(count: int, options: GpsOptions) -> list[NDArray[np.int64]]:
         return [np.array(c) for c in itertools.combinations(range(count), 3)]
     generator = np.random.default_rng(options.seed)
     return [generator.choice(count, 3, replace=False) for _ in range(options.max_ransac_samples)]
-
-
-def similarity_closed_form(source: FloatArray, target: FloatArray) -> Sim3 | None:
-    """Least-squares similarity target = S source, both (n, 3) (Umeyama 1991); None if points coincide."""
-    source_mean, target_mean = source.mean(axis=0), target.mean(axis=0)
-    a, b = source - source_mean, target - target_mean
-    variance = float((a**2).sum())
-    cross = b.T @ a
-    if variance < 1e-18 or float((b**2).sum()) < 1e-12:
-        return None
-    rotation = nearest_rotation(cross)
-    scale = float(np.trace(rotation.T @ cross)) / variance
-    if scale <= 0:
-        return None
-    return Sim3(scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean)
-
-
-def _refine(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> Sim3:
-    """Levenberg-Marquardt on the tangent, weighted by the sigmas."""
-    damping, cost = 1e-3, _cost(sim, centers, positions, sigmas)
-    for _ in range(50):
-        placed = sim.act(centers)
-        jacobian = (point_jacobian(placed) / sigmas[:, :, None]).reshape(-1, 7)
-        residual = ((positions - placed) / sigmas).ravel()
-        normal = jacobian.T @ jacobian
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residual)
-        candidate = Sim3.exp(step) @ sim
-        new_cost = _cost(candidate, centers, positions, sigmas)
-        if new_cost <= cost:
-            converged = cost - new_cost <= 1e-12 * max(cost, 1e-12)
-            sim, cost, damping = candidate, new_cost, damping / 10.0
-            if converged:
-                break
-        else:
-            damping *= 10.0
-            if damping > 1e8:
-                break
-    return sim
-
-
-def _cost(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> float:
-    return float((((positions - sim.act(centers)) / sigmas) ** 2).sum())
 
 
 def _distances(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from featuredb.cli.main import main
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, MapObservations
 from featuredb.store import Database
 from ingest.growth.map_graph import growth_of, place_of
@@ -21,7 +22,6 @@ from ingest.joint.in_database import adjust_maps
 from ingest.joint.joined import join_maps
 from ingest.joint.links import Links
 from ingest.joint.values import JointOptions
-from ingest.register.gps import similarity_closed_form
 from tests.support.scene_strip import POINTS, east, grown, strip_map
 
 _HALF_A_METRE = np.diag(np.repeat([1e-7, 0.5], [4, 3]) ** 2)

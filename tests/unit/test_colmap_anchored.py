@@ -9,6 +9,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from ingest.colmap_anchored import (
     AnchoredOptions,
     FixedPoints,
@@ -18,7 +19,6 @@ from ingest.colmap_anchored import (
     with_observations,
 )
 from ingest.colmap_bridge import Model, SfmPhoto, TwoView
-from ingest.register.gps import similarity_closed_form
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors, ring
 

@@ -7,12 +7,12 @@ from scipy.stats import chi2
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
 from ingest.register.gps import (
     GpsOptions,
     GpsPlacement,
     noise_variance_factor,
     place_by_gps,
-    similarity_closed_form,
 )
 
 _OPTIONS = GpsOptions()

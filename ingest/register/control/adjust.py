@@ -26,8 +26,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.similarity import refined_similarity
 from ingest.colmap_adjust import block_variance_px2
-from ingest.register.control.fit import Vertical, refine
+from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import on_ground
 
@@ -174,7 +175,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
         lost = np.isnan(previous.control_xyz)
         xyz = np.where(lost, change.act(xyz), previous.control_xyz)
         vertical = None if vertical is None else vertical.moved(change)
-    move = refine(Sim3.identity(), xyz[used], control.surveyed[used], vertical, weights.control_m)
+    move = refined_similarity(Sim3.identity(), xyz[used], control.surveyed[used], weights.control_m, vertical)
     start, xyz, vertical = (
         block.moved(move),
         move.act(xyz),

@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import intersect, mark_errors, on_ground
-from ingest.register.gps import similarity_closed_form
 
 _MOST_PAIRS = 45  # of one point's marks: all of ten
 _SIGMA_OF_MEDIAN = {
@@ -185,7 +185,7 @@ def fit_similarity(
         sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical, options)
         chosen = _choose(found, lengths, len(surveyed), options.outlier_sigmas * sigma)
         inliers = lengths[chosen] <= options.outlier_sigmas * sigma
-        refined = refine(sim, xyz[chosen][inliers], surveyed[inliers], vertical, sigma)
+        refined = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
         moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
         sim = refined
         if moved < 1e-6:
@@ -312,27 +312,3 @@ def _choose(
             ),
         )
     return chosen
-
-
-def refine(
-    sim: Sim3, xyz: FloatArray, surveyed: FloatArray, vertical: Vertical | None, sigma_m: float | FloatArray
-) -> Sim3:
-    """Least squares on the tangent, with what is known of the vertical.
-
-    Args:
-        xyz, surveyed: (n, 3), surveyed NaN where unknown. sigma_m: of surveyed coordinates, one or (3,).
-    """
-    for _ in range(20):
-        placed = sim.act(xyz)
-        known = np.isfinite(surveyed).ravel()
-        weight = np.broadcast_to(1.0 / np.asarray(sigma_m), surveyed.shape).ravel()[known]
-        jacobian = point_jacobian(placed).reshape(-1, 7)[known] * weight[:, None]
-        residual = (surveyed - placed).ravel()[known] * weight
-        if vertical is not None:
-            jacobian = np.vstack([jacobian, vertical.jacobian(sim)])
-            residual = np.concatenate([residual, -vertical.residual(sim)])
-        step = np.linalg.lstsq(jacobian, residual, rcond=1e-14)[0]
-        sim = Sim3.exp(step) @ sim
-        if np.abs(step).max() < 1e-10:
-            break
-    return sim
