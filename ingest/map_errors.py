@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from featuredb.adjust.block import Block, whole_lens
 from featuredb.adjust.marginals import Marginals
@@ -65,9 +66,10 @@ def map_errors(
     noise = joint[:size, :size] - factor[:size] @ factor[:size].T
     # Priors count `dilution` times in the problem; in truth observations count so much less.
     factor *= np.sqrt(options.dilution)
-    shape = _without_similarity(block)
-    noise = shape @ noise @ shape.T
-    factor = np.concatenate([shape @ factor[:size], factor[size:]])
+    moved, fit = _similarity_of(block)
+    factor[:size] -= moved @ (fit @ factor[:size])
+    noise -= moved @ (fit @ noise)
+    noise -= (noise @ fit.T) @ moved.T
     poses = noise + factor[:size] @ factor[:size].T
     lenses = [part @ part.T for part in factor[size:].reshape(len(block.cameras), LENS_SIZE, -1)]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
@@ -103,18 +105,18 @@ def _factor(joint: FloatArray, size: int) -> FloatArray:
     return np.asarray(joint[:, free] @ (vectors[:, good] / scale[:, None] / np.sqrt(values[good])))
 
 
-def _without_similarity(block: Block) -> FloatArray:
-    """(6 k, 6 k): displacements of poses less that of the similarity that fits their centres."""
-    centers = block.centers()
-    count, middle = len(centers), centers.mean(axis=0)
-    moved = np.zeros((6 * count, 7))
-    read = np.zeros((3 * count, 6 * count))
+def _similarity_of(block: Block) -> tuple[FloatArray, FloatArray]:
+    """How poses move with a similarity (6 k, 7), and the similarity that fits their centres (7, 6 k)."""
+    arms = block.centers() - block.centers().mean(axis=0)
+    at_centers = np.concatenate([np.column_stack([arm, -skew(arm), np.eye(3)]) for arm in arms])
+    by_center = np.linalg.pinv(at_centers)
+    moved, fit = np.zeros((6 * len(arms), 7)), np.zeros((7, 6 * len(arms)))
     for k, pose in enumerate(block.cam_from_block):
-        arm = centers[k] - middle
-        moved[6 * k : 6 * k + 3, 1:4] = -pose.rotation
-        moved[6 * k + 3 : 6 * k + 6] = -pose.rotation @ np.column_stack([arm, -skew(arm), np.eye(3)])
-        read[3 * k : 3 * k + 3, 6 * k + 3 : 6 * k + 6] = -pose.rotation.T
-    return np.asarray(np.eye(6 * count) - moved @ np.linalg.pinv(read @ moved) @ read)
+        turn, shift, center = 6 * k + np.arange(3), 6 * k + 3 + np.arange(3), 3 * k + np.arange(3)
+        moved[turn, 1:4] = -pose.rotation
+        moved[shift] = -pose.rotation @ at_centers[center]
+        fit[:, shift] = -by_center[:, center] @ pose.rotation.T
+    return moved, fit
 
 
 def _modes(block: Block, noise: FloatArray, factor: FloatArray) -> ErrorModes:
@@ -124,10 +126,11 @@ def _modes(block: Block, noise: FloatArray, factor: FloatArray) -> ErrorModes:
     unit = np.ones((count, 6))
     unit[:, 3:] = 1.0 / _depths(block)[:, None]
     scaled = unit.ravel()[:, None] * factor[:size]
-    values, vectors = np.linalg.eigh(unit.ravel()[:, None] * noise * unit.ravel() + scaled @ scaled.T)
+    whole = unit.ravel()[:, None] * noise * unit.ravel() + scaled @ scaled.T
+    values, vectors = eigh(whole, subset_by_index=(max(0, size - _MOST_MODES), size - 1))
     values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
-    together = np.cumsum(values) / max(float(values.sum()), 1e-300)
-    kept = min(int(np.searchsorted(together, _KEPT)) + 1, _MOST_MODES, int((values > 0.0).sum()))
+    together = np.cumsum(values) / max(float(np.trace(whole)), 1e-300)
+    kept = min(int(np.searchsorted(together, _KEPT)) + 1, int((values > 0.0).sum()))
     root = np.sqrt(values[:kept])
     lenses = factor[size:] @ (scaled.T @ (vectors[:, :kept] / root))
     return ErrorModes(

@@ -156,3 +156,47 @@ def _block(photos: int) -> Block:
         photo_of=np.repeat(np.arange(photos), 300),
         xy=xy + rng.normal(0, 0.3, xy.shape),
     )
+
+
+def test_joint_errors_are_those_of_the_poses() -> None:
+    """The modes are nearly all of the poses' covariances; a similarity of all is no error of shape."""
+    block = _block(12)
+    found = map_errors(block, {0: 1200.0})
+    depth = np.median(np.linalg.norm(block.xyz[None] - block.centers()[:, None], axis=2), axis=1)
+    unit = np.repeat([np.ones(12), 1.0 / depth], 3, axis=0).T
+    whole = np.einsum("kii->ki", found.poses) * unit**2
+    kept = (found.modes.poses**2).sum(axis=2)
+    assert (kept <= whole * (1 + 1e-6)).all()
+    assert kept.sum() > 0.998 * whole.sum()
+    # Centres that all drift along, or grow apart, do so together with the placement.
+    shifts = np.stack(
+        [
+            -pose.rotation.T @ found.modes.poses[k, 3:] * depth[k]
+            for k, pose in enumerate(block.cam_from_block)
+        ]
+    )
+    arms = block.centers() - block.centers().mean(axis=0)
+    largest = np.abs(shifts).max()
+    assert np.abs(shifts.mean(axis=0)).max() < 1e-6 * largest
+    assert np.abs(np.einsum("ki,kir->r", arms, shifts)).max() < 1e-6 * largest
+
+
+def test_a_map_whose_lenses_are_no_opencv_has_errors_of_poses_alone() -> None:
+    fisheye = Camera(
+        model="OPENCV_FISHEYE",
+        width=1600,
+        height=1200,
+        params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
+    )
+    block = _block(6)
+    xyz = block.xyz[block.point_of]
+    pixels = np.array(
+        [
+            fisheye.project(block.cam_from_block[p].act(x[None]))[0]
+            for p, x in zip(block.photo_of, xyz, strict=True)
+        ]
+    )
+    found = map_errors(replace(block, cameras=(fisheye,), xy=pixels + 0.1), {})
+    assert found.lenses is None
+    assert (found.modes.lenses == 0).all()
+    assert np.isfinite(found.poses).all()
