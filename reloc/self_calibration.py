@@ -178,14 +178,7 @@ class LensProblem:
         return length, cost
 
     def linearise(self, pose: Rigid3, camera: Camera) -> NormalEquations:
-        """Normal equations of pixels and prior."""
-        system = self.linearise_pixels(pose, camera)
-        system.information[6:, 6:] += np.diag(self.prior.information)
-        system.gradient[6:] += (self.prior.mean - lens_of(camera)) * self.prior.information
-        return system
-
-    def linearise_pixels(self, pose: Rigid3, camera: Camera) -> NormalEquations:
-        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2), of the pixels alone."""
+        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2), and the prior."""
         in_camera = pose.act(self.points)
         # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
         front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
@@ -194,6 +187,8 @@ class LensProblem:
         weight = self.trust / (self.noise_px**2 + np.sum(residual**2, axis=1))
         information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
         gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
+        information[6:, 6:] += np.diag(self.prior.information)
+        gradient[6:] += (self.prior.mean - lens_of(camera)) * self.prior.information
         return NormalEquations(information=information, gradient=gradient)
 
 

@@ -1,8 +1,7 @@
 """One lens of many photos, estimated with all their poses: a photo alone hardly tells it from its height.
 
-Least squares over all photos, by the residuals, weights and priors of `reloc.self_calibration`; each one's
-pose is eliminated (Schur complement), since only the lens ties them. The map's points are held fixed.
-COLMAP's bundle adjustment has no priors on lenses, which three photos from above may need.
+One adjustment (`featuredb.adjust`) over the pixels of all photos, with the prior of `reloc.lens_prior`. The
+map's points are held fixed.
 """
 
 from collections.abc import Sequence
@@ -11,23 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.adjust.block import Block, whole_camera
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import LensPrior as CameraPrior
+from featuredb.adjust.terms import Marks, Terms
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.lens_prior import LensPrior, LensPriors, lens_of
+from reloc.lens_prior import LensPrior, LensPriors, with_lens
 from reloc.options import PoseOptions
-from reloc.self_calibration import (
-    LensProblem,
-    NormalEquations,
-    calibrate,
-    covariance_from_information,
-    lens_step,
-    measured_noise_px,
-    pose_step,
-    prior_cost,
-)
+from reloc.self_calibration import LensProblem, calibrate, measured_noise_px
 from reloc.wire import CameraRequest, LocaliseReply
 
 
@@ -156,20 +150,23 @@ def shared_lens(
     focal_px = float(np.median([v.camera.focal_px for v in views]))
     prior = priors.around(first, focal_px, priors.unknown_focal_rel)
     noise_px = 0.25 * pose.tolerance_rel * max(first.width, first.height)
-    problems = [_problem(view, prior, noise_px) for view in views]
+    noise = [measured_noise_px(v.pixels, v.points, v.cam_from_local, v.camera, noise_px) for v in views]
+    problems = [_problem(view, prior, noise_px, own) for view, own in zip(views, noise, strict=True)]
     alone = np.array([_alone(p, v) for p, v in zip(problems, views, strict=True)])
     while agree.sum() >= options.least_photos:
         rows = [int(r) for r in np.flatnonzero(agree)]
         start = views[max(rows, key=lambda r: len(views[r].pixels))].camera
-        joint = _Joint([problems[r] for r in rows], prior)
-        poses, camera = joint.minimised([views[r].cam_from_local for r in rows], start)
-        for r, found in zip(rows, poses, strict=True):
+        block, covariance = _together(
+            [views[r] for r in rows], [noise[r] for r in rows], whole_camera(start), prior
+        )
+        camera = block.cameras[0]
+        for r, found in zip(rows, block.cam_from_block, strict=True):
             excess[r] = problems[r].cost_of_pixels(found, camera) - alone[r]
         worst = max(rows, key=lambda r: excess[r])
         if excess[worst] <= options.max_excess:
             return SharedLens(
                 camera=camera,
-                sigmas=_sigmas(camera, joint.covariance(poses, camera)),
+                sigmas=options.sigma_scale * np.sqrt(np.diag(covariance)),
                 agree=agree,
                 excess=excess,
             )
@@ -177,10 +174,9 @@ def shared_lens(
     return None
 
 
-def _problem(view: LensView, prior: LensPrior, noise_px: float) -> LensProblem:
-    noise = measured_noise_px(view.pixels, view.points, view.cam_from_local, view.camera, noise_px)
+def _problem(view: LensView, prior: LensPrior, noise_px: float, own_px: float) -> LensProblem:
     return LensProblem(
-        pixels=view.pixels, points=view.points, noise_px=noise_px, trust=(noise_px / noise) ** 2, prior=prior
+        pixels=view.pixels, points=view.points, noise_px=noise_px, trust=(noise_px / own_px) ** 2, prior=prior
     )
 
 
@@ -192,84 +188,37 @@ def _alone(problem: LensProblem, view: LensView) -> float:
     return problem.cost_of_pixels(own.cam_from_local, own.camera)
 
 
-class _Joint:
-    """All photos' pixels, and one lens."""
-
-    def __init__(self, problems: Sequence[LensProblem], prior: LensPrior) -> None:
-        self._problems, self._prior = problems, prior
-
-    def minimised(self, poses: Sequence[Rigid3], camera: Camera) -> tuple[list[Rigid3], Camera]:
-        """Levenberg-Marquardt."""
-        found, damping = list(poses), 1e-4
-        cost = self._cost(found, camera)
-        for _ in range(50):
-            systems = self._systems(found, camera)
-            before = cost
-            while damping < 1e6:
-                steps, lens = self._step(systems, camera, damping)
-                tried = [pose_step(p, s) for p, s in zip(found, steps, strict=True)]
-                bent = lens_step(camera, lens)
-                moved = self._cost(tried, bent)
-                if moved < cost:
-                    found, camera, cost = tried, bent, moved
-                    damping = max(0.3 * damping, 1e-10)
-                    break
-                damping *= 10.0
-            if before - cost < 1e-9 * before:
-                break
-        return found, camera
-
-    def covariance(self, poses: Sequence[Rigid3], camera: Camera) -> FloatArray:
-        """Of the lens, in the order of `lens_of`; the poses marginalised."""
-        information = np.diag(self._prior.information)
-        for system in self._systems(poses, camera):
-            information = information + _without_pose(system, 0.0)[0]
-        return covariance_from_information(information)
-
-    def _cost(self, poses: Sequence[Rigid3], camera: Camera) -> float:
-        pixels = (p.cost_of_pixels(pose, camera) for p, pose in zip(self._problems, poses, strict=True))
-        return sum(pixels) + prior_cost(self._prior, camera)
-
-    def _systems(self, poses: Sequence[Rigid3], camera: Camera) -> list[NormalEquations]:
-        return [p.linearise_pixels(pose, camera) for p, pose in zip(self._problems, poses, strict=True)]
-
-    def _step(
-        self, systems: Sequence[NormalEquations], camera: Camera, damping: float
-    ) -> tuple[list[FloatArray], FloatArray]:
-        information = np.diag(self._prior.information)
-        gradient = (self._prior.mean - lens_of(camera)) * self._prior.information
-        for system in systems:
-            of_lens, by_lens = _without_pose(system, damping)
-            information, gradient = information + of_lens, gradient + by_lens
-        information = information + damping * np.diag(np.diag(information))
-        lens: FloatArray = np.linalg.solve(information, gradient).astype(np.float64)
-        steps = [
-            np.asarray(np.linalg.solve(_damped(s, damping), s.gradient[:6] - s.information[:6, 6:] @ lens))
-            for s in systems
-        ]
-        return steps, lens
-
-
-def _damped(system: NormalEquations, damping: float) -> FloatArray:
-    # The floor keeps the matrix regular where no point says anything of a parameter.
-    own = system.information[:6, :6]
-    return np.asarray(own + np.diag(np.maximum(damping * np.diag(own), 1e-9)))
-
-
-def _without_pose(system: NormalEquations, damping: float) -> tuple[FloatArray, FloatArray]:
-    """What a photo says of the lens, whatever its pose: information and gradient."""
-    across = system.information[:6, 6:]
-    solved = np.linalg.solve(_damped(system, damping), np.column_stack([across, system.gradient[:6]]))
-    return (
-        np.asarray(system.information[6:, 6:] - across.T @ solved[:, :-1]),
-        np.asarray(system.gradient[6:] - across.T @ solved[:, -1]),
+def _together(
+    views: Sequence[LensView], noise_px: Sequence[float], start: Camera, prior: LensPrior
+) -> tuple[Block, FloatArray]:
+    """The poses and the lens that all pixels say together, and the lens's covariance (8, 8)."""
+    count = [len(view.pixels) for view in views]
+    block = Block(
+        names=tuple(str(k) for k in range(len(views))),
+        cameras=(start,),
+        camera_of=np.zeros(len(views), dtype=np.int64),
+        cam_from_block=tuple(view.cam_from_local for view in views),
+        xyz=np.zeros((0, 3)),
+        point_of=np.zeros(0, dtype=np.int64),
+        photo_of=np.zeros(0, dtype=np.int64),
+        xy=np.zeros((0, 2)),
     )
+    marks = Marks(
+        xyz=np.concatenate([view.points for view in views]),
+        photo_of=np.repeat(np.arange(len(views)), count),
+        xy=np.concatenate([view.pixels for view in views]),
+        sigma_px=np.repeat(noise_px, count),
+    )
+    problem = Problem(block, Terms(keypoint_px=1.0, lenses=(_opencv(prior, start),), marks=marks))
+    problem.solve(100, 1e-10)
+    return problem.block(), problem.marginals().lens(0)
 
 
-def _sigmas(camera: Camera, covariance: FloatArray) -> FloatArray:
-    """Of OPENCV's parameters, from the covariance of `lens_of`."""
-    lens = lens_of(camera)
+def _opencv(prior: LensPrior, camera: Camera) -> CameraPrior:
+    """The prior as that of OPENCV's own parameters."""
+    lens = prior.mean
     by_lens = np.zeros((8, 8))
     by_lens[[0, 2, 3, 4, 5, 6, 7], [0, 1, 2, 3, 5, 6, 7]] = 1.0
     by_lens[1, [0, 4]] = 1.0 + lens[4], lens[0]
-    return np.asarray(np.sqrt(np.diag(by_lens @ covariance @ by_lens.T)))
+    covariance = by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
+    return CameraPrior(mean=with_lens(camera, lens), covariance=covariance)

@@ -202,12 +202,14 @@ class Problem:
                 self._ceres.add_residual_block(cost, self._loss, [self._points[point]])
 
     def _add_marks(self, marks: Marks) -> None:
-        covariance = np.eye(2) * (marks.sigma_px / self._terms.keypoint_px) ** 2
-        for xyz, photo, xy in zip(marks.xyz, marks.photo_of.tolist(), marks.xy, strict=True):
+        variance = np.broadcast_to(np.square(marks.sigma_px / self._terms.keypoint_px), len(marks.xyz))
+        for xyz, photo, xy, one in zip(
+            marks.xyz, marks.photo_of.tolist(), marks.xy, variance.tolist(), strict=True
+        ):
             lens = int(self._block.camera_of[photo])
             model = pycolmap.CameraModelId.__members__[self._block.cameras[lens].model]
             cost = cost_functions.ReprojErrorCost(
-                camera_model_id=model, point2D_cov=covariance, point2D=xy, point3D=xyz
+                camera_model_id=model, point2D_cov=one * np.eye(2), point2D=xy, point3D=xyz
             )
             self._ceres.add_residual_block(cost, self._loss, [self._poses[photo], self._lenses[lens]])
 

@@ -47,13 +47,13 @@ class Marks:
 
     Attributes:
         xyz: (c, 3) in the block's frame. photo_of: (c,) the block's photo. xy: (c, 2) full-size pixels.
-        sigma_px: of a pixel coordinate.
+        sigma_px: of a pixel coordinate, of all or (c,).
     """
 
     xyz: FloatArray
     photo_of: NDArray[np.int64]
     xy: FloatArray
-    sigma_px: float = 1.0
+    sigma_px: float | FloatArray = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

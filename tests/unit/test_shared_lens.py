@@ -63,7 +63,7 @@ def test_many_photos_tell_the_lens_better_than_each_alone() -> None:
     off = (np.array(found.camera.params) - TRUE.params) / found.sigmas
     assert np.abs(off).max() < 4.0
     # The true lens is within what is said of it, and that is not merely wide.
-    assert found.sigmas[0] < 1.0
+    assert found.sigmas[0] < 1.5
 
 
 def test_the_sigmas_hold_over_many_draws() -> None:
