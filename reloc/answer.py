@@ -12,7 +12,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import quaternion_from_matrix, skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
-from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from reloc.map_shape import shape_covariance
 from reloc.pose import PoseHypothesis, PoseUncertainty
@@ -38,8 +37,11 @@ def make_answer(
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
-    modes = ErrorModes.of_provenance(main.provenance)
-    lent = pose.camera_source == "map" or (told is not None and pose.lens_prior is None)
+    modes = area.modes[order[0]]
+    # The map's own lens stands for one that was told, where they are the same (`reloc.search`).
+    lent = pose.camera_source == "map" or (
+        told is not None and pose.lens_prior is None and pose.camera != told
+    )
     shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes, lent)
     covariance = on_earth(area, main, center, uncertainty.covariance, point_rows, shape)
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)

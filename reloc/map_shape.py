@@ -11,12 +11,13 @@ from reloc.pose import PoseHypothesis
 from reloc.self_calibration import joint_jacobians
 
 _DAMPING = 1e-9
+_WITH_DERIVATIVES = ("SIMPLE_RADIAL", "OPENCV")
 
 
 def shape_covariance(
     area: Area, main: int, pose: PoseHypothesis, rows: NDArray[np.int64], modes: ErrorModes, lent: bool
 ) -> FloatArray | None:
-    """(6, 6) in the area's axes; None where the modes do not cover the images that see the points.
+    """(6, 6) in the area's axes; None where the modes do not cover the images or the lens.
 
     Args:
         main: row of the map. rows: (k,) of the area's points that gave the pose.
@@ -24,7 +25,7 @@ def shape_covariance(
     """
     mine = rows[area.point_map[rows] == main]
     moved = _moved_points(area, main, mine, modes)
-    if moved is None:
+    if moved is None or (lent and pose.camera.model not in _WITH_DERIVATIVES):
         return None
     points, shift = moved
     own = pose.lens_prior
@@ -92,8 +93,8 @@ def _camera_of(area: Area, main: int, points: NDArray[np.int64]) -> int:
     wanted[points] = True
     first = int(np.searchsorted(area.image_map, main))
     images = area.maps[main].images
-    cameras = [images[i - first].camera_id for i in area.see_image[wanted[area.see_point]]]
-    return int(np.argmax(np.bincount(cameras)))
+    count = np.bincount(area.see_image[wanted[area.see_point]] - first, minlength=len(images))
+    return int(np.argmax(np.bincount([image.camera_id for image in images], weights=count)))
 
 
 def _as_lens_of(params: tuple[float, ...], modes: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ An area is derived from maps and can be rebuilt at any time. Only points that ca
 in it.
 """
 
+import logging
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +19,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.view_cones import view_cones
+from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,6 +48,7 @@ class Area:
         image_reach: (i,) float64, median distance of those points from the camera, metres.
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
         extractor_fingerprint: of all descriptors.
+        modes: (m,) joint errors of each map, None of those that keep none.
     """
 
     frame: LocalFrame
@@ -65,6 +70,7 @@ class Area:
     image_reach: FloatArray
     covisible: sparse.csr_array
     extractor_fingerprint: str
+    modes: tuple[ErrorModes | None, ...]
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
@@ -145,7 +151,22 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         image_reach=image_reach,
         covisible=_covisibility(see_image, see_point, image_map, image_scene, image_reach),
         extractor_fingerprint=fingerprints[0],
+        modes=tuple(_modes(feature_map) for feature_map in maps),
     )
+
+
+def _modes(feature_map: FeatureMap) -> ErrorModes | None:
+    """None, too, where they are broken: answers then rest on the covariances of single images."""
+    try:
+        modes = ErrorModes.of_provenance(feature_map.provenance)
+    except InvalidValueError as error:
+        _LOG.warning("map %s: %s", feature_map.map_id, error)
+        return None
+    if modes is not None and len(modes.lenses) != len(feature_map.cameras):
+        found, wanted = len(modes.lenses), len(feature_map.cameras)
+        _LOG.warning("map %s: error modes: expected %d lenses, found %d", feature_map.map_id, wanted, found)
+        return None
+    return modes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

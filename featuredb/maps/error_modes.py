@@ -5,6 +5,7 @@ points do not say so, and whoever is localised by those points is off with them.
 """
 
 from base64 import b64decode, b64encode
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,6 +70,13 @@ class ErrorModes:
             raise InvalidValueError(
                 f"provenance {_KEY}: expected image_id, modes, poses and lenses as base64 of float32, {error}"
             ) from error
+
+    def of(self, images: Collection[int], cameras: Sequence[int]) -> "ErrorModes":
+        """Of the images with these ids, and of cameras in this order."""
+        rows = np.flatnonzero(np.isin(self.image_id, list(images)))
+        return ErrorModes(
+            image_id=self.image_id[rows], poses=self.poses[rows], lenses=self.lenses[list(cameras)]
+        )
 
 
 def without_modes(provenance: dict[str, Any]) -> dict[str, Any]:

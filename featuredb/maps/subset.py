@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
+from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import MapObservations
 from featuredb.maps.unplaced_map import MapKind
 
@@ -38,8 +39,11 @@ def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int
     seen = feature_map.observations
     stays = np.isin(seen.image_id, np.array(sorted(wanted), dtype=np.int32))
     views = _views(seen.point_index[stays], seen.image_id[stays], len(feature_map.points))
+    modes = ErrorModes.of_provenance(feature_map.provenance)
+    kept = {} if modes is None else modes.of(wanted, cameras).as_provenance()
     part = replace(
         feature_map,
+        provenance=feature_map.provenance | kept,
         cameras=tuple(feature_map.cameras[c] for c in cameras),
         camera_keys=tuple(feature_map.camera_keys[c] for c in cameras) if feature_map.camera_keys else (),
         images=tuple(replace(image, camera_id=cameras.index(image.camera_id)) for image in images),

@@ -13,6 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.maps.error_modes import ErrorModes, without_modes
+from featuredb.maps.subset import only_images
 from reloc.map_shape import shape_covariance
 from reloc.pose import PoseHypothesis
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
@@ -82,7 +83,10 @@ def test_a_pose_is_off_as_the_map_is(lent: bool) -> None:
     assert covariance is not None
     error = np.concatenate([_turn(truth.rotation.T @ found.rotation), truth.center - found.center])
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.abs(error) / step, rtol=0.02, atol=2e-6)
-    # Images that the modes do not know: nothing can be said.
+    # A fisheye, or images that the modes do not know: nothing can be said.
+    fisheye = replace(_LENS, model="OPENCV_FISHEYE")
+    fish = shape_covariance(area, 0, replace(pose, camera=fisheye), rows, modes, lent)
+    assert (fish is None) == lent
     fewer = ErrorModes(image_id=np.arange(5), poses=modes.poses[:5], lenses=modes.lenses)
     assert shape_covariance(area, 0, pose, rows, fewer, lent) is None
 
@@ -109,3 +113,33 @@ def _located(start: Rigid3, points: FloatArray, xy: FloatArray, lens: Camera) ->
 
 def _turn(rotation: FloatArray) -> FloatArray:
     return np.array([rotation[2, 1], rotation[0, 2], rotation[1, 0]])
+
+
+def test_a_part_of_a_map_keeps_its_part_of_them() -> None:
+    rng = np.random.default_rng(2)
+    modes = ErrorModes(
+        image_id=np.arange(4), poses=rng.normal(size=(4, 6, 3)), lenses=rng.normal(size=(2, 8, 3))
+    )
+    whole = scene_map(points=box_points(rng, 40), descriptors=random_descriptors(rng, 40), poses=ring(4))
+    cameras = (whole.cameras[0], _LENS)
+    images = tuple(replace(image, camera_id=k % 2) for k, image in enumerate(whole.images))
+    whole = replace(whole, cameras=cameras, images=images, provenance=modes.as_provenance())
+    part = only_images(whole, [1, 3])
+    kept = ErrorModes.of_provenance(part.provenance)
+    assert kept is not None
+    assert part.cameras == (_LENS,)
+    np.testing.assert_allclose(kept.poses, modes.poses[[1, 3]], rtol=1e-6)
+    np.testing.assert_allclose(kept.lenses, modes.lenses[1:], rtol=1e-6)
+    assert build_area([part]).modes[0] is not None
+
+
+@pytest.mark.parametrize("lenses", [0, 3])
+def test_broken_ones_are_left_out_and_said(lenses: int, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(2)
+    whole = scene_map(points=box_points(rng, 40), descriptors=random_descriptors(rng, 40), poses=ring(4))
+    wrong = ErrorModes(image_id=np.arange(4), poses=np.ones((4, 6, 1)), lenses=np.ones((lenses, 8, 1)))
+    assert build_area([replace(whole, provenance=wrong.as_provenance())]).modes == (None,)
+    assert "error modes" in caplog.text
+    caplog.clear()
+    assert build_area([replace(whole, provenance={"error_modes": 7})]).modes == (None,)
+    assert "expected image_id" in caplog.text
