@@ -38,11 +38,7 @@ def make_answer(
     main = area.maps[order[0]]
     center = pose.cam_from_local.center
     modes = area.modes[order[0]]
-    # The map's own lens stands for one that was told, where they are the same (`reloc.search`).
-    lent = pose.camera_source == "map" or (
-        told is not None and pose.lens_prior is None and pose.camera != told
-    )
-    shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes, lent)
+    shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes)
     covariance = on_earth(area, main, center, uncertainty.covariance, point_rows, shape)
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(

@@ -3,41 +3,43 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
+from featuredb.maps.feature_map import FeatureMap
 from reloc.jacobians import pixel_jacobians
 from reloc.pose import PoseHypothesis
 from reloc.self_calibration import joint_jacobians
 
 _DAMPING = 1e-9
-_WITH_DERIVATIVES = ("SIMPLE_RADIAL", "OPENCV")
 
 
 def shape_covariance(
-    area: Area, main: int, pose: PoseHypothesis, rows: NDArray[np.int64], modes: ErrorModes, lent: bool
+    area: Area, main: int, pose: PoseHypothesis, rows: NDArray[np.int64], modes: ErrorModes
 ) -> FloatArray | None:
-    """(6, 6) in the area's axes; None where the modes do not cover the images or the lens.
+    """(6, 6) in the area's axes; None where the modes do not cover the images.
+
+    A lens of the map, which it lent, is as wrong as there and moves along.
 
     Args:
         main: row of the map. rows: (k,) of the area's points that gave the pose.
-        lent: the pose's lens is the map's, and as wrong.
     """
     mine = rows[area.point_map[rows] == main]
     moved = _moved_points(area, main, mine, modes)
-    if moved is None or (lent and pose.camera.model not in _WITH_DERIVATIVES):
+    if moved is None:
         return None
     points, shift = moved
     own = pose.lens_prior
     jacobians = pixel_jacobians if own is None else joint_jacobians
     by_point, by_own = jacobians(pose.camera, pose.cam_from_local, area.points[points])
     pixels = np.einsum("kij,kjr->kir", by_point, shift)
-    if lent:
-        camera = _camera_of(area, main, points)
+    lender = _lender(area.maps[main], pose.camera)
+    if lender is not None:
         _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
-        pixels += (
-            by_lens[:, :, 6:] @ _as_lens_of(pose.camera.params, modes.lenses[camera])[: by_lens.shape[2] - 6]
-        )
+        zoom = pose.camera.width / area.maps[main].cameras[lender].width
+        pixels += by_lens[:, :, 6:] @ _as_lens_of(pose.camera.params, modes.lenses[lender], zoom)
     normal = np.einsum("kij,kil->jl", by_own, by_own)
     if own is not None:
         normal[6:, 6:] += np.diag(own.information)
@@ -87,20 +89,22 @@ def _moved_points(
     return points, np.linalg.solve(normal + _DAMPING * trace * np.eye(3), right)
 
 
-def _camera_of(area: Area, main: int, points: NDArray[np.int64]) -> int:
-    """The map's camera that sees most of the points."""
-    wanted = np.zeros(len(area.points), dtype=np.bool_)
-    wanted[points] = True
-    first = int(np.searchsorted(area.image_map, main))
-    images = area.maps[main].images
-    count = np.bincount(area.see_image[wanted[area.see_point]] - first, minlength=len(images))
-    return int(np.argmax(np.bincount([image.camera_id for image in images], weights=count)))
+def _lender(feature_map: FeatureMap, camera: Camera) -> int | None:
+    """The map's camera that this is, of pictures of any size; None if it is none."""
+    for c, own in enumerate(feature_map.cameras):
+        try:
+            same = own.model == "OPENCV" and own.scaled_to(camera.width, camera.height) == camera
+        except InvalidValueError:  # of another shape
+            continue
+        if same:
+            return c
+    return None
 
 
-def _as_lens_of(params: tuple[float, ...], modes: FloatArray) -> FloatArray:
-    """(8, r) of OPENCV's parameters in the order of `reloc.lens_prior.lens_of`."""
+def _as_lens_of(params: tuple[float, ...], modes: FloatArray, zoom: float = 1.0) -> FloatArray:
+    """(8, r) of OPENCV's parameters as `reloc.lens_prior.lens_of` has them, of pictures so much larger."""
     fx, fy = params[0], params[1]
-    dfx, dfy, cx, cy, k1, k2, p1, p2 = modes
+    dfx, dfy, cx, cy, k1, k2, p1, p2 = modes * np.array([zoom] * 4 + [1.0] * 4)[:, None]
     return np.stack([dfx, cx, cy, k1, dfy / fx - fy / fx**2 * dfx, k2, p1, p2])
 
 

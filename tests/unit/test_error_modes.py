@@ -46,8 +46,8 @@ def test_what_is_not_ours_is_an_error(wrong: object) -> None:
         ErrorModes.of_provenance({"error_modes": wrong})
 
 
-@pytest.mark.parametrize("lent", [True, False])
-def test_a_pose_is_off_as_the_map_is(lent: bool) -> None:
+@pytest.mark.parametrize("lens_of_photo", ["the map's", "the map's, smaller", "its own"])
+def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
     """One mode, applied to the images and the lens of a map; its points triangulated and a photo located."""
     rng = np.random.default_rng(4)
     points, poses = box_points(rng, 80), ring(6)
@@ -57,38 +57,42 @@ def test_a_pose_is_off_as_the_map_is(lent: bool) -> None:
     area = build_area([feature_map])
     rows = np.unique(area.see_point)
     truth = looking_at(np.array([20.0, -30.0, 28.0]), np.array([0.0, 2.0, 4.0]))
-    seen = _LENS.project(truth.act(area.points))
     step = 1e-4
     mode = rng.normal(size=(6, 6)) * np.repeat([1e-3, 5e-4], 3) * step
     lens = np.array([5.0, 4.0, 3.0, -2.0, 5e-3, 3e-3, 2e-4, 3e-4]) * step
     off = replace(_LENS, params=tuple(np.array(_LENS.params) + lens))
+    right, wrong = _LENS, off
+    if lens_of_photo == "the map's, smaller":
+        right, wrong = right.scaled_to(500, 400), wrong.scaled_to(500, 400)
+    elif lens_of_photo == "its own":
+        right = wrong = replace(_LENS, params=(850.0, 850.0, *_LENS.params[2:]))
+    seen = right.project(truth.act(area.points))
     reach = area.image_reach
     moved = [
         Rigid3.exp(np.concatenate([m[:3], m[3:] * far])) @ pose
         for m, far, pose in zip(mode, reach, poses, strict=True)
     ]
     shifted = np.array([_triangulated(area.points[p], moved, off, poses, feature_map, area, p) for p in rows])
-    found = _located(truth, shifted, seen[rows], off if lent else _LENS)
+    found = _located(truth, shifted, seen[rows], wrong)
     modes = ErrorModes(
         image_id=np.arange(6), poses=mode[:, :, None] / step, lenses=lens[None, :, None] / step
     )
     pose = PoseHypothesis(
         cam_from_local=truth,
-        camera=_LENS,
-        camera_source="map" if lent else "request",
+        camera=right,
+        camera_source="map",
         inliers=np.ones(len(rows), np.bool_),
         prior_focal_px=None,
     )
-    covariance = shape_covariance(area, 0, pose, rows, modes, lent)
+    covariance = shape_covariance(area, 0, pose, rows, modes)
     assert covariance is not None
     error = np.concatenate([_turn(truth.rotation.T @ found.rotation), truth.center - found.center])
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.abs(error) / step, rtol=0.02, atol=2e-6)
-    # A fisheye, or images that the modes do not know: nothing can be said.
+    # Images that the modes do not know: nothing can be said. A fisheye is no lens of the map.
     fisheye = replace(_LENS, model="OPENCV_FISHEYE")
-    fish = shape_covariance(area, 0, replace(pose, camera=fisheye), rows, modes, lent)
-    assert (fish is None) == lent
+    assert shape_covariance(area, 0, replace(pose, camera=fisheye), rows, modes) is not None
     fewer = ErrorModes(image_id=np.arange(5), poses=modes.poses[:5], lenses=modes.lenses)
-    assert shape_covariance(area, 0, pose, rows, fewer, lent) is None
+    assert shape_covariance(area, 0, pose, rows, fewer) is None
 
 
 def _triangulated(start, moved, lens, poses, feature_map, area, row) -> FloatArray:  # type: ignore[no-untyped-def]
