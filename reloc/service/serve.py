@@ -28,6 +28,9 @@ def start_server(
     return Server.start(DatabaseSource(database, localise_options), options, name, inbox)
 
 
+_TURN_S = 1.0
+
+
 def serve(
     database: Database,
     options: ServeOptions | None = None,
@@ -47,7 +50,9 @@ def serve(
     try:
         with start_server(database, options, localise_options) as server:
             on_ready(server)
-            stop.wait()
+            # A signal that a library's thread receives does not end a wait: its handler runs at the next.
+            while not stop.wait(_TURN_S):
+                pass
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
