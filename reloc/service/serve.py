@@ -12,6 +12,8 @@ from reloc.service.inbox import Inbox
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
 
+_TURN_S = 1.0  # of waiting for a signal
+
 
 def start_server(
     database: Database, options: ServeOptions | None = None, localise_options: LocaliseOptions | None = None
@@ -26,9 +28,6 @@ def start_server(
     name = options.name or wire_name_of(database.url)
     inbox = Inbox(DatabaseInbox(database), options.inbox) if options.contributions else None
     return Server.start(DatabaseSource(database, localise_options), options, name, inbox)
-
-
-_TURN_S = 1.0
 
 
 def serve(

@@ -26,6 +26,8 @@ from featuredb.store import Database
 from featuredb.store.candidates import list_candidates, load_image
 from reloc.client import CameraRequest, Client, PriorRequest
 from reloc.overlay import project_utm
+from reloc.service.options import ServeOptions
+from reloc.service.serve import serve
 from reloc.wire import LocaliseReply
 from tests.support.planar_map import (
     CAMERA,
@@ -386,6 +388,25 @@ def test_a_query_is_contributed_and_the_inbox_lists_it(server, database, photos,
     assert load_image(Database.open(database), given[1]) == (photos / "a.png").read_bytes()
     assert run(*query, "--contribute", "--owner", "A. Person") == 2
     assert "expected --owner and --licence" in capsys.readouterr().err
+
+
+def test_a_stop_signal_that_another_thread_receives_ends_the_server(database):
+    """The kernel may give it to any thread; a wait of the main thread does not end by that."""
+    before = signal.getsignal(signal.SIGTERM)
+    sent: list[threading.Thread] = []
+
+    def on_ready(server):
+        def send():
+            time.sleep(0.5)  # the main thread waits by then
+            signal.pthread_kill(threading.get_ident(), signal.SIGTERM)
+            time.sleep(20.0)
+
+        sent.append(threading.Thread(target=send, daemon=True))
+        sent[0].start()
+
+    serve(Database.open(database), ServeOptions(listen=("tcp/127.0.0.1:0",)), on_ready=on_ready)
+    assert sent[0].is_alive()  # ended by the signal, not by the thread's end
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_a_server_told_to_take_no_contributions(database, photos, capsys):
