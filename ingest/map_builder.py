@@ -22,7 +22,7 @@ from ingest.extract import PhotoFeatures
 from ingest.map_errors import MapErrors, map_errors
 from ingest.own_frame import own_frame_of
 from ingest.photo import Photo
-from ingest.photo_positions import gps_priors
+from ingest.photo_positions import center_priors
 from ingest.precision import (
     Linearised,
     linearise,
@@ -77,7 +77,7 @@ def build_map(
         photos, features: of the model's registered photos, in the order of `model.rows`; features are read
             once, photo by photo.
     """
-    positions = _positions(photos, frame) if placement.method == "gps" else None
+    positions = center_priors(photos, frame) if placement.method == "gps" else None
     parts = _parts(model, placement.local_from_sfm, photos, features, identity, options, positions)
     if parts is None:
         return None
@@ -166,17 +166,6 @@ def _parts(
             "licence": identity.licence,
             "provenance": provenance,
         },
-    )
-
-
-def _positions(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:
-    """Of the photos that say one."""
-    xyz, sigmas = gps_priors(photos, frame)
-    rows = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
-    if len(rows) < 3:
-        return None
-    return CenterPriors(
-        photo_of=rows, xyz=xyz[rows], covariance=np.array([np.diag(s**2) for s in sigmas[rows]])
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from featuredb.adjust.terms import CenterPriors
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from ingest.photo import Photo
@@ -54,3 +55,18 @@ def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[Float
             assert gps is not None
             sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
     return positions, sigmas
+
+
+def center_priors(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:
+    """Measured centres for an adjustment in the frame: of positions that somebody answers for.
+
+    Returns:
+        None where fewer than three photos have one: they do not tell a similarity.
+    """
+    xyz, sigmas = gps_priors(photos, frame)
+    hints = np.array([photo.gps_is_hint for photo in photos], dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(sigmas).all(axis=1) & ~hints)
+    if len(rows) < 3:
+        return None
+    covariance = np.array([np.diag(sigma**2) for sigma in sigmas[rows]])
+    return CenterPriors(photo_of=rows, xyz=xyz[rows], covariance=covariance)

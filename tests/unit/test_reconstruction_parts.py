@@ -15,7 +15,7 @@ from ingest.colmap_bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.photo import Photo
 from ingest.photo_cameras import photo_cameras
-from ingest.photo_positions import local_frame_of
+from ingest.photo_positions import center_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions
 from ingest.sfm import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
@@ -80,6 +80,19 @@ def test_a_stray_position_does_not_move_the_frame() -> None:
     assert frame.longitude_deg == pytest.approx(8.41, abs=1e-3)
     assert frame.height_m == pytest.approx(202.0, abs=3.0)
     assert local_frame_of([_PHOTO]) is None
+
+
+def test_measured_centres_are_those_that_somebody_answers_for() -> None:
+    tagged = [_at(48.99 + 1e-4 * k, 8.41, 200.0 + k) for k in range(5)]
+    photos = [_PHOTO, replace(tagged[0], gps_is_hint=True), *tagged[1:4], _at(48.99, 8.41, None)]
+    frame = local_frame_of(tagged)
+    assert frame is not None
+    found = center_priors(photos, frame)
+    assert found is not None
+    assert found.photo_of.tolist() == [2, 3, 4]  # no position, a hint and one without height say nothing
+    np.testing.assert_allclose(found.covariance[0], np.diag([9.0, 9.0, 25.0]))
+    np.testing.assert_allclose(np.diff(found.xyz[:, 2]), 1.0, atol=1e-2)
+    assert center_priors(photos[:4], frame) is None
 
 
 def _model(rows: list[int]) -> Model:
