@@ -160,6 +160,14 @@ def lens_of(camera: Camera) -> FloatArray:
     )
 
 
+def opencv_by_lens(lens: FloatArray) -> FloatArray:
+    """(8, 8) derivatives of OPENCV's parameters by those of `lens_of` (8,)."""
+    derivatives = np.zeros((8, 8))
+    derivatives[[0, 2, 3, 4, 5, 6, 7], [0, 1, 2, 3, 5, 6, 7]] = 1.0
+    derivatives[1, [0, 4]] = 1.0 + lens[4], lens[0]
+    return derivatives
+
+
 def whole_lens(lens: FloatArray) -> FloatArray:
     """(8,) with what a SIMPLE_RADIAL lens has not."""
     return np.concatenate([lens, np.zeros(8 - len(lens))])

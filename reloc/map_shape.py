@@ -10,6 +10,7 @@ from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
 from reloc.jacobians import pixel_jacobians
+from reloc.lens_prior import lens_of, opencv_by_lens
 from reloc.pose import PoseHypothesis
 from reloc.self_calibration import joint_jacobians
 
@@ -39,7 +40,7 @@ def shape_covariance(
     if lender is not None:
         _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
         zoom = pose.camera.width / area.maps[main].cameras[lender].width
-        pixels += by_lens[:, :, 6:] @ _as_lens_of(pose.camera.params, modes.lenses[lender], zoom)
+        pixels += by_lens[:, :, 6:] @ _as_lens_of(pose.camera, modes.lenses[lender], zoom)
     normal = np.einsum("kij,kil->jl", by_own, by_own)
     if own is not None:
         normal[6:, 6:] += np.diag(own.information)
@@ -82,7 +83,7 @@ def _moved_points(
         mode = modes.poses[place[photo.image_id]].copy()
         mode[3:] *= area.image_reach[image]
         pixels = left @ mode
-        pixels += by_pose[:, :, 6:] @ _as_lens_of(camera.params, modes.lenses[photo.camera_id])
+        pixels += by_pose[:, :, 6:] @ _as_lens_of(camera, modes.lenses[photo.camera_id])
         normal[sees] += np.swapaxes(by_point, 1, 2) @ by_point
         right[sees] -= np.swapaxes(by_point, 1, 2) @ pixels
     trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
@@ -101,11 +102,10 @@ def _lender(feature_map: FeatureMap, camera: Camera) -> int | None:
     return None
 
 
-def _as_lens_of(params: tuple[float, ...], modes: FloatArray, zoom: float = 1.0) -> FloatArray:
+def _as_lens_of(camera: Camera, modes: FloatArray, zoom: float = 1.0) -> FloatArray:
     """(8, r) of OPENCV's parameters as `reloc.lens_prior.lens_of` has them, of pictures so much larger."""
-    fx, fy = params[0], params[1]
-    dfx, dfy, cx, cy, k1, k2, p1, p2 = modes * np.array([zoom] * 4 + [1.0] * 4)[:, None]
-    return np.stack([dfx, cx, cy, k1, dfy / fx - fy / fx**2 * dfx, k2, p1, p2])
+    scaled = modes * np.repeat([zoom, 1.0], 4)[:, None]
+    return np.asarray(np.linalg.solve(opencv_by_lens(lens_of(camera)), scaled))
 
 
 def _skews(vectors: FloatArray) -> FloatArray:

@@ -19,7 +19,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.lens_prior import LensPrior, LensPriors, with_lens
+from reloc.lens_prior import LensPrior, LensPriors, opencv_by_lens, with_lens
 from reloc.options import PoseOptions
 from reloc.self_calibration import LensProblem, calibrate, measured_noise_px
 from reloc.wire import CameraRequest, LocaliseReply
@@ -216,9 +216,6 @@ def _together(
 
 def _opencv(prior: LensPrior, camera: Camera) -> CameraPrior:
     """The prior as that of OPENCV's own parameters."""
-    lens = prior.mean
-    by_lens = np.zeros((8, 8))
-    by_lens[[0, 2, 3, 4, 5, 6, 7], [0, 1, 2, 3, 5, 6, 7]] = 1.0
-    by_lens[1, [0, 4]] = 1.0 + lens[4], lens[0]
+    by_lens = opencv_by_lens(prior.mean)
     covariance = by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
-    return CameraPrior(mean=with_lens(camera, lens), covariance=covariance)
+    return CameraPrior(mean=with_lens(camera, prior.mean), covariance=covariance)

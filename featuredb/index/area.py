@@ -158,15 +158,10 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
 def _modes(feature_map: FeatureMap) -> ErrorModes | None:
     """None, too, where they are broken: answers then rest on the covariances of single images."""
     try:
-        modes = ErrorModes.of_provenance(feature_map.provenance)
+        return ErrorModes.of_provenance(feature_map.provenance, len(feature_map.cameras))
     except InvalidValueError as error:
         _LOG.warning("map %s: %s", feature_map.map_id, error)
         return None
-    if modes is not None and len(modes.lenses) != len(feature_map.cameras):
-        found, wanted = len(modes.lenses), len(feature_map.cameras)
-        _LOG.warning("map %s: error modes: expected %d lenses, found %d", feature_map.map_id, wanted, found)
-        return None
-    return modes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

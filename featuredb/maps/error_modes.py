@@ -25,7 +25,8 @@ class ErrorModes:
 
     Attributes:
         image_id: (k,) of the map's images.
-        poses: (k, 6, r) left perturbation of cam_from_local: rad, and shares of the image's `depth`.
+        poses: (k, 6, r) left perturbation of cam_from_local: rad, and shares of the median distance of the
+            points that the image sees.
         lenses: (c, 8, r) of OPENCV's parameters of the map's cameras; zero for others.
     """
 
@@ -50,11 +51,14 @@ class ErrorModes:
         return {_KEY: written}
 
     @classmethod
-    def of_provenance(cls, provenance: dict[str, Any]) -> "ErrorModes | None":
+    def of_provenance(cls, provenance: dict[str, Any], cameras: int) -> "ErrorModes | None":
         """None for maps that keep none.
 
+        Args:
+            cameras: of the map.
+
         Raises:
-            InvalidValueError: it is not what `as_provenance` writes.
+            InvalidValueError: it is not what `as_provenance` writes of such a map.
         """
         written = provenance.get(_KEY)
         if written is None:
@@ -63,13 +67,13 @@ class ErrorModes:
             ids = np.array(written["image_id"], dtype=np.int64)
             modes = int(written["modes"])
             poses = _numbers(written["poses"]).reshape(len(ids), 6, modes)
-            return cls(
-                image_id=ids, poses=poses, lenses=_numbers(written["lenses"]).reshape(-1, LENS_SIZE, modes)
-            )
-        except (KeyError, TypeError, ValueError) as error:
+            lenses = _numbers(written["lenses"]).reshape(cameras, LENS_SIZE, modes)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InvalidValueError(
-                f"provenance {_KEY}: expected image_id, modes, poses and lenses as base64 of float32, {error}"
+                f"provenance {_KEY}: expected image_id, modes, and poses and lenses of as many images and "
+                f"{cameras} cameras as base64 of float32; found: {error}"
             ) from error
+        return cls(image_id=ids, poses=poses, lenses=lenses)
 
     def of(self, images: Collection[int], cameras: Sequence[int]) -> "ErrorModes":
         """Of the images with these ids, and of cameras in this order."""

@@ -24,7 +24,7 @@ def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int
         image_ids: of the images that stay. min_views: points that fewer of them see are left out.
 
     Raises:
-        InvalidValueError: an id that the map does not have.
+        InvalidValueError: an id that the map does not have, or broken `error_modes`.
     """
     wanted = set(image_ids)
     unknown = wanted - {image.image_id for image in feature_map.images}
@@ -39,7 +39,7 @@ def only_images(feature_map: MapKind, image_ids: Collection[int], min_views: int
     seen = feature_map.observations
     stays = np.isin(seen.image_id, np.array(sorted(wanted), dtype=np.int32))
     views = _views(seen.point_index[stays], seen.image_id[stays], len(feature_map.points))
-    modes = ErrorModes.of_provenance(feature_map.provenance)
+    modes = ErrorModes.of_provenance(feature_map.provenance, len(feature_map.cameras))
     kept = {} if modes is None else modes.of(wanted, cameras).as_provenance()
     part = replace(
         feature_map,

@@ -1,6 +1,7 @@
 """Joint errors of a map: their storage, and what they make of a pose that was found by its points."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.index.area import build_area
+from featuredb.index.area import Area, build_area
 from featuredb.maps.error_modes import ErrorModes, without_modes
 from featuredb.maps.subset import only_images
 from reloc.map_shape import shape_covariance
@@ -29,21 +30,28 @@ def test_provenance_keeps_them() -> None:
         image_id=np.array([3, 0, 7]), poses=rng.normal(size=(3, 6, 5)), lenses=rng.normal(size=(2, 8, 5))
     )
     written = json.loads(json.dumps({"version": "1"} | modes.as_provenance()))
-    read = ErrorModes.of_provenance(written)
+    read = ErrorModes.of_provenance(written, 2)
     assert read is not None
     np.testing.assert_array_equal(read.image_id, modes.image_id)
     np.testing.assert_allclose(read.poses, modes.poses, rtol=1e-6)
     np.testing.assert_allclose(read.lenses, modes.lenses, rtol=1e-6)
-    assert ErrorModes.of_provenance({"version": "1"}) is None
+    assert ErrorModes.of_provenance({"version": "1"}, 2) is None
     assert without_modes(written) == {"version": "1"}
 
 
 @pytest.mark.parametrize(
-    "wrong", [[], {"image_id": [0], "modes": 2, "poses": "AAAA", "lenses": ""}, {"image_id": [0]}, "text"]
+    "wrong",
+    [
+        [],
+        {"image_id": [0], "modes": 2, "poses": "AAAA", "lenses": ""},
+        {"image_id": [0]},
+        "text",
+        {"image_id": [1 << 70]},
+    ],
 )
 def test_what_is_not_ours_is_an_error(wrong: object) -> None:
     with pytest.raises(InvalidValueError, match="error_modes: expected"):
-        ErrorModes.of_provenance({"error_modes": wrong})
+        ErrorModes.of_provenance({"error_modes": wrong}, 1)
 
 
 @pytest.mark.parametrize("lens_of_photo", ["the map's", "the map's, smaller", "its own"])
@@ -72,7 +80,7 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
         Rigid3.exp(np.concatenate([m[:3], m[3:] * far])) @ pose
         for m, far, pose in zip(mode, reach, poses, strict=True)
     ]
-    shifted = np.array([_triangulated(area.points[p], moved, off, poses, feature_map, area, p) for p in rows])
+    shifted = np.array([_triangulated(area, p, poses, moved, off) for p in rows])
     found = _located(truth, shifted, seen[rows], wrong)
     modes = ErrorModes(
         image_id=np.arange(6), poses=mode[:, :, None] / step, lenses=lens[None, :, None] / step
@@ -95,7 +103,11 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
     assert shape_covariance(area, 0, pose, rows, fewer) is None
 
 
-def _triangulated(start, moved, lens, poses, feature_map, area, row) -> FloatArray:  # type: ignore[no-untyped-def]
+def _triangulated(
+    area: Area, row: int, poses: Sequence[Rigid3], moved: Sequence[Rigid3], lens: Camera
+) -> FloatArray:
+    """Where a point comes to lie whose pixels are those of the true poses and lens."""
+    start = area.points[row]
     images = area.see_image[area.see_point == row]
     xy = [_LENS.project(poses[i].act(start[None]))[0] for i in images]
 
@@ -129,7 +141,7 @@ def test_a_part_of_a_map_keeps_its_part_of_them() -> None:
     images = tuple(replace(image, camera_id=k % 2) for k, image in enumerate(whole.images))
     whole = replace(whole, cameras=cameras, images=images, provenance=modes.as_provenance())
     part = only_images(whole, [1, 3])
-    kept = ErrorModes.of_provenance(part.provenance)
+    kept = ErrorModes.of_provenance(part.provenance, 1)
     assert kept is not None
     assert part.cameras == (_LENS,)
     np.testing.assert_allclose(kept.poses, modes.poses[[1, 3]], rtol=1e-6)
@@ -143,7 +155,7 @@ def test_broken_ones_are_left_out_and_said(lenses: int, caplog: pytest.LogCaptur
     whole = scene_map(points=box_points(rng, 40), descriptors=random_descriptors(rng, 40), poses=ring(4))
     wrong = ErrorModes(image_id=np.arange(4), poses=np.ones((4, 6, 1)), lenses=np.ones((lenses, 8, 1)))
     assert build_area([replace(whole, provenance=wrong.as_provenance())]).modes == (None,)
-    assert "error modes" in caplog.text
+    assert "1 cameras" in caplog.text
     caplog.clear()
     assert build_area([replace(whole, provenance={"error_modes": 7})]).modes == (None,)
     assert "expected image_id" in caplog.text

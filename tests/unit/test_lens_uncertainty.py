@@ -20,6 +20,9 @@ from reloc.self_calibration import calibrate
 _LENS = Camera(
     model="OPENCV", width=1600, height=1200, params=(1200.0, 1202.0, 805.0, 597.0, -0.02, 0.01, 4e-4, -3e-4)
 )
+_FISHEYE = Camera(
+    model="OPENCV_FISHEYE", width=1600, height=1200, params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0)
+)
 
 
 def test_the_doubt_is_that_of_drawn_lenses() -> None:
@@ -58,17 +61,11 @@ def test_a_provenance_that_is_not_ours_is_an_error(written: object) -> None:
 
 
 def test_lenses_of_other_models_have_none() -> None:
-    fisheye = Camera(
-        model="OPENCV_FISHEYE",
-        width=1600,
-        height=1200,
-        params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
-    )
-    assert uncertainty_of_lenses([fisheye], [np.eye(8)], [3], 50.0) is None
+    assert uncertainty_of_lenses([_FISHEYE], [np.eye(8)], [3], 50.0) is None
     uncertainty = LensUncertainty(
         focal_rel=1e-3, aspect=1e-3, center_rel=(0, 0), radial=(0, 0), tangential=(0, 0), dilution=50.0
     )
-    assert seen_by_a_map(fisheye, uncertainty) is None
+    assert seen_by_a_map(_FISHEYE, uncertainty) is None
 
 
 def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told() -> None:
@@ -182,21 +179,15 @@ def test_joint_errors_are_those_of_the_poses() -> None:
 
 
 def test_a_map_whose_lenses_are_no_opencv_has_errors_of_poses_alone() -> None:
-    fisheye = Camera(
-        model="OPENCV_FISHEYE",
-        width=1600,
-        height=1200,
-        params=(800.0, 800.0, 800.0, 600.0, 0.0, 0.0, 0.0, 0.0),
-    )
     block = _block(6)
     xyz = block.xyz[block.point_of]
     pixels = np.array(
         [
-            fisheye.project(block.cam_from_block[p].act(x[None]))[0]
+            _FISHEYE.project(block.cam_from_block[p].act(x[None]))[0]
             for p, x in zip(block.photo_of, xyz, strict=True)
         ]
     )
-    found = map_errors(replace(block, cameras=(fisheye,), xy=pixels + 0.1), {})
+    found = map_errors(replace(block, cameras=(_FISHEYE,), xy=pixels + 0.1), {})
     assert found.lenses is None
     assert (found.modes.lenses == 0).all()
     assert np.isfinite(found.poses).all()
