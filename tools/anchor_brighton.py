@@ -8,6 +8,8 @@
 3. A server answers for each held-out photo, as `featuredb query` asks: nothing but the file.
 4. The answers are compared with poses that tools/scan_poses.py finds by registering each photo to the scan
    directly (kept in the file of --poses). Before anchoring, too, to show what it changed.
+5. Of the map as GPS placed it: its focal length beside the scan's, with the standard deviation that the map
+   stores, and how far its cameras are from the scan's poses after a similarity (median).
 
 Exit code 0 if the medians lie within the limits and all were answered, else 1.
 """
@@ -26,6 +28,8 @@ import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools import scan_poses
 from tools.figures import add_json_option, write_figures
@@ -46,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             shutil.copytree(args.database, database)
         else:
             ingest(database, args.photos, args.held_out)
+        shape = by_gps(Database.open(database), frame, args.poses)
         sys.stdout.write("before, placed by GPS\n")
         before = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
         sys.stdout.write(table(before, args.max_m, args.max_deg) + "\n")
@@ -60,7 +65,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         after = ask_poses(Database.open(database), args.photos, args.held_out, frame, poses)
         sys.stdout.write(table(after, args.max_m, args.max_deg) + "\n")
     figures = error_figures(after) | {f"before_{k}": v for k, v in error_figures(before).items()}
-    write_figures(args.json, figures)
+    write_figures(args.json, figures | shape)
+    sys.stdout.write(
+        f"by GPS: focal length {shape['gps_focal_px']:.0f} px +- {shape['gps_focal_sigma']:.1%} "
+        f"(scan {shape['scan_focal_px']:.0f}), cameras {shape['gps_shape_m']:.3f} m off after a similarity\n"
+    )
     return _verdict(after, args.max_m, args.max_deg)
 
 
@@ -77,6 +86,29 @@ def read_poses(path: Path) -> tuple[LocalFrame, dict[str, Rigid3]]:
         for name, entry in document["poses"].items()
     }
     return frame, poses
+
+
+def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, float]:
+    """What the map's own lens and shape are worth against the scan's, whatever its place."""
+    snapshot = database.snapshot()
+    feature_map = snapshot.load_map(snapshot.maps()[0].map_id)
+    scan_px = float(json.loads(poses.read_text(encoding="utf-8"))["camera"]["params"][0])
+    true = read_poses(poses)[1]
+    own = np.array([image.cam_from_local.center for image in feature_map.images])
+    wanted = np.array([true[image.name].center for image in feature_map.images])
+    fit = similarity_closed_form(frame.enu_from(feature_map.frame).act(own), wanted)
+    uncertainty = LensUncertainty.of_provenance(feature_map.provenance)
+    if fit is None or uncertainty is None:
+        raise SystemExit("the map has no lens uncertainty, or its cameras lie on one point")
+    rest = fit.act(frame.enu_from(feature_map.frame).act(own)) - wanted
+    focal_px = feature_map.cameras[0].focal_px
+    return {
+        "gps_focal_px": focal_px,
+        "scan_focal_px": scan_px,
+        "gps_focal_sigma": uncertainty.focal_rel,
+        "gps_focal_off": abs(focal_px / scan_px - 1.0) / max(uncertainty.focal_rel, 0.01),
+        "gps_shape_m": float(np.median(np.linalg.norm(rest, axis=1))),
+    }
 
 
 def _verdict(rows: Sequence[Row], max_m: float, max_deg: float) -> int:

@@ -60,6 +60,7 @@ _SHOWN = 0.7  # of the points in view
 _QUERIES = 20
 _LEVELS = (0.68, 0.95)
 _KEY = "drone"
+_PARTS = (slice(0, 3), slice(3, 6))  # of an error: rotation, displacement
 _EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
 
 
@@ -192,9 +193,6 @@ def drawn(seed: int, sigma_m: float) -> list[Answer]:
         squares = [float(error[k] @ np.linalg.solve(answer.covariance[k, k], error[k])) for k in _PARTS]
         answers.append(Answer(orientation=squares[0], position=squares[1], inliers=result.inliers))
     return answers
-
-
-_PARTS = (slice(0, 3), slice(3, 6))
 
 
 def scene_of(seed: int) -> Scene:

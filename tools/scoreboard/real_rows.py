@@ -115,12 +115,18 @@ REAL: tuple[Row, ...] = (
                 *("--poses", "{cache}/brighton-poses.json", "--held-out", *HELD_OUT, *OUT),
             ),
         ),
-        figures=ERRORS | same("before_median_m"),
-        text=ANSWERS + " (by GPS {before_median_m:.1f} m)",
+        figures=ERRORS
+        | same("before_median_m", "gps_focal_px", "scan_focal_px", "gps_focal_sigma", "gps_focal_off")
+        | same("gps_shape_m"),
+        text=ANSWERS + " (by GPS {before_median_m:.1f} m; its focal length {gps_focal_px:.0f} px, known to "
+        "{gps_focal_sigma:.1%}, the scan's {scan_focal_px:.0f}; cameras {gps_shape_m:.3f} m off after a "
+        "similarity)",
         limits=(
             Limit(figure="answered", least=4),
             Limit(figure="median_m", most=0.30),
             Limit(figure="median_deg", most=0.25),
+            Limit(figure="gps_focal_off", most=1.0),  # of 1 % or its own sigma, the larger
+            Limit(figure="gps_shape_m", most=0.05),
         ),
         needs=("brighton/images", "brighton/model.laz"),
         readme=True,
