@@ -50,16 +50,7 @@ def map_errors(
     """
     options = options or AdjustOptions()
     block = whole_lens(block)
-    priors = tuple(lens_prior_of(camera, focal_px.get(c), options) for c, camera in enumerate(block.cameras))
-    gauge, orientations = _anywhere(block)
-    terms = Terms(
-        keypoint_px=float(np.sqrt(block_variance_px2(block))),
-        dilution=options.dilution,
-        lenses=priors,
-        centers=centers or gauge,
-        orientations=orientations,
-        held_photos=() if centers is not None else (0,),
-    )
+    terms = terms_of_map(block, focal_px, centers, options)
     joint = _joint(block, Problem(block, terms, options.threads).marginals())
     size = 6 * len(block.names)
     factor = _factor(joint, size)
@@ -77,6 +68,25 @@ def map_errors(
         lenses=uncertainty_of_lenses(block.cameras, lenses, photos, options.dilution),
         poses=np.array([poses[k : k + 6, k : k + 6] for k in range(0, size, 6)]),
         modes=_modes(block, noise, factor),
+    )
+
+
+def terms_of_map(
+    block: Block, focal_px: Mapping[int, float], centers: CenterPriors | None, options: AdjustOptions
+) -> Terms:
+    """What holds a map of whole lenses: what is known of these, and positions; without any the first photo.
+
+    Args:
+        focal_px, centers: as of `map_errors`.
+    """
+    gauge, orientations = _anywhere(block)
+    return Terms(
+        keypoint_px=float(np.sqrt(block_variance_px2(block))),
+        dilution=options.dilution,
+        lenses=tuple(lens_prior_of(lens, focal_px.get(c), options) for c, lens in enumerate(block.cameras)),
+        centers=centers or gauge,
+        orientations=orientations,
+        held_photos=() if centers is not None else (0,),
     )
 
 

@@ -1,7 +1,7 @@
 """A block and its terms as COLMAP's bundle adjustment, to whose Ceres problem pyceres adds the terms."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -131,6 +131,22 @@ class Problem:
         return marginals(
             self._jacobian(rows, ()), np.array(rows, dtype=np.int64), poses, lenses, self.block()
         )
+
+    def by_lens_priors(self, found: Marginals, cameras: Collection[int]) -> FloatArray:
+        """(6 k, 6 k) the part of `found.by_lenses()` that comes from how far lenses are off their priors.
+
+        Args:
+            found: by `marginals`. cameras: rows of the lenses.
+        """
+        part = np.zeros_like(found.by_lenses())
+        for c in cameras:
+            prior = self._terms.lenses[c]
+            if prior is not None and found.lens_start[c] >= 0:
+                off = np.array(self._lenses[c]) - np.array(prior.mean.params)
+                information = np.linalg.inv(prior.covariance)
+                weight = 1.0 / (1.0 + float(off @ information @ off) / _LETS_GO**2)  # of the Cauchy loss
+                part += found.by_lens_prior(c, np.asarray(weight**2 * information))
+        return part
 
     def target_marginals(self) -> TargetMarginals:
         """The same with the targets, and what their residuals may be."""

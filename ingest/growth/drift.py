@@ -59,7 +59,9 @@ def photo_covariances(
     """Of all photos, relative to the existing points.
 
     What a lens model leaves over is common to whole photos: so many observations count as one for lenses as
-    they do where lenses are estimated, and for poses as their neighbours share.
+    they do where lenses are estimated, and for poses as their neighbours share. By how much a lens
+    differs from the one that a map has lent is this reconstruction's alone: it may have changed since. All
+    else that the lenses bring other maps of the same cameras have as well.
 
     Args:
         model: refined, in metres. keypoints: of its photos.
@@ -85,10 +87,12 @@ def photo_covariances(
         lenses=lenses.priors(model.cameras, adjust),
         marks=replace(marks, sigma_px=sigma_px),
     )
-    found = Problem(block, terms).marginals()
+    problem = Problem(block, terms)
+    found = problem.marginals()
     by_lenses = found.by_lenses()
     size = len(by_lenses)
     covariance = (found.shared[:size, :size] - by_lenses) / dilution + by_lenses
+    common = by_lenses - problem.by_lens_priors(found, lenses.lent)
     seen = np.flatnonzero(found.pose_start >= 0)
     for k in seen.tolist():
         at = found.pose_start[k] + np.arange(6)
@@ -96,7 +100,7 @@ def photo_covariances(
     for k, piece in _pieces(model, fixed, kept, seen).items():
         at = found.pose_start[piece]
         spread.turns[k] = _turn(model, covariance, piece, at)
-        spread.lens_turns[k] = _turn(model, by_lenses, piece, at)
+        spread.lens_turns[k] = _turn(model, common, piece, at)
     return spread
 
 

@@ -21,7 +21,8 @@ class PhotoSpread:
         turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
             may be turned: the mean rotation of the photo and those that share most points with it. What comes
             next is tied to such a piece. NaN as before.
-        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring, which other maps have as well.
+        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring and that other maps have as well: all
+            but what a lens may differ by from the one that a map has lent.
     """
 
     poses: FloatArray

@@ -1,0 +1,198 @@
+"""How wide are real lenses around what is known of them beforehand? Measures the widths of the lens priors.
+
+    python -m tools.lens_widths --photos FOLDER [FOLDER ...] --work DIR [--json FILE]
+
+Each folder of photos is ingested into a database of its own in DIR (one that is there is used). Of every lens
+of its maps the photos' own say is taken from the adjustment: its normal equations with poses and points
+eliminated, less the prior. The widths are those under which the lenses of all cameras together are most
+likely (type II maximum likelihood): a lens of which the photos say little says little of the widths.
+
+For each width: what `AdjustOptions` has, what is measured, and between which limits it lies with 95 %
+probability (likelihood ratio, the other widths where they are most likely). Exit code 0 if all that
+`AdjustOptions` has lie within.
+"""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import brentq, minimize
+from scipy.stats import chi2
+
+from featuredb.adjust.block import whole_lens
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import LensWidths, Terms, lens_prior
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from ingest.colmap_adjust import AdjustOptions
+from ingest.map_errors import terms_of_map
+from ingest.photo import Photo
+from ingest.register.block import block_of_map
+from ingest.scan import scan_folder
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import all_maps, make, photo_names
+
+WIDTHS = tuple(field.name for field in fields(LensWidths))
+_DROP = float(chi2.ppf(0.95, 1)) / 2.0
+_FAR = float(np.log(100.0))  # widths are looked for up to so many times more and less than assumed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Told:
+    """What its photos say of one lens.
+
+    Attributes:
+        mean: what is known of it beforehand.
+        information: (8, 8) and vector: (8,) of the normal equations of OPENCV's parameters, around the mean.
+        has_exif: whether the focal length is one of EXIF.
+    """
+
+    mean: Camera
+    information: FloatArray
+    vector: FloatArray
+    has_exif: bool
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    options = AdjustOptions()
+    told: list[Told] = []
+    for folder in args.photos:
+        found = lenses_of(_database(folder, args.work), folder, options)
+        sys.stderr.write(f"{folder}: {len(found)} lenses\n")
+        told += found
+    if not told:
+        sys.stderr.write("no lens of any map\n")
+        return 1
+    assumed = assumed_widths(options)
+    measured = measured_widths(told, assumed, options)
+    limits = {name: _limits(told, measured, k, options) for k, name in enumerate(WIDTHS)}
+    sys.stdout.write(f"{len(told)} lenses, {sum(one.has_exif for one in told)} with EXIF\n")
+    sys.stdout.write(f"{'':12} {'assumed':>9} {'measured':>9}   95 %\n")
+    for k, name in enumerate(WIDTHS):
+        low, high = limits[name]
+        sys.stdout.write(f"{name:12} {assumed[k]:9.5f} {measured[k]:9.5f}   {low:.5f} to {high:.5f}\n")
+    inside = {name: limits[name][0] <= assumed[k] <= limits[name][1] for k, name in enumerate(WIDTHS)}
+    figures = {
+        "lenses": len(told),
+        **{name: measured[k] for k, name in enumerate(WIDTHS)},
+        "inside": sum(inside.values()),
+    }
+    write_figures(args.json, figures)
+    return 0 if all(inside.values()) else 1
+
+
+def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> list[Told]:
+    """What the photos of each lens of a database's maps say of it."""
+    photos = {photo.name: photo for photo in scan_folder(folder).photos}
+    told = []
+    for feature_map in all_maps(database):
+        block = whole_lens(block_of_map(feature_map))
+        focal_px = _focals(block.names, block.camera_of.tolist(), photos)
+        terms = terms_of_map(block, focal_px, None, options)
+        problem = Problem(block, terms, options.threads)
+        problem.solve(options.max_iterations, 1e-6)
+        told += _told(problem, terms, focal_px, options)
+    return told
+
+
+def _told(
+    problem: Problem, terms: Terms, focal_px: Mapping[int, float], options: AdjustOptions
+) -> list[Told]:
+    """Posterior information less the prior's, of each lens by itself."""
+    block, found = problem.block(), problem.marginals()
+    result = []
+    for c, (camera, prior) in enumerate(zip(block.cameras, terms.lenses, strict=True)):
+        if prior is None or camera.model != "OPENCV" or found.lens_start[c] < 0:
+            continue
+        posterior = np.linalg.inv(options.dilution * found.lens(c))
+        off = np.array(camera.params) - np.array(prior.mean.params)
+        result.append(
+            Told(
+                mean=prior.mean,
+                information=posterior - np.linalg.inv(prior.covariance),
+                vector=posterior @ off,
+                has_exif=c in focal_px,
+            )
+        )
+    return result
+
+
+def assumed_widths(options: AdjustOptions) -> FloatArray:
+    """(5,) of `WIDTHS`."""
+    return np.array(astuple(replace(options.lens, focal_rel=options.exif_focal_rel)))
+
+
+def measured_widths(told: Sequence[Told], start: FloatArray, options: AdjustOptions) -> FloatArray:
+    """(5,) the most likely ones."""
+    best = minimize(
+        lambda logs: -log_likelihood(told, np.exp(logs), options),
+        np.log(start),
+        method="Nelder-Mead",
+        bounds=[(log - _FAR, log + _FAR) for log in np.log(start)],
+        options={"maxiter": 4000},
+    )
+    return np.asarray(np.exp(best.x))
+
+
+def log_likelihood(told: Sequence[Told], widths: FloatArray, options: AdjustOptions) -> float:
+    """Of the photos' say under normal lenses of these widths (5,), up to a constant."""
+    lens = LensWidths(**dict(zip(WIDTHS, widths.tolist(), strict=True)))
+    no_exif = replace(lens, focal_rel=options.lens.focal_rel)
+    total = 0.0
+    for one in told:
+        covariance = lens_prior(one.mean, lens if one.has_exif else no_exif).covariance
+        whole = np.eye(8) + covariance @ one.information
+        most_likely = np.linalg.solve(whole, covariance @ one.vector)
+        total += 0.5 * float(one.vector @ most_likely - np.linalg.slogdet(whole)[1])
+    return total
+
+
+def _limits(
+    told: Sequence[Told], best: FloatArray, which: int, options: AdjustOptions
+) -> tuple[float, float]:
+    """Where the likelihood of one width has fallen as far as it does by chance in one of twenty cases."""
+    top = log_likelihood(told, best, options)
+
+    def lack(shift: float) -> float:
+        moved = best.copy()
+        moved[which] *= np.exp(shift)
+        return top - log_likelihood(told, moved, options) - _DROP
+
+    low, high = np.log(assumed_widths(options)[which] / best[which]) + np.array([-_FAR, _FAR])
+    ends = [brentq(lack, 0.0, far) if abs(far) > 0.0 and lack(far) > 0.0 else far for far in (low, high)]
+    return float(best[which] * np.exp(ends[0])), float(best[which] * np.exp(ends[1]))
+
+
+def _focals(names: Sequence[str], camera_of: Sequence[int], photos: Mapping[str, Photo]) -> dict[int, float]:
+    """EXIF's focal length of each camera whose photos tell one."""
+    told: dict[int, set[float | None]] = {}
+    for name, camera in zip(names, camera_of, strict=True):
+        told.setdefault(camera, set()).add(photos[name].focal_px)
+    only = {camera: next(iter(focals)) for camera, focals in told.items() if len(focals) == 1}
+    return {camera: focal for camera, focal in only.items() if focal is not None}
+
+
+def _database(folder: Path, work: Path) -> Path:
+    """Of the folder's photos, made if it is not there."""
+    database = work / folder.parent.name / folder.name / "db"
+    if not database.exists():
+        control = folder.parent / "gcp_list.txt"
+        more = ("--gcp", str(control)) if control.exists() else ()
+        make(database, "photos", folder, len(photo_names(folder)), more)
+    return database
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, nargs="+", required=True, metavar="FOLDER")
+    parser.add_argument("--work", type=Path, required=True, help="databases are kept there")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
