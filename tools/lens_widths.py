@@ -16,6 +16,7 @@ import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -40,7 +41,7 @@ _DROP = float(chi2.ppf(0.95, 1)) / 2.0
 _FAR = float(np.log(100.0))  # widths are looked for up to so many times more and less than assumed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Told:
     """What its photos say of one lens.
 
@@ -54,6 +55,12 @@ class Told:
     information: FloatArray
     vector: FloatArray
     has_exif: bool
+
+    @cached_property
+    def by_variance(self) -> FloatArray:
+        """(5, 8, 8) covariance of a prior for each of the squared widths."""
+        none = LensWidths(**dict.fromkeys(WIDTHS, 0.0))
+        return np.array([lens_prior(self.mean, replace(none, **{name: 1.0})).covariance for name in WIDTHS])
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,7 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 1
     assumed = assumed_widths(options)
     measured = measured_widths(told, assumed, options)
-    limits = {name: _limits(told, measured, k, options) for k, name in enumerate(WIDTHS)}
+    limits = {name: limits_of(told, measured, k, options) for k, name in enumerate(WIDTHS)}
     sys.stdout.write(f"{len(told)} lenses, {sum(one.has_exif for one in told)} with EXIF\n")
     sys.stdout.write(f"{'':12} {'assumed':>9} {'measured':>9}   95 %\n")
     for k, name in enumerate(WIDTHS):
@@ -140,18 +147,16 @@ def measured_widths(told: Sequence[Told], start: FloatArray, options: AdjustOpti
 
 def log_likelihood(told: Sequence[Told], widths: FloatArray, options: AdjustOptions) -> float:
     """Of the photos' say under normal lenses of these widths (5,), up to a constant."""
-    lens = LensWidths(**dict(zip(WIDTHS, widths.tolist(), strict=True)))
-    no_exif = replace(lens, focal_rel=options.lens.focal_rel)
-    total = 0.0
-    for one in told:
-        covariance = lens_prior(one.mean, lens if one.has_exif else no_exif).covariance
-        whole = np.eye(8) + covariance @ one.information
-        most_likely = np.linalg.solve(whole, covariance @ one.vector)
-        total += 0.5 * float(one.vector @ most_likely - np.linalg.slogdet(whole)[1])
-    return total
+    variance = np.tile(widths**2, (len(told), 1))
+    variance[[not one.has_exif for one in told], 0] = options.lens.focal_rel**2
+    covariance = np.einsum("nk,nkij->nij", variance, np.array([one.by_variance for one in told]))
+    vector = np.array([one.vector for one in told])[:, :, None]
+    whole = np.eye(8) + covariance @ np.array([one.information for one in told])
+    most_likely = np.linalg.solve(whole, covariance @ vector)
+    return 0.5 * float((vector * most_likely).sum() - np.linalg.slogdet(whole)[1].sum())
 
 
-def _limits(
+def limits_of(
     told: Sequence[Told], best: FloatArray, which: int, options: AdjustOptions
 ) -> tuple[float, float]:
     """Where the likelihood of one width has fallen as far as it does by chance in one of twenty cases."""
