@@ -10,11 +10,12 @@
    once more with an overlay if asked for. --on says by what: the map, the scan alone (from a pose of the
    first frame that is off by 10 m and 5 degrees), or the map with the scan where it knows nothing.
 
-Prints for each film the errors of position and orientation over all frames with a pose, the first and the
-last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film shows another
-town, and how long it took to be found again; frames per second, the longest time between two poses, and the
-machine's load, since a busy machine's speed is not the program's. Writes track.json, errors.png, and for each
-film the errors of its axes. Exit code 0 if everything holds.
+Prints for each film how many errors lie inside their bounds, over all frames with a pose and over the quarter
+of them with the fewest landmarks; the errors of position and orientation over all frames with a pose, the
+first and the last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film
+shows another town, and how long it took to be found again; frames per second, the longest time between two
+poses, and the machine's load, since a busy machine's speed is not the program's. Writes track.json, errors.png,
+and for each film the errors of its axes. Exit code 0 if everything holds.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -60,6 +62,7 @@ _RATE_HZ, _OVERLAY_HZ, _GAP_S = 60.0, 20.0, 0.150
 _FOUND_S = 1.0
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
 _END = 200  # frames at each end whose errors are compared; of short films, a half each
+_FEW_INSIDE = 0.90  # five points less than said
 _WRONG_M = 1.0  # a pose that is farther off is no inaccuracy
 _CUT = (0.4, 0.55)  # of the film
 
@@ -75,6 +78,9 @@ class Tracked:
         found_s: from the town's return to the first pose, of the film's time; 0 without a cut.
         rate_hz, gap_s: frames a second over the whole run, and the longest time between two poses.
         overlay_hz: frames a second with an overlay; 0: not run. load: of the machine, when the run ended.
+        position_68 to orientation_95: shares of the errors inside these bounds. squared: mean squared error
+            of the position over its covariance; 3 is right. few_*: of the quarter of the frames with the
+            fewest landmarks.
     """
 
     frames: int
@@ -91,6 +97,14 @@ class Tracked:
     gap_s: float
     overlay_hz: float
     load: float
+    position_68: float
+    position_95: float
+    orientation_68: float
+    orientation_95: float
+    squared: float
+    few_position_95: float
+    few_orientation_95: float
+    few_squared: float
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -115,9 +129,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             drawn = track_video(folder / FILM_FILE, finder, camera=camera, overlay=args.out / f"{name}.mp4")
             overlay_hz = len(drawn.trajectory.points) / drawn.seconds.total
         metres, degrees = errors(tracked, truth)
-        results[name] = judge_film(tracked, truth, metres, degrees, overlay_hz, load)
-        _draw(ax, name, truth, metres)
         off = axis_errors(tracked.trajectory, truth.frame, truth.cam_from_local)
+        results[name] = judge_film(tracked, truth, metres, degrees, off, overlay_hz, load)
+        _draw(ax, name, truth, metres)
         drawing = plot_png(tracked.trajectory, off)
         (args.out / f"axes-{name}.png").write_bytes(drawing)
         say(f"{name}: {results[name]}; stages {tracked.seconds}")
@@ -227,9 +241,13 @@ def judge_film(
     truth: FilmTruth,
     metres: FloatArray,
     degrees: FloatArray,
+    off: FloatArray,
     overlay_hz: float,
     load: float,
 ) -> Tracked:
+    """Args:
+    metres, degrees: of `errors`. off: of `axis_errors`.
+    """
     known = np.isfinite(metres)
     if not known.any():
         raise SystemExit(f"track_evaluation: no frame of {tracked.trajectory.source} has a pose")
@@ -250,7 +268,30 @@ def judge_film(
         gap_s=tracked.seconds.longest_gap,
         overlay_hz=overlay_hz,
         load=load,
+        **_inside(tracked.trajectory, off),
     )
+
+
+def _inside(trajectory: Trajectory, off: FloatArray) -> dict[str, float]:
+    """How true the bounds are: the last figures of `Tracked`."""
+    rows = [k for k in range(len(off)) if np.isfinite(off[k]).all()]
+    points = [trajectory.points[k] for k in rows]
+    few = np.argsort([p.inliers for p in points], kind="stable")[: (len(points) + 3) // 4]
+    figures: dict[str, float] = {}
+    for name, part in (("orientation", slice(0, 3)), ("position", slice(3, 6))):
+        squared = np.array(
+            [
+                off[k, part] @ np.linalg.solve(p.pose.covariance[part, part], off[k, part])
+                for k, p in zip(rows, points, strict=True)
+                if p.pose is not None
+            ]
+        )
+        for level in (0.68, 0.95):
+            figures[f"{name}_{level:.0%}".rstrip("%")] = float((squared <= chi2.ppf(level, 3)).mean())
+        figures[f"few_{name}_95"] = float((squared[few] <= chi2.ppf(0.95, 3)).mean())
+        if name == "position":
+            figures |= {"squared": float(squared.mean()), "few_squared": float(squared[few].mean())}
+    return figures
 
 
 def _found_s(truth: FilmTruth, known: NDArray[np.bool_]) -> float:
@@ -277,6 +318,9 @@ def verdicts(results: dict[str, Tracked], on: str = "map") -> list[Verdict]:
         line(
             f"{name}, wrong", f"largest {r.largest_m:.2f} m, under {_WRONG_M} wanted", r.largest_m < _WRONG_M
         )
+        least = min(r.few_position_95, r.few_orientation_95)
+        text = f"fewest landmarks: {least:.0%} inside their 95 %, {_FEW_INSIDE:.0%} wanted"
+        line(f"{name}, bounds", text, least >= _FEW_INSIDE)
         if name == "smooth":
             p95_m, mean_deg = times * _P95_M, times * _MEAN_DEG
             line("smooth, 95 %", f"{r.p95_m:.3f} m, {p95_m} wanted", r.p95_m <= p95_m)

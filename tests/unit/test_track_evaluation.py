@@ -9,6 +9,8 @@ from tools.track_evaluation import Tracked, film_options, verdicts
 _GOOD = Tracked(
     frames=1200, lost=0, invented=0, mean_m=0.05, p95_m=0.1, largest_m=0.3, mean_deg=0.05, first_m=0.05,
     last_m=0.05, found_s=0.0, rate_hz=80.0, gap_s=0.1, overlay_hz=25.0, load=1.0,
+    position_68=0.7, position_95=0.95, orientation_68=0.7, orientation_95=0.95, squared=3.0,
+    few_position_95=0.95, few_orientation_95=0.95, few_squared=3.0,
 )  # fmt: skip
 
 
@@ -21,6 +23,8 @@ _GOOD = Tracked(
         ("smooth", {"mean_deg": 0.11}, "smooth, orientation"),
         ("smooth", {"last_m": 0.07}, "smooth, drift"),
         ("smooth", {"lost": 1}, "smooth, lost"),
+        ("smooth", {"few_position_95": 0.89}, "smooth, bounds"),
+        ("jerky", {"few_orientation_95": 0.89}, "jerky, bounds"),
         ("smooth", {"rate_hz": 59.0}, "smooth, speed"),
         ("smooth", {"gap_s": 0.16}, "smooth, speed"),
         ("smooth", {"overlay_hz": 19.0}, "smooth, with overlay"),

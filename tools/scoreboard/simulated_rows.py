@@ -4,7 +4,10 @@ from tools.scoreboard.row import Limit, Row
 from tools.scoreboard.words import OUT, same
 
 _SIGMAS, _KINDS = ("2cm", "50cm", "300cm"), ("position", "orientation")
-_TRACKED = ("frames", "lost", "invented", "mean_m", "largest_m", "first_m", "last_m", "rate_hz")
+_TRACKED = (
+    *("frames", "lost", "invented", "mean_m", "largest_m", "first_m", "last_m", "rate_hz"),
+    *("position_95", "orientation_95", "squared", "few_position_95", "few_orientation_95", "few_squared"),
+)
 
 
 def _track(film: str, on: str, size: str, frames: int, mean_m: float, minutes: float) -> Row:
@@ -23,9 +26,13 @@ def _track(film: str, on: str, size: str, frames: int, mean_m: float, minutes: f
         json="{work}/track.json",
         figures={name: f"figures.{film}.{name}" for name in _TRACKED},
         text="{lost} of {frames} lost, {invented} invented, mean {mean_m:.3f} m, largest {largest_m:.2f} m; "
-        "{rate_hz:.0f} frames/s",
+        "{rate_hz:.0f} frames/s; inside 95 %: {position_95:.0%} and {orientation_95:.0%}, with fewest "
+        "landmarks {few_position_95:.0%} and {few_orientation_95:.0%} (squared error {few_squared:.1f}; 3 is "
+        "right)",
         limits=(
             Limit(figure="mean_m", most=mean_m),
+            Limit(figure="few_position_95", least=0.90),
+            Limit(figure="few_orientation_95", least=0.90),
             Limit(figure="largest_m", most=1.0),
             Limit(figure="invented", most=0),
         ),
