@@ -14,8 +14,8 @@ Prints for each film how many errors lie inside their bounds, over all frames wi
 of them with the fewest landmarks; the errors of position and orientation over all frames with a pose, the
 first and the last 200 of them (a half each of fewer than 400), lost frames, what was invented where the film
 shows another town, and how long it took to be found again; frames per second, the longest time between two
-poses, and the machine's load, since a busy machine's speed is not the program's. Writes track.json, errors.png,
-and for each film the errors of its axes. Exit code 0 if everything holds.
+poses, and the machine's load, since a busy machine's speed is not the program's. Writes track.json,
+errors.png, and for each film the errors of its axes. Exit code 0 if everything holds.
 """
 
 import argparse
