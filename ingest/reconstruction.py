@@ -35,6 +35,7 @@ from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm import SfmOptions, SfmView
 from ingest.tagged_elsewhere import ElsewhereOptions
 from ingest.workspace import Workspace
+from ingest.zoomed_lenses import zoomed_keys
 
 logger = logging.getLogger(__name__)
 
@@ -165,7 +166,13 @@ def reconstruct_photos(
         return done
 
     with clock.stage("reconstruct") as counts:
-        made = _reconstruct(done, cameras, camera_rows, matched, workspace, options, executor, progress)
+        made = _reconstruct(done, matched, workspace, options, executor, progress)
+        keys = zoomed_keys(made.models(), usable, features)
+        if keys:
+            logger.info("%d photos of films with another focal length than their shot's first", len(keys))
+            usable = tuple(replace(p, camera_key=keys.get(p.name, p.camera_key)) for p in usable)
+            done = replace(done, usable=usable)
+            made = _reconstruct(done, matched, workspace, options, executor, progress)
         counts |= {"reused": made.reused, "total": made.blocks}
     lost = {usable[row].name: reason for row, reason in made.lost.items()}
     return replace(done, reconstruction=made, lost=lost)
@@ -185,8 +192,6 @@ def _views(
 
 def _reconstruct(
     done: Reconstructed,
-    cameras: Sequence[tuple[Camera, bool]],
-    camera_rows: Sequence[int],
     matched: Matched,
     workspace: Workspace,
     options: MapMakingOptions,
@@ -194,6 +199,7 @@ def _reconstruct(
     progress: Progress,
 ) -> Reconstruction:
     photos, smallest = done.usable, options.sfm.min_model_photos
+    cameras, camera_rows = photo_cameras(photos, options.cameras, options.sfm.camera_model)
     clusters = find_clusters(len(photos), matched.inliers, smallest, options.clusters)
     views: list[SfmView] = [
         SfmView(name=photo.name, camera_row=row, features=path)

@@ -35,7 +35,6 @@ class ShotOutcome:
         dropped: number of the other frames by reason, see `DROPPED`.
         bars: left, top, right and bottom, burnt in, shares of the picture's width and height.
         overlay_share: of the picture within the bars that logos and captions cover, painted over.
-        lenses: focal lengths: 1, or more where the lens zooms; each keyframe has its own meanwhile.
     """
 
     start_s: float
@@ -46,7 +45,6 @@ class ShotOutcome:
     dropped: Mapping[str, int] = field(default_factory=dict)
     bars: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
     overlay_share: float = 0.0
-    lenses: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +98,6 @@ def films_json(films: Sequence[FilmOutcome]) -> list[dict[str, Any]]:
                     "dropped": shot.dropped,
                     "bars": shot.bars,
                     "overlay_share": shot.overlay_share,
-                    "lenses": shot.lenses,
                 }
                 for shot in film.shots
             ],
@@ -166,8 +163,9 @@ def _kept(shot: ShotOutcome, known: Mapping[str, "PhotoOutcome"]) -> str:
         text += f", bars over {1.0 - _inside(shot):.0%} of the picture"
     if shot.overlay_share:
         text += f", {shot.overlay_share:.1%} under logos or captions"
-    if shot.lenses > 1:
-        text += f", the lens zooms ({shot.lenses} focal lengths)"
+    lenses = {known[name].camera_key for name in shot.keyframes if name in known}
+    if len(lenses) > 1:
+        text += f", the lens zooms ({len(lenses)} focal lengths)"
     return text
 
 

@@ -20,7 +20,6 @@ from ingest.executor import Progress
 from ingest.video.burnt_in import BurntIn, BurntInOptions, find_burnt_in, painted_over
 from ingest.video.keyframes import KeyframeChoice
 from ingest.video.positions import Position
-from ingest.video.zoom import ZoomOptions, lenses_of
 from ingest.workspace import atomic_file
 
 
@@ -105,55 +104,30 @@ def _jpeg(
     return out.getvalue()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cleaned:
-    """What was found in keyframes.
-
-    Attributes:
-        burnt_in: of each shot. lenses: number of focal lengths of each shot.
-    """
-
-    burnt_in: dict[int, BurntIn]
-    lenses: dict[int, int]
-
-
 def clean_keyframes(
-    folder: Path,
-    choice: KeyframeChoice,
-    side_px: int,
-    quality: int,
-    options: tuple[BurntInOptions, ZoomOptions],
-) -> Cleaned:
-    """Paint over what is burnt into keyframes, so that no feature comes of it; name lenses that have zoomed.
+    folder: Path, choice: KeyframeChoice, side_px: int, quality: int, options: BurntInOptions
+) -> dict[int, BurntIn]:
+    """Paint over what is burnt into keyframes, so that no feature comes of it.
 
     Args:
         side_px: of the pictures that are looked at, and whose pixels the answer has.
+
+    Returns:
+        What was found, by shot.
     """
     files = [folder / keyframe_name(index) for index in choice.index]
     pictures = [_shrunk(file, side_px) for file in files]
-    found = find_burnt_in(pictures, choice.shot, options[0])
-    clean = [
-        painted_over(np.dstack([picture] * 3), found[shot].mask)[..., 0]
-        for picture, shot in zip(pictures, choice.shot, strict=True)
-    ]
-    lenses = lenses_of(clean, choice.shot, options[1])
-    for file, shot, lens in zip(files, choice.shot, lenses, strict=True):
-        if lens or found[shot].mask.any():
-            _finish(file, found[shot].mask, lens, quality)
-    return Cleaned(
-        burnt_in=found,
-        lenses={
-            shot: len({n for n, s in zip(lenses, choice.shot, strict=True) if s == shot}) for shot in found
-        },
-    )
+    found = find_burnt_in(pictures, choice.shot, options)
+    for file, shot in zip(files, choice.shot, strict=True):
+        if found[shot].mask.any():
+            _paint_over(file, found[shot].mask, quality)
+    return found
 
 
-def _finish(file: Path, mask: NDArray[np.bool_], lens: int, quality: int) -> None:
-    """Paint over a keyframe's mask, and name its lens."""
+def _paint_over(file: Path, mask: NDArray[np.bool_], quality: int) -> None:
+    """Paint over a keyframe's mask."""
     with Image.open(file) as picture:
         rgb, exif = np.asarray(picture.convert("RGB")), picture.getexif()
-    if lens:
-        exif[ExifTags.Base.Model.value] += f" zoom {lens}"
     size = (rgb.shape[1], rgb.shape[0])
     large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     with atomic_file(file) as target:

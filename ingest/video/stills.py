@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -16,15 +17,14 @@ from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.report_films import ShotOutcome
-from ingest.video.burnt_in import BurntInOptions
+from ingest.video.burnt_in import BurntIn, BurntInOptions
 from ingest.video.clocks import ClockOptions, check_overlap
 from ingest.video.film_time import FilmTime
-from ingest.video.keyframe_files import Cleaned, Encoding, clean_keyframes, keyframe_name, write_keyframes
+from ingest.video.keyframe_files import Encoding, clean_keyframes, keyframe_name, write_keyframes
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.lag import LagOptions
 from ingest.video.motion import FrameKind, Motion, MotionOptions, measure_motion
 from ingest.video.positions import digest_of_telemetry, lateness, positions_at
-from ingest.video.zoom import ZoomOptions
 from ingest.workspace import write_json
 
 _DONE = "film.json"
@@ -60,7 +60,6 @@ class StillsOptions:
     motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
     burnt_in: BurntInOptions = field(default_factory=BurntInOptions)
-    zoom: ZoomOptions = field(default_factory=ZoomOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,10 +146,8 @@ def make_stills(
         unnamed=unnamed_model(content),
     )
     write_keyframes(film, folder, choice, places, encoding, progress)
-    cleaned = clean_keyframes(
-        folder, choice, options.motion_side_px, options.quality, (options.burnt_in, options.zoom)
-    )
-    shots = tuple(_with_findings(number, shot, cleaned) for number, shot in enumerate(shots))
+    burnt_in = clean_keyframes(folder, choice, options.motion_side_px, options.quality, options.burnt_in)
+    shots = tuple(_with_findings(number, shot, burnt_in) for number, shot in enumerate(shots))
     made = Stills(
         folder=folder,
         shots=shots,
@@ -212,16 +209,11 @@ def _shots(motion: Motion, choice: KeyframeChoice) -> tuple[ShotOutcome, ...]:
     return tuple(shots)
 
 
-def _with_findings(number: int, shot: ShotOutcome, cleaned: Cleaned) -> ShotOutcome:
-    if number not in cleaned.burnt_in:
+def _with_findings(number: int, shot: ShotOutcome, burnt_in: Mapping[int, BurntIn]) -> ShotOutcome:
+    if number not in burnt_in:
         return shot
-    found = cleaned.burnt_in[number]
-    return replace(
-        shot,
-        bars=found.bar_shares,
-        overlay_share=round(found.overlay_share, 4),
-        lenses=cleaned.lenses[number],
-    )
+    found = burnt_in[number]
+    return replace(shot, bars=found.bar_shares, overlay_share=round(found.overlay_share, 4))
 
 
 def _dropped(shots: tuple[ShotOutcome, ...]) -> str:
