@@ -58,20 +58,18 @@ def zoomed_keys(
                 continue
             names = sorted(block.names[k] for k in np.flatnonzero(block.camera_of == camera))
             key = photos[rows[block.names.index(names[0])]].camera_key
-            first = numbers[key]
+            lenses = (numbers[key] + runs).tolist()
             numbers[key] += int(runs.max()) + 1
-            keys |= {
-                name: f"{key} zoom {first + run}" for name, run in zip(names, runs.tolist(), strict=True)
-            }
+            keys |= {name: f"{key} zoom {lens}" for name, lens in zip(names, lenses, strict=True)}
     return keys
 
 
 def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) -> NDArray[np.int64] | None:
-    """(k,) number of the focal length of each photo of a camera, from 0, in the order of the photos' names.
+    """(k,) number of the focal length of each photo of a camera, from 0, in the order of their names.
 
-    Photos that follow each other keep one while no difference is significant. None: one for all. Whether a lens
-    zooms at all is asked with the dilution of what observations say of lenses, where it changes without: what a
-    lens model leaves over its photos have in common.
+    Photos that follow each other keep one while no difference is significant. None: one for all. Whether a
+    lens zooms at all is asked with the dilution of what observations say of lenses, where it does without: what
+    a lens model leaves over is common to its photos.
 
     Args:
         camera: its row in the block, of a shot whose photos' names are in the order of time.
@@ -92,7 +90,7 @@ def _part(block: Block, rows: NDArray[np.int64]) -> tuple[Block, NDArray[np.int6
     """The photos of `rows`, those that share most points with them, and points that the first see.
 
     Returns:
-        The part, in which each photo of `rows` has a camera of its own, the first ones, and these photos in it.
+        The part, in which each photo has a camera of its own, and the photos of `rows` in it, the first ones.
     """
     mine = np.isin(block.photo_of, rows)
     keep = np.zeros(len(block.xyz), dtype=np.bool_)
@@ -153,7 +151,7 @@ def _equal(values: FloatArray, covariance: FloatArray) -> bool:
 
 
 def _runs(values: FloatArray, covariance: FloatArray) -> NDArray[np.int64]:
-    """(k,) a number for each value; a new one where it differs from the mean of those with the last number."""
+    """(k,) a number for each value; a new one where it differs from the mean of those with the last one."""
     runs, first = np.zeros(len(values), dtype=np.int64), 0
     limit = float(norm.isf(0.5 * _RATE))
     for k in range(1, len(values)):
