@@ -67,9 +67,10 @@ def zoomed_keys(
 def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) -> NDArray[np.int64] | None:
     """(k,) number of the focal length of each photo of a camera, from 0, in the order of their names.
 
-    Photos that follow each other keep one while no difference is significant. None: one for all. Whether a
-    lens zooms at all is asked with the dilution of what observations say of lenses, where it does without: what
-    a lens model leaves over is common to its photos.
+    Photos that follow each other keep one while no difference is significant. None: one for all.
+
+    Observations count with their dilution where it is asked whether a lens zooms, and in full where it does:
+    what a lens model leaves over is common to its photos.
 
     Args:
         camera: its row in the block, of a shot whose photos' names are in the order of time.
