@@ -5,6 +5,9 @@ from typing import Any
 from tools.scoreboard.row import Form, Limit, Row
 from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, OUT, SCAN, same
 
+_LENS_SETS = ("brighton/images", "seneca/images", "copr/images", "sacre_coeur/mapping")
+_LENS_WIDTHS = ("focal_rel", "aspect_rel", "center_rel", "radial", "tangential")
+
 
 def _portions(photos: str, cut: str, minutes: float) -> Row:
     return Row(
@@ -299,6 +302,25 @@ REAL: tuple[Row, ...] = (
     ),
     _laser("fountain-P11", 9, "quick"),
     _laser("entry-P10", 8, "full"),
+    Row(
+        name="lens-widths",
+        group="real",
+        form="full",
+        claim="how wide lenses are around what is known of them, on four real sets: the priors' widths lie "
+        "where 95 % of the likelihood is",
+        commands=(
+            (
+                *("tools.lens_widths", "--work", "{work}", *OUT, "--photos"),
+                *(f"{{data}}/{folder}" for folder in _LENS_SETS),
+            ),
+        ),
+        figures=same("lenses", *_LENS_WIDTHS, "inside"),
+        text="{lenses} lenses; focal length {focal_rel:.2%}, aspect {aspect_rel:.3%}, principal point "
+        "{center_rel:.2%}, radial {radial:.3f}, tangential {tangential:.4f}; {inside} of 5 widths lie within",
+        limits=(Limit(figure="inside", least=5),),
+        needs=_LENS_SETS,
+        minutes=15,
+    ),
     Row(
         name="copr-control-points",
         group="real",
