@@ -40,13 +40,15 @@ def zoomed_keys(
         models: their rows count `photos`, and the features of these.
     """
     keys: dict[str, str] = {}
+    if not any(_may_zoom(photo) for photo in photos):
+        return keys
     numbers: Counter[str] = Counter()  # focal lengths of a key so far
     for model in models:
         rows = model.rows.tolist()
         unknown = {
             camera
             for row, camera in zip(rows, model.camera_of.tolist(), strict=True)
-            if photos[row].film and photos[row].focal_px is None
+            if _may_zoom(photos[row])
         }
         if not unknown:
             continue
@@ -62,6 +64,10 @@ def zoomed_keys(
             numbers[key] += int(runs.max()) + 1
             keys |= {name: f"{key} zoom {lens}" for name, lens in zip(names, lenses, strict=True)}
     return keys
+
+
+def _may_zoom(photo: Photo) -> bool:
+    return bool(photo.film) and photo.focal_px is None
 
 
 def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) -> NDArray[np.int64] | None:
@@ -81,7 +87,10 @@ def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) 
         return None
     rows = rows[np.argsort([block.names[k] for k in rows], kind="stable")]
     part, own = _part(block, rows)
-    focal, covariance = _focal_lengths(part, own, options)
+    try:
+        focal, covariance = _focal_lengths(part, own, options)
+    except np.linalg.LinAlgError:  # nothing determines them
+        return None
     if focal is None or _equal(focal, covariance):
         return None
     return _runs(focal, covariance / options.dilution)
