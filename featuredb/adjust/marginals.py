@@ -244,5 +244,6 @@ def _inverse_blocks(blocks: Any, n: int) -> Any:
     dense = np.zeros((n, 3, 3))
     dense[blocks.row // 3, blocks.row % 3, blocks.col % 3] = blocks.data
     diagonal = np.einsum("nii->ni", dense)
-    diagonal += _DAMPING * diagonal.sum(axis=1, keepdims=True)
+    # No residual of a point behind its cameras depends on it: its block is zero.
+    diagonal += _DAMPING * np.maximum(diagonal.sum(axis=1, keepdims=True), _DAMPING)
     return sparse.bsr_matrix((np.linalg.inv(dense), np.arange(n), np.arange(n + 1)), shape=(3 * n, 3 * n))

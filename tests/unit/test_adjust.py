@@ -206,6 +206,24 @@ def _squares(problem: Problem, truth: Block, found: Marginals) -> tuple[float, f
     )
 
 
+def test_a_point_behind_all_cameras_breaks_no_covariance() -> None:
+    """No residual depends on it: as if it were not there."""
+    block = whole_lens(_block())
+    xyz = block.xyz.copy()
+    xyz[-1, 2] = 500.0
+    behind = replace(block, xyz=xyz)
+    rest = block.point_of != len(xyz) - 1
+    without = replace(
+        block,
+        xyz=xyz[:-1],
+        point_of=block.point_of[rest],
+        photo_of=block.photo_of[rest],
+        xy=block.xy[rest],
+    )
+    found, expected = (Problem(one, _terms(one, TRUE)).marginals() for one in (behind, without))
+    np.testing.assert_allclose(found.pose(1), expected.pose(1), rtol=1e-4, atol=1e-12)
+
+
 def test_what_is_held_stays_and_has_no_covariance() -> None:
     block = _block(noise_px=0.5)
     terms = replace(_terms(block, TRUE), lenses=(None,), held_photos=(3,))
