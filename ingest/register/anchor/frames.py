@@ -34,12 +34,14 @@ class FramesOptions:
 
     Attributes:
         frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
-        max_tries: frames tried for it, at most. Where six of ten register, as with intensities alone, six
-            tries leave fewer than two registered once in 25 maps; a wrong scan costs all of them.
+        max_tries: frames tried until the first one is registered, at most; a wrong scan costs all of them.
+        more_tries: frames tried at most once one is registered. Where one of three registers, as low films
+            over a scan without colours, 18 leave fewer than two registered once in 150 maps.
     """
 
     frames: int = 3
     max_tries: int = 6
+    more_tries: int = 18
     start: StartOptions = field(default_factory=StartOptions)
     proposals: ProposalOptions = field(default_factory=ProposalOptions)
     frame: FrameOptions = field(default_factory=FrameOptions)
@@ -136,8 +138,10 @@ def try_frames(
     wanted = [_started(feature_map, i, starts[i], ranking) for i in starts]
     wanted += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
-    for proposal in wanted[: max(options.max_tries, len(starts))]:
-        if sum(frame.registration.accepted for frame in tried) >= options.frames:
+    least = max(options.max_tries, len(starts))
+    for number, proposal in enumerate(wanted[: max(least, options.more_tries)]):
+        accepted = sum(frame.registration.accepted for frame in tried)
+        if accepted >= options.frames or (number >= least and not accepted):
             break
         frame = _try(feature_map, cloud, proposal, reader, options.frame)
         if frame is not None:
