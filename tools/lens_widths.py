@@ -117,11 +117,16 @@ def _told(
             continue
         posterior = np.linalg.inv(options.dilution * found.lens(c))
         off = np.array(camera.params) - np.array(prior.mean.params)
+        # Directions that photos say nothing of have what the prior says, or by its robust loss less.
+        root = np.linalg.cholesky(prior.covariance)
+        told, axes = np.linalg.eigh(root.T @ posterior @ root - np.eye(len(off)))
+        axes = np.linalg.solve(root.T, axes[:, told > 0.0])
+        told = told[told > 0.0]
         result.append(
             Told(
                 mean=prior.mean,
-                information=posterior - np.linalg.inv(prior.covariance),
-                vector=posterior @ off,
+                information=(axes * told) @ axes.T,
+                vector=axes @ (axes.T @ prior.covariance @ posterior @ off),
                 has_exif=c in focal_px,
             )
         )
