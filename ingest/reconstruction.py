@@ -169,7 +169,7 @@ def reconstruct_photos(
         made = _reconstruct(done, matched, workspace, options, executor, progress)
         keys = zoomed_keys(made.models(), usable, features)
         if keys:
-            logger.info("%d photos of films with another focal length than their shot's first", len(keys))
+            logger.info("%d photos of shots whose lens zooms: they are reconstructed again", len(keys))
             usable = tuple(replace(p, camera_key=keys.get(p.name, p.camera_key)) for p in usable)
             done = replace(done, usable=usable)
             made = _reconstruct(done, matched, workspace, options, executor, progress)

@@ -4,6 +4,7 @@ A reconstruction with one lens for all of a shot takes a zoom for a movement. Ad
 each photo, it says itself whether they are equal: their differences are tested against their covariance.
 """
 
+import logging
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -21,6 +22,8 @@ from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.map_errors import terms_of_map
 from ingest.photo import Photo
+
+logger = logging.getLogger(__name__)
 
 _RATE = 1e-3  # of lenses that do not zoom and are found to
 _LEAST_PHOTOS = 3
@@ -89,7 +92,8 @@ def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) 
     part, own = _part(block, rows)
     try:
         focal, covariance = _focal_lengths(part, own, options)
-    except np.linalg.LinAlgError:  # nothing determines them
+    except np.linalg.LinAlgError as error:
+        logger.warning("%s: nothing determines whether the lens zooms (%s)", part.names[0], error)
         return None
     if focal is None or _equal(focal, covariance):
         return None

@@ -1,6 +1,8 @@
 """A focal length that changes within a shot is found by the adjustment; a flight ahead is no zoom."""
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +13,9 @@ from featuredb.adjust.terms import Terms
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap_adjust import AdjustOptions, lens_prior_of
-from ingest.zoomed_lenses import focal_runs
+from ingest.colmap_bridge import Model
+from ingest.photo import Photo
+from ingest.zoomed_lenses import focal_runs, zoomed_keys
 from tests.support.scenes import box_points, looking_at
 
 ZOOM = [800.0] * 5 + [860.0, 940.0, 1010.0] + [1040.0] * 4
@@ -82,6 +86,37 @@ def test_photos_in_any_order_are_taken_by_name() -> None:
     runs = focal_runs(mixed, 0)
     assert runs is not None
     assert runs.tolist() == [0, 0, 0, 0, 0, 1, 2, 3, 4, 4, 4, 4]
+
+
+def test_keyframes_of_a_zoom_get_keys_and_other_photos_keep_theirs() -> None:
+    block = shot(ZOOM, (4.0, 0.0, 0.0))
+    order = np.lexsort((block.photo_of, block.point_of))
+    point_of, photo_of, xy = block.point_of[order], block.photo_of[order], block.xy[order]
+    keypoint_of, features = np.zeros(len(xy), dtype=np.int64), []
+    for k in range(len(ZOOM)):
+        mine = photo_of == k
+        keypoint_of[mine] = np.arange(mine.sum())
+        features.append(SimpleNamespace(features=SimpleNamespace(xy=xy[mine])))
+    model = Model(
+        cameras=block.cameras,
+        rows=np.arange(len(ZOOM)),
+        camera_of=block.camera_of,
+        cam_from_sfm=block.cam_from_block,
+        xyz=block.xyz,
+        point_of=point_of,
+        photo_of=photo_of,
+        keypoint_of=keypoint_of,
+    )
+    photos = [
+        Photo(name=name, path=Path(name), camera_key="film|a", film="a.mp4", width=960, height=720)
+        for name in block.names
+    ]
+    keys = zoomed_keys([model], photos, features)  # type: ignore[arg-type]
+    numbers = [0, 0, 0, 0, 0, 1, 2, 3, 4, 4, 4, 4]
+    assert keys == {name: f"film|a zoom {n}" for name, n in zip(block.names, numbers, strict=True)}
+    assert zoomed_keys([model], [replace(p, film="") for p in photos], features) == {}  # type: ignore[arg-type]
+    known = [replace(p, focal_px=800.0) for p in photos]
+    assert zoomed_keys([model], known, features) == {}  # type: ignore[arg-type]
 
 
 def test_two_photos_say_nothing() -> None:
