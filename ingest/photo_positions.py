@@ -44,17 +44,26 @@ def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> F
 
 
 def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
-    """Positions (n, 3) in the frame and sigmas (n, 3), NaN for photos without GPS or height."""
+    """Positions and sigmas (n, 3) in the frame: NaN for photos without GPS, infinite without height."""
     positions = np.full((len(photos), 3), np.nan)
     sigmas = np.full((len(photos), 3), np.nan)
-    rows = [i for i, p in enumerate(photos) if p.gps is not None and p.gps.height_m is not None]
+    rows = [i for i, p in enumerate(photos) if p.gps is not None]
     if frame is not None and rows:
         positions[rows] = gps_positions([photos[i] for i in rows], frame)
         for i in rows:
             gps = photos[i].gps
             assert gps is not None
-            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, gps.sigma_vertical_m)
+            vertical = gps.sigma_vertical_m if gps.height_m is not None else np.inf
+            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, vertical)
     return positions, sigmas
+
+
+def capture_seconds(photos: Sequence[Photo]) -> FloatArray | None:
+    """Times (n,) of capture; None where some photo does not say, or some do not say in which zone."""
+    times = [photo.capture_time for photo in photos if photo.capture_time is not None]
+    if len(times) < len(photos) or len({time.tzinfo is None for time in times}) != 1:
+        return None
+    return np.array([(time - times[0]).total_seconds() for time in times])
 
 
 def center_priors(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:

@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -20,9 +20,10 @@ from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress,
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
 from ingest.outcomes import map_outcome, photo_outcomes, registered_photos
+from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
 from ingest.photo_table import is_table, read_table
-from ingest.placed_models import Component, place_models
+from ingest.placed_models import HINTS, Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, reconstruct_photos
 from ingest.register.control.model import Survey
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome, StageTiming
@@ -35,6 +36,7 @@ logger = logging.getLogger(__name__)
 _MAP_VERSION = "photos-3"
 # Some hundred megabytes as rows of the tables; what a folder of a few hundred photos makes is one commit.
 _OBSERVATIONS_PER_COMMIT = 1_000_000
+_MOST_NOTES = 20
 _LIBRARIES = ("featuredb", "pycolmap", "opencv-contrib-python-headless", "numpy", "faiss-cpu")
 
 
@@ -241,25 +243,25 @@ def _place_and_commit(
     options: IngestOptions,
     identity: Callable[[int], MapIdentity],
     progress: Progress,
-) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome], list[str]]:
+) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome], dict[str, str]]:
     """Place the models and make the maps visible.
 
     Returns:
-        What became of each component and of its photos, and the ids of maps in quarantine.
+        What became of each component and of its photos, and why maps are in quarantine, by id.
 
     Maps are committed together until they are large: then the next ones go into another commit, so that
     memory does not grow with the photos.
     """
     outcomes: list[MapOutcome] = []
     registered: dict[str, PhotoOutcome] = {}
-    quarantined: list[str] = []
+    quarantined: dict[str, str] = {}
     if options.stop_after not in (None, "build", "commit"):
-        return (), {}, []
+        return (), {}, {}
     batch: list[Component] = []
     for component in place_models(result, options.making, identity=identity, survey=options.survey):
         batch.append(component)
         if component.feature_map is not None and component.feature_map.status == "quarantined":
-            quarantined.append(component.feature_map.map_id)
+            quarantined[component.feature_map.map_id] = component.reason
         if sum(len(c.model.point_of) for c in batch) > _OBSERVATIONS_PER_COMMIT:
             outcomes += _commit(database, batch, options)
             registered |= _registered_all(batch, result)
@@ -285,14 +287,17 @@ def _commit(database: Database, batch: Sequence[Component], options: IngestOptio
     return [map_outcome(c, created, options.making) for c in batch]
 
 
-def _quarantine_note(map_ids: Sequence[str]) -> tuple[str, ...]:
-    if not map_ids:
-        return ()
-    return (
-        f"{len(map_ids)} maps are placed by geotags that nobody answers for and stay in quarantine "
-        f"({', '.join(map_ids[:3])}{', ...' if len(map_ids) > 3 else ''}): they answer no queries until "
-        "something better confirms them; --trust-geotags believes the geotags.",
-    )
+def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:
+    """Why maps have a place and do not answer, and what can be done."""
+    notes = []
+    for reason in dict.fromkeys(quarantined.values()):
+        ids = [map_id for map_id, of in quarantined.items() if of == reason]
+        way = "--trust-geotags believes the geotags" if reason == HINTS else "; ".join(WAYS_TO_A_PLACE)
+        notes.append(
+            f"{len(ids)} maps ({', '.join(ids[:3])}{', ...' if len(ids) > 3 else ''}) stay in quarantine: "
+            f"{reason}. They answer no queries until something better confirms them: {way}."
+        )
+    return tuple(notes[:_MOST_NOTES])
 
 
 def _lost(result: Reconstructed) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
-from ingest.photo_positions import gps_priors, local_frame_of
+from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
@@ -31,6 +31,7 @@ _ELSEWHERE = (
     "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
     "that looks like it, or their positions have one error"
 )
+HINTS = "placed by geotags that nobody answers for"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,8 +111,9 @@ def placed_by_gps(
     """A model by the GPS of its photos: the frame, photos with GPS by place in the model, the placement."""
     frame = local_frame_of(chosen)  # its own: models may lie in different towns
     positions, sigmas = gps_priors(chosen, frame)
-    with_gps = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
-    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options)
+    with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
+    placed = place_by_gps(model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options, times_s)
     return frame, tuple(with_gps.tolist()), placed
 
 
@@ -148,8 +150,8 @@ def _component(
 ) -> Component:
     """Place one model and build its map; without a place where no placement is accepted.
 
-    Positions that nobody answers for place a quarantined map: it answers nothing and places nothing until
-    something better confirms it.
+    Positions that nobody answers for, or that are too few to check a place by, place a quarantined map: it
+    answers nothing and places nothing until something better confirms it.
 
     Args:
         photos: all usable ones.
@@ -190,9 +192,10 @@ def _component(
             reason_code="NO_POINTS",
             reason="no point is placed well enough: the photos' rays are parallel",
         )
-    if any(hints):
+    held_back = placed.provisional or (HINTS if any(hints) else "")
+    if held_back:
         feature_map = replace(feature_map, status="quarantined")
-    return replace(component, feature_map=feature_map, reason="")
+    return replace(component, feature_map=feature_map, reason_code="", reason=held_back)
 
 
 def _without_place(

@@ -50,6 +50,7 @@ class Localiser:
         snapshot: int,
         lineages: Mapping[str, Lineage],
         unplaced: Mapping[str, Callable[[], UnplacedMap]] | None = None,
+        provisional: Mapping[str, Callable[[], FeatureMap]] | None = None,
     ) -> None:
         self._loaded = tuple(loaded)
         self._options = options
@@ -57,6 +58,7 @@ class Localiser:
         # Of the snapshot, not of an area: an area that is taken over may hang on maps that have changed.
         self._lineages = dict(lineages)
         self._unplaced = dict(unplaced or {})
+        self._provisional = dict(provisional or {})
         self._own: tuple[UnplacedMap, IndexedArea] | None = None
         self._own_lock = threading.Lock()
 
@@ -72,6 +74,8 @@ class Localiser:
         instead: Mapping[str, FeatureMap] | None = None,
     ) -> "Localiser":
         """Load and index the active maps of a snapshot.
+
+        Maps in quarantine that are placed by positions alone answer where they are named.
 
         Args:
             as_of: snapshot number or time; None: the newest.
@@ -99,7 +103,12 @@ class Localiser:
             for m in snapshot.unplaced_maps()
             if m.descriptors
         }
-        return cls(loaded, options, snapshot.version, snapshot.lineages(), unplaced)
+        provisional = {
+            m.map_id: partial(snapshot.load_map, m.map_id)
+            for m in snapshot.maps()
+            if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
+        }
+        return cls(loaded, options, snapshot.version, snapshot.lineages(), unplaced, provisional)
 
     @property
     def snapshot(self) -> int:
@@ -213,7 +222,7 @@ class Localiser:
         if map_ids is None:
             return [loaded.indexed for loaded in self._loaded]
         wanted = set(map_ids)
-        unknown = wanted - {m for loaded in self._loaded for m in loaded.map_ids}
+        unknown = wanted - self._provisional.keys() - {m for loaded in self._loaded for m in loaded.map_ids}
         if unknown:
             raise MapNotFoundError(
                 f"snapshot {self._snapshot} serves no map {', '.join(sorted(unknown))}; "
@@ -226,6 +235,9 @@ class Localiser:
             elif loaded.map_ids & wanted:
                 area = build_area([m for m in loaded.indexed.area.maps if m.map_id in wanted])
                 chosen.append(IndexedArea(area=area, index=build_index(area.descriptors)))
+        for map_id in sorted(wanted & self._provisional.keys()):
+            area = build_area([self._provisional[map_id]()])
+            chosen.append(IndexedArea(area=area, index=build_index(area.descriptors)))
         return chosen
 
 

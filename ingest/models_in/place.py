@@ -18,7 +18,7 @@ from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap_bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photo import Photo
-from ingest.photo_positions import gps_priors, local_frame_of
+from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps
 
 Axes = Literal["enu", "utm", "ecef"]
@@ -168,8 +168,9 @@ def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
     """By the GPS of the photos, with the gates of an ordinary ingest; or why they refuse it."""
     frame = local_frame_of(photos)
     positions, sigmas = gps_priors(photos, frame)
-    known = np.flatnonzero(np.isfinite(sigmas).all(axis=1))
-    placed = place_by_gps(model.centers()[known], positions[known], sigmas[known], GpsOptions())
+    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
+    times_s = capture_seconds([photos[i] for i in known.tolist()])
+    placed = place_by_gps(model.centers()[known], positions[known], sigmas[known], GpsOptions(), times_s)
     if (
         placed.reason is not None
         or placed.local_from_sfm is None
@@ -193,6 +194,7 @@ def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
             evidence=placed.figures,
         ),
         epsg=utm_epsg(frame.latitude_deg, frame.longitude_deg),
+        status="quarantined" if placed.provisional else "active",
     )
 
 

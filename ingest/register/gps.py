@@ -1,9 +1,13 @@
-"""Placement by GPS: the similarity that carries camera centres to the photos' positions.
+"""Placement by positions of any quality: the similarity, how wide it is, and whether it may be by chance.
 
-Equation: gps_i = S center_i + bias + noise_i, with S = local_from_sfm. The sigma of a position is that of
-its whole error, bias + noise. Noise is independent for each photo and shows in the residuals; the bias is
-shared by all photos of a flight (atmosphere, ephemeris, barometer) and never does. What the sigmas claim
-and the residuals do not show is therefore taken for bias: it goes into the covariance of the translation.
+How noisy the positions are is estimated with the similarity (`ingest.register.position_noise`). What noise
+leaves of the stated sigmas is taken for a bias that all positions share. Two tests, each by a rate of error:
+
+- chance: how often would positions that have nothing to do with the reconstruction fit as well? It follows
+  from the ratio of the likelihoods, times the number of ways to leave out the positions that were left out.
+  A map answers where it is less than one in a thousand.
+- contradiction: noise above what one receiver in a thousand has; or in twenty, where chance fits as well in
+  one case of twenty.
 """
 
 import itertools
@@ -12,243 +16,206 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import norm
 
+from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.sim3 import Sim3, point_jacobian
-from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
+from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
+from ingest.register.position_noise import NOISE_SHARE, NoisyFit, fit_noisy
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
+
+_LEAST_PHOTOS = 3  # fix a similarity
+_PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsOptions:
-    """How the similarity is estimated and when it is refused.
+    """How the similarity is estimated and what may answer.
 
     Attributes:
-        min_photos: three positions are the least that fix a similarity.
-        outlier_sigmas: a photo whose residual is further out, in sigmas of its own prior, is left out.
-            3.5 keeps 99.3 % of honest positions (three axes).
-        max_outlier_share: with more outliers than that the priors or the reconstruction are wrong.
-        min_rotation_sigma_ratio: the spread of the centres across their main line, over the sigma of
-            GPS across it; below, the rotation about the line is not observed to better than ~30 deg.
-        max_variance_factor: of weighted residuals over their expectation; 9 means that GPS is three
-            times worse than it says.
-        max_scale_sigma: relative standard deviation of the scale; beyond, a map is no measure.
-        noise_confidence: small residuals of few photos may be luck; the noise is taken as large as it
-            can be at this confidence, up to what the sigmas claim.
+        wrong: share of receivers that are noisier than what is refused.
+        no_place: the same, where chance explains the fit as often.
+        answers: chance below which a map may answer.
+        max_scale_sigma, max_turn_deg: standard deviations beyond which covariances say nothing, as they are
+            linear.
         max_ransac_samples: of three positions; fewer photos are tried exhaustively.
         seed: of the samples.
     """
 
-    min_photos: int = 3
-    outlier_sigmas: float = 3.5
-    max_outlier_share: float = 0.4
-    min_rotation_sigma_ratio: float = 2.0
-    max_variance_factor: float = 9.0
+    wrong: float = 0.001
+    no_place: float = 0.05
+    answers: float = 0.001
     max_scale_sigma: float = 0.1
-    noise_confidence: float = 0.95
+    max_turn_deg: float = 10.0
     max_ransac_samples: int = 500
     seed: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GpsPlacement:
-    """Outcome of a placement: accepted when `reason` is None.
+    """Outcome of a placement: there is one when `reason` is None.
 
     Attributes:
-        reason: gate that refused it, or None; `message` says it for people.
+        reason: why there is none, or None; `message` says it for people.
+        provisional: why the map may not answer before something confirms it; "" where it may.
         local_from_sfm: the similarity, None where none could be estimated.
         covariance: (7, 7) of its left perturbation (sigma, omega, nu), or None.
         residuals_m: (n, 3) GPS minus placed centre, east, north, up; NaN without a similarity.
-        inliers: (n,) bool.
-        variance_factor: weighted residuals' variance over the priors' own.
+        inliers: (n,) bool, those that are not far out.
         figures: what the decision rests on, JSON-able.
     """
 
     reason: GpsReason | None
     message: str
+    provisional: str
     local_from_sfm: Sim3 | None
     covariance: FloatArray | None
     residuals_m: FloatArray
     inliers: NDArray[np.bool_]
-    variance_factor: float
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
     def residual_rms_m(self) -> float:
         """Root mean square length of the inliers' residuals, metres."""
         inner = self.residuals_m[self.inliers]
-        return float(np.sqrt((inner**2).sum(axis=1).mean())) if len(inner) else float("nan")
+        return float(np.sqrt(np.nansum(inner**2, axis=1).mean())) if len(inner) else float("nan")
 
 
 def place_by_gps(
-    centers_sfm: FloatArray, positions_local: FloatArray, sigmas_m: FloatArray, options: GpsOptions
+    centers_sfm: FloatArray,
+    positions_local: FloatArray,
+    sigmas_m: FloatArray,
+    options: GpsOptions,
+    times_s: FloatArray | None = None,
 ) -> GpsPlacement:
     """Robust similarity from camera centres to GPS positions.
 
     Args:
         centers_sfm: (n, 3) camera centres in the reconstruction's frame.
         positions_local: (n, 3) GPS in the local frame, metres.
-        sigmas_m: (n, 3) standard deviations of the positions along the local axes.
+        sigmas_m: (n, 3) standard deviations of the positions along the local axes; infinite for a coordinate
+            that is not known.
+        times_s: (n,) of capture; None: in the order given.
     """
     count = len(centers_sfm)
-    if count < options.min_photos:
-        return _refused(
-            "TOO_FEW",
-            f"{count} registered photos have GPS, at least {options.min_photos} are needed",
-            count,
-            {"photos_with_gps": count},
-        )
-    start = _ransac(centers_sfm, positions_local, sigmas_m, options)
+    figures: dict[str, Any] = {"photos_with_gps": count, "options": asdict(options)}
+    if count < _LEAST_PHOTOS:
+        message = f"{count} registered photos have GPS, at least {_LEAST_PHOTOS} are needed"
+        return _refused("TOO_FEW", message, count, figures)
+    start = _start(centers_sfm, positions_local, sigmas_m, options)
     if start is None:
-        return _refused(
-            "DEGENERATE_LINE", "the camera centres or positions coincide", count, {"photos_with_gps": count}
-        )
-    sim, inliers = start
-    for _ in range(10):  # inliers settle in two or three rounds
-        sim = refined_similarity(sim, centers_sfm[inliers], positions_local[inliers], sigmas_m[inliers])
-        again = _distances(sim, centers_sfm, positions_local, sigmas_m) <= options.outlier_sigmas
-        if (again == inliers).all() or again.sum() < options.min_photos:
-            break
-        inliers = again
-    return _judge(sim, centers_sfm, positions_local, sigmas_m, inliers, options)
+        return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
+    times = np.arange(count, dtype=np.float64) if times_s is None else times_s
+    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times)
+    return _judged(fit, centers_sfm, positions_local, sigmas_m, figures, options)
 
 
-def _judge(
-    sim: Sim3,
+def _judged(
+    fit: NoisyFit,
     centers: FloatArray,
     positions: FloatArray,
     sigmas: FloatArray,
-    inliers: NDArray[np.bool_],
+    figures: dict[str, Any],
     options: GpsOptions,
 ) -> GpsPlacement:
-    """Covariance, figures and gates of an estimated similarity."""
-    residuals = positions - sim.act(centers)
-    used = int(inliers.sum())
-    freedom = 3 * used - 7
-    weighted = float(((residuals[inliers] / sigmas[inliers]) ** 2).sum())
-    factor = weighted / freedom
-    spread_ratio = _spread_over_sigma(positions[inliers], sigmas[inliers])
-    figures: dict[str, Any] = {
-        "photos_with_gps": len(centers),
-        "inliers": used,
-        "variance_factor": factor,
-        "chi_square": weighted,
-        "degrees_of_freedom": freedom,
-        "chi_square_probability": float(chi2.sf(weighted, freedom)),
-        "across_line_over_sigma": spread_ratio,
-        "rms_horizontal_m": float(np.sqrt((residuals[inliers, :2] ** 2).sum(axis=1).mean())),
-        "rms_vertical_m": float(np.sqrt((residuals[inliers, 2] ** 2).mean())),
-        "options": asdict(options),
+    """Covariance, figures and tests of an estimated similarity."""
+    known = np.isfinite(sigmas)
+    residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
+    stated = np.array([_median(sigmas[:, k]) for k in range(3)])
+    white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
+    bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
+    covariance = fit.covariance.copy()
+    covariance[4:, 4:] += np.diag(bias**2)
+    chance = fit.log_chance
+    inliers = np.asarray(fit.used.all(axis=1))
+    turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
+    figures = figures | {
+        "inliers": int(inliers.sum()),
+        "noise_m": fit.noise.white,
+        "drift_m": fit.noise.drift,
+        "bias_sigma_m": bias.tolist(),
+        "scale_sigma": float(np.sqrt(covariance[0, 0])),
+        "turn_sigma_deg": turn_deg,
+        "log10_chance": chance / np.log(10.0),
+        "rms_horizontal_m": float(np.sqrt(np.nansum(residuals[inliers, :2] ** 2, axis=1).mean())),
+        "rms_vertical_m": float(np.sqrt(np.nanmean(residuals[inliers, 2] ** 2)))
+        if known[inliers, 2].any()
+        else None,
     }
 
-    def outcome(reason: GpsReason | None, message: str, covariance: FloatArray | None) -> GpsPlacement:
+    def outcome(reason: GpsReason | None, message: str, provisional: str = "") -> GpsPlacement:
         return GpsPlacement(
             reason=reason,
             message=message,
-            local_from_sfm=sim,
+            provisional=provisional,
+            local_from_sfm=fit.local_from_sfm,
             covariance=covariance,
             residuals_m=residuals,
             inliers=inliers,
-            variance_factor=factor,
             figures=figures,
         )
 
-    if spread_ratio < options.min_rotation_sigma_ratio:
-        return outcome(
-            "DEGENERATE_LINE",
-            f"the photos lie along a line: {spread_ratio:.1f} sigmas of GPS across it, at least "
-            f"{options.min_rotation_sigma_ratio:g} are needed to tell which way is up; add photos "
-            "beside the line, or place it by control points (--gcp) or a scan",
-            None,
-        )
-    share = 1.0 - used / len(centers)
-    if share > options.max_outlier_share or factor > options.max_variance_factor:
+    rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
+    usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
+    above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
+    if above > norm.isf(options.wrong) or (
+        above > norm.isf(options.no_place) and chance > np.log(options.no_place)
+    ):
         return outcome(
             "RESIDUALS",
-            f"the photos' GPS does not fit the reconstruction: {share:.0%} outliers, the rest "
-            f"{factor**0.5:.1f} times their sigma (limits {options.max_outlier_share:.0%} and "
-            f"{options.max_variance_factor**0.5:g})",
-            None,
+            f"the photos' GPS does not fit the reconstruction: it would be noisy by {rms[0]:.0f} m "
+            f"horizontally and {rms[-1]:.0f} m in height; positions of other photos would fit as well in "
+            f"{np.exp(chance):.1g} of cases",
         )
-    noise = noise_variance_factor(weighted, freedom, options.noise_confidence)
-    bias = _bias_shares(residuals[inliers] / sigmas[inliers], freedom)
-    covariance = _covariance(sim, centers[inliers], sigmas[inliers], noise, bias)
-    figures["noise_variance_factor"] = noise
-    figures["bias_sigma_m"] = (np.median(sigmas[inliers], axis=0) * np.sqrt(bias)).tolist()
-    figures["scale_sigma"] = float(np.sqrt(covariance[0, 0]))
+    if turn_deg > options.max_turn_deg:
+        return outcome(
+            "DEGENERATE_LINE",
+            f"the photos lie along a line: their GPS tells the orientation to {turn_deg:.0f} degrees, "
+            f"{options.max_turn_deg:.0f} are needed; add photos beside the line, or place it by control "
+            "points (--gcp) or a scan",
+        )
     if figures["scale_sigma"] > options.max_scale_sigma:
         return outcome(
             "SCALE",
             f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} is "
             "needed: the photos are too close together for their GPS",
-            None,
         )
-    return outcome(None, "placed by GPS", covariance)
+    if chance > np.log(options.answers):
+        return outcome(
+            None,
+            "placed by GPS",
+            f"positions that have nothing to do with these photos would fit as well in {np.exp(chance):.1%} "
+            f"of cases (limit {options.answers:.1%}): too few are left to check the place by",
+        )
+    return outcome(None, "placed by GPS")
 
 
-def _covariance(
-    sim: Sim3, centers: FloatArray, sigmas: FloatArray, noise_factor: float, bias_shares: FloatArray
-) -> FloatArray:
-    """(7, 7): noise by the normal equations, plus the shared bias in the translation."""
-    jacobian = point_jacobian(sim.act(centers)) / sigmas[:, :, None]
-    normal = np.einsum("nij,nik->jk", jacobian, jacobian)
-    covariance = np.linalg.inv(normal) * noise_factor
-    covariance[4:, 4:] += np.diag(np.median(sigmas, axis=0) ** 2 * bias_shares)
-    return np.asarray((covariance + covariance.T) / 2)
+def _median(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
-def _bias_shares(normalised: FloatArray, freedom: int) -> FloatArray:
-    """(3,) share of each axis' variance that is taken for bias, east, north, up: what the noise leaves.
-
-    A height is often off by metres and yet steady to decimetres, steadier than the position: by one noise
-    factor for all axes, part of its bias would pass for noise, which averages out. So the height's own
-    factor counts where it leaves more to the bias, and likewise that of the horizontal axes. The noise is
-    counted as measured here: its upper limit would take from the bias what may be the bias's.
-
-    Args:
-        normalised: (n, 3) residuals over sigmas.
-        freedom: degrees of freedom of all of them together; they are shared out evenly.
-    """
-    squared = (normalised**2).sum(axis=0)
-    horizontal = float(squared[:2].sum()) / (freedom * 2 / 3)
-    vertical = float(squared[2]) / (freedom / 3)
-    noise = np.minimum(float(squared.sum()) / freedom, np.array([horizontal, horizontal, vertical]))
-    return np.asarray(np.maximum(0.0, 1.0 - noise), dtype=np.float64)
-
-
-def noise_variance_factor(weighted: float, freedom: float, confidence: float) -> float:
-    """Variance of the noise over the square of the sigmas, from the weighted sum of squared residuals.
-
-    Where the residuals are larger than the sigmas say: as measured. Where they are smaller: the upper end
-    of the confidence interval, at most 1.
-    """
-    measured = weighted / freedom
-    upper = weighted / float(chi2.ppf(1.0 - confidence, freedom))
-    return max(measured, min(1.0, upper))
-
-
-def _ransac(
+def _start(
     centers: FloatArray, positions: FloatArray, sigmas: FloatArray, options: GpsOptions
-) -> tuple[Sim3, NDArray[np.bool_]] | None:
-    """The similarity of three photos, or of all, with the smallest truncated sum of squared distances."""
-    samples = _samples(len(centers), options)
+) -> Sim3 | None:
+    """The similarity of three photos, or of all, that fits most of them at whatever noise they have."""
+    whole = np.isfinite(sigmas).all(axis=1)
+    if not whole.any():  # heights that nobody knows: one height for all
+        positions, whole = np.where(np.isfinite(sigmas), positions, 0.0), np.ones(len(sigmas), dtype=np.bool_)
+    rows = np.flatnonzero(whole)
     best: tuple[float, Sim3] | None = None
-    for rows in [np.arange(len(centers)), *samples]:
-        sim = similarity_closed_form(centers[rows], positions[rows])
+    for sample in [rows, *(rows[s] for s in _samples(len(rows), options))]:
+        sim = similarity_closed_form(centers[sample], positions[sample])
         if sim is None:
             continue
-        distances = _distances(sim, centers, positions, sigmas)
-        cost = float(np.minimum(distances, options.outlier_sigmas).__pow__(2).sum())
+        off = (positions - sim.act(centers)) / sigmas
+        off[~np.isfinite(off)] = 0.0
+        cost = float(np.log1p((off[:, :2] ** 2).sum(axis=1)).sum() + 0.5 * np.log1p(off[:, 2] ** 2).sum())
         if best is None or cost < best[0]:
             best = (cost, sim)
-    if best is None:
-        return None
-    inliers = _distances(best[1], centers, positions, sigmas) <= options.outlier_sigmas
-    if inliers.sum() < options.min_photos:  # nothing fits: let the gates see all residuals
-        inliers = np.ones(len(centers), dtype=bool)
-    return best[1], inliers
+    return best[1] if best is not None else None
 
 
 def _samples(count: int, options: GpsOptions) -> list[NDArray[np.int64]]:
@@ -258,31 +225,14 @@ def _samples(count: int, options: GpsOptions) -> list[NDArray[np.int64]]:
     return [generator.choice(count, 3, replace=False) for _ in range(options.max_ransac_samples)]
 
 
-def _distances(sim: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray) -> FloatArray:
-    """Mahalanobis distance (n,) of each position from its placed centre."""
-    return np.asarray(np.sqrt((((positions - sim.act(centers)) / sigmas) ** 2).sum(axis=1)))
-
-
-def _spread_over_sigma(positions: FloatArray, sigmas: FloatArray) -> float:
-    """Root sum of squares of the positions across their main line, over the sigma of GPS in that direction.
-
-    The inverse is about the standard deviation, in radians, of the rotation about the line. A single
-    direction across counts: it fixes the rotation, the other does not add to the question.
-    """
-    centred = positions - positions.mean(axis=0)
-    _, values, axes = np.linalg.svd(centred, full_matrices=False)
-    sigma_across = float(np.sqrt(((axes[1] * np.median(sigmas, axis=0)) ** 2).sum()))
-    return float(values[1]) / sigma_across
-
-
 def _refused(reason: GpsReason, message: str, count: int, figures: dict[str, Any]) -> GpsPlacement:
     return GpsPlacement(
         reason=reason,
         message=message,
+        provisional="",
         local_from_sfm=None,
         covariance=None,
         residuals_m=np.full((count, 3), np.nan),
         inliers=np.zeros(count, dtype=bool),
-        variance_factor=float("nan"),
         figures=figures,
     )

@@ -439,3 +439,33 @@ def test_a_database_serves_its_active_maps_only(
     upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
     with pytest.raises(IncompatibleExtractorError, match="start the server"):
         Localiser.open(database, upright, previous=third).localise(photo, KNOWN)
+
+
+def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(
+    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
+) -> None:
+    by_gps = replace(field_map.placement, method="gps")
+    database = Database.create(tmp_path / "db")
+    database.commit_map(replace(field_map, placement=by_gps, status="quarantined"))
+    localiser = Localiser.open(database)
+    assert localiser.localise(photo, KNOWN).reason == "NO_COVERAGE"
+    named = localiser.localise(photo, replace(KNOWN, map_ids=("field",)))
+    assert named.pose is not None
+    assert [entry["map_id"] for entry in named.pose.lineage] == ["field"]
+
+
+def test_a_map_in_quarantine_that_maps_placed_answers_nobody(
+    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8]
+) -> None:
+    database = Database.create(tmp_path / "db")
+    database.commit_map(field_map)
+    grown = replace(
+        field.planar_map(map_id="grown"),
+        placement=replace(field_map.placement, method="map"),
+        parents=("field",),
+        generation=1,
+        status="quarantined",
+    )
+    database.commit_map(grown)
+    with pytest.raises(MapNotFoundError, match="grown"):
+        Localiser.open(database).localise(photo, replace(KNOWN, map_ids=("grown",)))
