@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap_bridge import Model
+from ingest.register.position_noise import Level
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (
@@ -20,6 +22,8 @@ WAYS_TO_A_PLACE = (
 # A frame is called upright where the standard error of its vertical is below this about both horizontal axes.
 _UPRIGHT_SIGMA_RAD = np.radians(2.0)
 _ROBUST_ROUNDS = 5
+_ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
+_COMMON_ROLL_RAD = np.radians(1.5)  # of all photos by one gimbal or hand
 _KEPT_SIGMAS = 3.0  # photos that were held askew do not tell the vertical
 
 
@@ -46,25 +50,53 @@ def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
 
     Photos whose image axis is off the level by more than three robust standard deviations do not count.
     """
+    found = _held_level(poses)
+    if found is None:
+        return None
+    kept, sigma, up, spread = found
+    if sigma / np.sqrt(max(spread, 1e-12)) > _UPRIGHT_SIGMA_RAD:  # about the axis that they span least
+        return None
+    return np.asarray(up if float((_down(poses)[kept] @ up).mean()) < 0 else -up)
+
+
+def level_of(poses: Sequence[Rigid3]) -> Level | None:
+    """How photos are held, for a placement: None where most of them are not held level."""
+    found = _held_level(poses)
+    if found is None or found[1] > _ASKEW_RAD:
+        return None
+    kept, sigma, _, _ = found
+    return Level(
+        across=np.array([pose.rotation[0] for pose in poses])[kept],
+        sigma_rad=float(np.sqrt(sigma**2 + kept.sum() * _COMMON_ROLL_RAD**2)),
+        down=_down(poses)[kept].mean(axis=0),
+    )
+
+
+def _held_level(poses: Sequence[Rigid3]) -> tuple[NDArray[np.bool_], float, FloatArray, float] | None:
+    """Photos held level, the deviation of one, the vertical (up to its sign), and how well it is spanned.
+
+    None where less than half of them agree.
+    """
     across = np.array([pose.rotation[0] for pose in poses]).reshape(-1, 3)
     kept = np.ones(len(across), dtype=np.bool_)
     for _ in range(_ROBUST_ROUNDS):
         if kept.sum() < 4:
             return None
         values, vectors = np.linalg.eigh(across[kept].T @ across[kept])
-        up = vectors[:, 0]
-        roll = across @ up
+        roll = across @ vectors[:, 0]
         sigma = max(1.4826 * float(np.median(np.abs(roll[kept]))), 1e-6)
         now = np.abs(roll) <= _KEPT_SIGMAS * sigma
         if (now == kept).all():
             break
         kept = now
-    sigma_up = sigma / np.sqrt(max(values[1], 1e-12))  # about the axis that the photos' axes span least
-    if kept.sum() < max(4, len(across) // 2) or sigma_up > _UPRIGHT_SIGMA_RAD:
+    if kept.sum() < max(4, len(across) // 2):
         return None
-    # Image rows point downwards in photos of fronts, the view does in photos from above.
-    down = np.array([pose.rotation[1] + pose.rotation[2] for pose in poses])[kept]
-    return np.asarray(up if float((down @ up).mean()) < 0 else -up)
+    return kept, sigma, vectors[:, 0], float(values[1])
+
+
+def _down(poses: Sequence[Rigid3]) -> FloatArray:
+    """(k, 3) about downwards: image rows point there in photos of fronts, the view in photos from above."""
+    return np.array([pose.rotation[1] + pose.rotation[2] for pose in poses])
 
 
 def _z_to(up: FloatArray) -> FloatArray:

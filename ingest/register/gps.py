@@ -22,7 +22,7 @@ from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import NOISE_SHARE, NoisyFit, fit_noisy
+from ingest.register.position_noise import NOISE_SHARE, Level, NoisyFit, fit_noisy
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -89,6 +89,7 @@ def place_by_gps(
     sigmas_m: FloatArray,
     options: GpsOptions,
     times_s: FloatArray | None = None,
+    level: Level | None = None,
 ) -> GpsPlacement:
     """Robust similarity from camera centres to GPS positions.
 
@@ -98,6 +99,7 @@ def place_by_gps(
         sigmas_m: (n, 3) standard deviations of the positions along the local axes; infinite for a coordinate
             that is not known.
         times_s: (n,) of capture; None: in the order given.
+        level: how the photos are held.
     """
     count = len(centers_sfm)
     figures: dict[str, Any] = {"photos_with_gps": count, "options": asdict(options)}
@@ -107,8 +109,10 @@ def place_by_gps(
     start = _start(centers_sfm, positions_local, sigmas_m, options)
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
-    times = np.arange(count, dtype=np.float64) if times_s is None else times_s
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times)
+    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, level)
+    if level is not None and (fit.local_from_sfm.rotation @ level.down)[2] > 0:  # a line, the wrong side up
+        over = _turned_over(fit.local_from_sfm, centers_sfm)
+        fit = fit_noisy(over, centers_sfm, positions_local, sigmas_m, times_s, level)
     return _judged(fit, centers_sfm, positions_local, sigmas_m, figures, options)
 
 
@@ -135,6 +139,7 @@ def _judged(
         "inliers": int(inliers.sum()),
         "noise_m": fit.noise.white,
         "drift_m": fit.noise.drift,
+        "lag_s": fit.lag_s,
         "bias_sigma_m": bias.tolist(),
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "turn_sigma_deg": turn_deg,
@@ -190,6 +195,15 @@ def _judged(
             f"of cases (limit {options.answers:.1%}): too few are left to check the place by",
         )
     return outcome(None, "placed by GPS")
+
+
+def _turned_over(sim: Sim3, centers: FloatArray) -> Sim3:
+    """Turned by half a turn about the main line of the centres."""
+    placed = sim.act(centers)
+    middle = placed.mean(axis=0)
+    axis = np.linalg.svd(placed - middle, full_matrices=False)[2][0]
+    turn = 2.0 * np.outer(axis, axis) - np.eye(3)
+    return Sim3(scale=1.0, rotation=turn, translation=middle - turn @ middle) @ sim
 
 
 def _median(values: FloatArray) -> float:

@@ -37,6 +37,10 @@ _PROPOSAL = 5.0  # degrees of freedom of the t from which components are drawn
 _LEAST_M = 1e-6
 _RANGE = 7.0  # of logarithms: a thousand times more or less
 _LEAST_PHOTOS = 3
+_LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
+_LAG_SHARE = 0.5  # of a stated sigma that may be a lag
+_MOST_LAG_S = 1.0  # standard deviation of a lag
+_STEADY_S = 20.0
 _MOST_POSITIONS = 400  # more are thinned out evenly in time
 _TURNS = 8.0  # local maxima of the likelihood over turns: each is a chance of its own
 _INSIDE = 0.999  # of honest positions
@@ -58,6 +62,21 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Level:
+    """How photos are held: their horizontal image axes are level.
+
+    Attributes:
+        across: (k, 3) those axes in the reconstruction's frame.
+        sigma_rad: how far one is off the level, with what all have in common.
+        down: (3,) about downwards.
+    """
+
+    across: FloatArray
+    sigma_rad: float
+    down: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NoisyFit:
     """The similarity and what it is worth.
 
@@ -65,6 +84,7 @@ class NoisyFit:
         local_from_sfm: the similarity.
         covariance: (7, 7) of its left perturbation about the local origin, without the bias.
         noise: its most likely components.
+        lag_s: by which positions are late.
         used: (n, 2) horizontal and vertical; others are so far out that one of a thousand honest ones is.
         log_chance: natural logarithm of how often positions that know nothing of the reconstruction fit as
             well, by the ratio of the likelihoods, both with their own components.
@@ -73,6 +93,7 @@ class NoisyFit:
     local_from_sfm: Sim3
     covariance: FloatArray
     noise: Noise
+    lag_s: float
     used: NDArray[np.bool_]
     log_chance: float
 
@@ -85,6 +106,8 @@ class _Data:
         positions, sigmas: (n, 3), a coordinate that nobody knows has an infinite sigma.
         walk: (n, n) covariance of a walk of unit variance at its end.
         stated: (2,) median sigma, horizontal and vertical.
+        speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
+        lag_sigma_s: of the time between a photo and its position.
     """
 
     centers: FloatArray
@@ -92,6 +115,46 @@ class _Data:
     sigmas: FloatArray
     walk: FloatArray
     stated: FloatArray
+    speed: FloatArray
+    lag_sigma_s: float
+    level: Level | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """The similarity and the lag, in seconds, by which positions are late."""
+
+    sim: Sim3
+    lag_s: float
+
+    def residual(self, data: "_Data") -> FloatArray:
+        """(n, 3) of the positions."""
+        return data.positions - self.sim.act(data.centers) - self.lag_s * self._speed(data)
+
+    def jacobian(self, data: "_Data") -> FloatArray:
+        """(n, 3, 8) by lag and similarity."""
+        placed = self.sim.act(data.centers)
+        return np.concatenate([self._speed(data)[:, :, None], point_jacobian(placed)], axis=2)
+
+    def moved(self, step: FloatArray) -> "_State":
+        """After a step (8,), no further than where it is linear."""
+        most = max(float(np.abs(step[1:5]).max()) / _MOST_STEP, 1.0)
+        return _State(Sim3.exp(step[1:] / most) @ self.sim, self.lag_s + float(step[0]) / most)
+
+    def known(self, data: "_Data") -> tuple[FloatArray, FloatArray]:
+        """Jacobian (m, 8) and residual (m,), whitened, of what is known beside positions."""
+        wide = np.array([data.lag_sigma_s, _UNKNOWN_SCALE, *[_UNKNOWN_TURN] * 3, *[_UNKNOWN_M] * 3])
+        rows, off = [np.diag(1.0 / wide)], [np.array([-self.lag_s / data.lag_sigma_s, *[0.0] * 7])]
+        if data.level is not None:
+            across = data.level.across @ self.sim.rotation.T
+            level = np.zeros((len(across), 8))
+            level[:, 2], level[:, 3] = across[:, 1], -across[:, 0]
+            rows.append(level / data.level.sigma_rad)
+            off.append(-across[:, 2] / data.level.sigma_rad)
+        return np.vstack(rows), np.concatenate(off)
+
+    def _speed(self, data: "_Data") -> FloatArray:
+        return -self.sim.scale * data.speed @ self.sim.rotation.T
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,8 +172,26 @@ class _Axis:
     walk: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linear:
+    """A linear problem whose noise is independent once its components are given.
+
+    Attributes:
+        known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside positions.
+    """
+
+    axes: list[_Axis]
+    known: FloatArray
+    off: FloatArray
+
+
 def fit_noisy(
-    start: Sim3, centers: FloatArray, positions: FloatArray, sigmas: FloatArray, times_s: FloatArray
+    start: Sim3,
+    centers: FloatArray,
+    positions: FloatArray,
+    sigmas: FloatArray,
+    times_s: FloatArray | None = None,
+    level: Level | None = None,
 ) -> NoisyFit:
     """The similarity with all components of variance.
 
@@ -118,56 +199,78 @@ def fit_noisy(
         start: within the range where the similarity is linear.
         centers: (n, 3) camera centres of the reconstruction. positions: (n, 3) local, metres.
         sigmas: (n, 3) as stated, of the whole error; infinite where a coordinate is not known.
-        times_s: (n,) of capture; their order is what counts most.
+        times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
+        level: how the photos are held.
     """
     stated = np.array([_median(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
+    speed, order = np.zeros_like(centers), np.arange(len(centers), dtype=np.float64)
+    if times_s is not None:
+        speed, order = _speeds(centers, times_s), times_s
+    fastest = start.scale * float(np.median(np.linalg.norm(speed, axis=1)))
     data = _Data(
         centers=centers,
         positions=middle.inverse().act(positions),
         sigmas=sigmas,
-        walk=_walk(times_s),
+        walk=_walk(order),
         stated=stated,
+        speed=speed,
+        lag_sigma_s=min(_LAG_SHARE * stated[0] / fastest, _MOST_LAG_S) if fastest > 0 else _MOST_LAG_S,
+        level=level,
     )
-    sim, theta = middle.inverse() @ start, _prior_mean(stated)
+    state, theta = _State(middle.inverse() @ start, 0.0), _prior_mean(stated)
     taken = np.zeros((len(centers), 1))
-    taken[np.argsort(times_s, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
-    weights = taken * _start_weights(data, sim)
+    taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
+    weights = taken * _start_weights(data, state)
     for _ in range(_ROUNDS):  # heavy tails: a start that nothing far out decides
-        sim, theta, settled = _round(data, sim, weights, theta)
-        weights = taken * _weights(_squared(data, sim, weights, theta))
+        state, theta, settled = _round(data, state, weights, theta)
+        weights = taken * _weights(_squared(data, state, weights, theta))
         if settled:
             break
     used = np.zeros((len(centers), 2), dtype=np.bool_)
     for _ in range(_ROUNDS):  # then normal ones, without what is far out
-        again = _squared(data, sim, weights, theta) <= chi2.ppf(_INSIDE, _SIZES)
+        again = _squared(data, state, weights, theta) <= chi2.ppf(_INSIDE, _SIZES)
         again |= (again & (taken > 0)).sum(axis=0) < _LEAST_PHOTOS
         if (again == used).all():
             break
         used, weights = again, taken * again
-        sim, theta, _ = _round(data, sim, weights, theta)
-    axes = _at(data, sim, weights)
-    modes = _modes(axes, theta, stated)
-    step, covariance = _integrated(axes, modes, stated)
-    sim, theta = Sim3.exp(step) @ sim, modes[0]
+        state, theta, _ = _round(data, state, weights, theta)
+    problem = _at(data, state, weights)
+    modes = _modes(problem, theta, stated)
+    step, covariance = _integrated(problem, modes, stated)
+    state, theta = state.moved(step), modes[0]
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
-        local_from_sfm=middle @ sim,
-        covariance=middle.adjoint() @ covariance @ middle.adjoint().T,
+        local_from_sfm=middle @ state.sim,
+        covariance=middle.adjoint() @ covariance[1:, 1:] @ middle.adjoint().T,
         noise=Noise(white=(float(white[0]), float(white[1])), drift=(float(drift[0]), float(drift[1]))),
+        lag_s=state.lag_s,
         used=used,
-        log_chance=_log_chance(data, sim, weights, int(taken.sum())),
+        log_chance=_log_chance(data, state, weights, int(taken.sum())),
     )
 
 
-def _round(data: _Data, sim: Sim3, weights: FloatArray, theta: FloatArray) -> tuple[Sim3, FloatArray, bool]:
+def _round(
+    data: _Data, state: _State, weights: FloatArray, theta: FloatArray
+) -> tuple[_State, FloatArray, bool]:
     """Components, then similarity; whether it has settled."""
-    axes = _at(data, sim, weights)
-    theta = _most_likely(axes, theta, data.stated)
-    step, covariance = _solution(axes, theta)
+    problem = _at(data, state, weights)
+    theta = _most_likely(problem, theta, data.stated)
+    step, covariance = _solution(problem, theta)
     settled = np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED
-    far = float(np.abs(step[:4]).max()) / _MOST_STEP
-    return Sim3.exp(step / max(far, 1.0)) @ sim, theta, bool(settled)
+    return state.moved(step), theta, bool(settled)
+
+
+def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
+    """(n, 3) between the photos before and after; 0 beyond the longest time that a camera moves steadily."""
+    order = np.argsort(times_s, kind="stable")
+    at, when = centers[order], times_s[order]
+    before, after = np.maximum(np.arange(len(at)) - 1, 0), np.minimum(np.arange(len(at)) + 1, len(at) - 1)
+    time = when[after] - when[before]
+    steady = (time > 0) & (time <= 2.0 * _STEADY_S)
+    speed = np.zeros_like(centers)
+    speed[order[steady]] = (at[after] - at[before])[steady] / time[steady, None]
+    return speed
 
 
 def _median(sigmas: FloatArray) -> float:
@@ -214,29 +317,28 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
     return result
 
 
-def _at(data: _Data, sim: Sim3, weights: FloatArray) -> list[_Axis]:
-    placed = sim.act(data.centers)
-    return _axes(data, data.positions - placed, point_jacobian(placed), weights)
+def _at(data: _Data, state: _State, weights: FloatArray) -> _Linear:
+    axes = _axes(data, state.residual(data), state.jacobian(data), weights)
+    return _Linear(axes, *state.known(data))
 
 
-def _normal(axes: list[_Axis], theta: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+def _normal(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
     """Normal matrix (p, p), right side (p,), sum of squared residuals and of the variances' logarithms."""
-    size = axes[0].jacobian.shape[1]
-    known = np.array([_UNKNOWN_SCALE, *[_UNKNOWN_TURN] * 3, *[_UNKNOWN_M] * 3][-size:])
-    matrix, right, squared, logs = np.diag(known**-2), np.zeros(size), 0.0, 0.0
-    for axis in axes:
+    matrix, right = problem.known.T @ problem.known, problem.known.T @ problem.off
+    squared, logs = float(problem.off @ problem.off), 0.0
+    for axis in problem.axes:
         variance = np.exp(2.0 * theta[axis.group]) + np.exp(2.0 * theta[2 + axis.group]) * axis.walk
         scaled = axis.jacobian / variance[:, None]
-        matrix += axis.jacobian.T @ scaled
-        right += scaled.T @ axis.residual
+        matrix = matrix + axis.jacobian.T @ scaled
+        right = right + scaled.T @ axis.residual
         squared += float((axis.residual**2 / variance).sum())
         logs += float(np.log(variance).sum())
     return matrix, right, squared, logs
 
 
-def _cost(theta: FloatArray, axes: list[_Axis], stated: FloatArray | None) -> float:
+def _cost(theta: FloatArray, problem: _Linear, stated: FloatArray | None) -> float:
     """Minus twice the logarithm of the restricted likelihood, with the prior where `stated` is given."""
-    matrix, right, squared, logs = _normal(axes, theta)
+    matrix, right, squared, logs = _normal(problem, theta)
     factor, lower = cho_factor(matrix)
     determinant = 2.0 * float(np.log(np.diag(factor)).sum())
     cost = logs + determinant + squared - float(right @ cho_solve((factor, lower), right))
@@ -246,42 +348,46 @@ def _cost(theta: FloatArray, axes: list[_Axis], stated: FloatArray | None) -> fl
     return cost
 
 
-def _most_likely(axes: list[_Axis], start: FloatArray, stated: FloatArray | None) -> FloatArray:
+def _most_likely(
+    problem: _Linear, start: FloatArray, stated: FloatArray | None, least: FloatArray | None = None
+) -> FloatArray:
     """Logarithms (4,) of white noise and drift, horizontal and vertical."""
     bounds = [(value - _RANGE, value + _RANGE) for value in start]
-    return np.asarray(minimize(_cost, start, (axes, stated), "L-BFGS-B", bounds=bounds).x)
+    if least is not None:
+        bounds[:2] = [(float(low), high) for low, (_, high) in zip(least, bounds, strict=False)]
+    return np.asarray(minimize(_cost, start, (problem, stated), "L-BFGS-B", bounds=bounds).x)
 
 
-def _solution(axes: list[_Axis], theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _solution(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Step (7,) and its covariance; what nothing tells is as wide as it can be."""
-    matrix, right, _, _ = _normal(axes, theta)
+    matrix, right, _, _ = _normal(problem, theta)
     covariance = np.linalg.inv(matrix)
     return np.asarray(covariance @ right), np.asarray(covariance)
 
 
-def _modes(axes: list[_Axis], start: FloatArray, stated: FloatArray) -> list[FloatArray]:
+def _modes(problem: _Linear, start: FloatArray, stated: FloatArray) -> list[FloatArray]:
     """The most likely components, best first: from those at hand, and as if all were drift, or all noise."""
     away = np.array([[-1.0, -1.0, 3.0, 3.0], [-1.0, 1.0, 3.0, -1.0], [1.0, -1.0, -1.0, 3.0]])
     starts = [start, *(_prior_mean(stated) + away)]
-    found = [_most_likely(axes, at, stated) for at in starts]
-    return sorted(found, key=lambda theta: _cost(theta, axes, stated))
+    found = [_most_likely(problem, at, stated) for at in starts]
+    return sorted(found, key=lambda theta: _cost(theta, problem, stated))
 
 
 def _integrated(
-    axes: list[_Axis], modes: list[FloatArray], stated: FloatArray
+    problem: _Linear, modes: list[FloatArray], stated: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of the step over what the components may be."""
-    base = _cost(modes[0], axes, stated)
-    widths = np.array([_widths(axes, mode, stated) for mode in modes])
+    base = _cost(modes[0], problem, stated)
+    widths = np.array([_widths(problem, mode, stated) for mode in modes])
     draws = np.random.default_rng(0).standard_t(_PROPOSAL, (len(modes), _SAMPLES // len(modes), 4))
-    total, mean, spread = 0.0, np.zeros(7), np.zeros((7, 7))
+    total, mean, spread = 0.0, np.zeros(8), np.zeros((8, 8))
     for at in (np.array(modes)[:, None] + widths[:, None] * draws).reshape(-1, 4):
         off = (at - np.array(modes)) / widths
         density = (
             np.exp(-0.5 * (_PROPOSAL + 1.0) * np.log1p(off**2 / _PROPOSAL).sum(axis=1)) / widths.prod(axis=1)
         ).sum()
-        weight = float(np.exp(-0.5 * (_cost(at, axes, stated) - base)) / density)
-        step, covariance = _solution(axes, at)
+        weight = float(np.exp(-0.5 * (_cost(at, problem, stated) - base)) / density)
+        step, covariance = _solution(problem, at)
         total += weight
         mean += weight * step
         spread += weight * (covariance + np.outer(step, step))
@@ -289,13 +395,13 @@ def _integrated(
     return mean, spread / total - np.outer(mean, mean)
 
 
-def _widths(axes: list[_Axis], theta: FloatArray, stated: FloatArray) -> FloatArray:
+def _widths(problem: _Linear, theta: FloatArray, stated: FloatArray) -> FloatArray:
     """(4,) standard deviations of the components, each by itself."""
-    base, widths = _cost(theta, axes, stated), np.empty(4)
+    base, widths = _cost(theta, problem, stated), np.empty(4)
     for k in range(4):
         step = np.zeros(4)
         step[k] = _DELTA
-        bend = _cost(theta + step, axes, stated) + _cost(theta - step, axes, stated) - 2.0 * base
+        bend = _cost(theta + step, problem, stated) + _cost(theta - step, problem, stated) - 2.0 * base
         widths[k] = 1.0 / np.sqrt(max(bend / (2.0 * _DELTA**2), 1.0 / _DRIFT_SPREAD**2))
     return widths
 
@@ -316,9 +422,9 @@ def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: Float
     return result
 
 
-def _squared(data: _Data, sim: Sim3, weights: FloatArray, theta: FloatArray) -> FloatArray:
+def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
     """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
-    residual = data.positions - sim.act(data.centers)
+    residual = state.residual(data)
     rest = residual - _walked(data, residual, weights, theta)
     result = np.zeros_like(weights)
     for group, axes in enumerate(_AXES):
@@ -329,10 +435,10 @@ def _squared(data: _Data, sim: Sim3, weights: FloatArray, theta: FloatArray) -> 
     return result
 
 
-def _start_weights(data: _Data, sim: Sim3) -> FloatArray:
+def _start_weights(data: _Data, state: _State) -> FloatArray:
     """As if all were noise of the size that residuals have at the median."""
     nothing = _prior_mean(data.stated) - 20.0
-    squared = _squared(data, sim, np.ones((len(data.centers), 2)), nothing * [0.0, 0.0, 1.0, 1.0])
+    squared = _squared(data, state, np.ones((len(data.centers), 2)), nothing * [0.0, 0.0, 1.0, 1.0])
     return _weights(squared / np.maximum(np.median(squared, axis=0) / chi2.ppf(0.5, _SIZES), _LEAST_M))
 
 
@@ -341,7 +447,7 @@ def _weights(squared: FloatArray) -> FloatArray:
     return np.asarray((_TAIL + _SIZES) / (_TAIL + squared))
 
 
-def _log_chance(data: _Data, sim: Sim3, weights: FloatArray, total: int) -> float:
+def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
     """See `NoisyFit`: four of the degrees of freedom are the scale's and the turn's, so that the ratio of the
     sums of squares, which is the likelihoods', has a beta distribution.
 
@@ -352,12 +458,14 @@ def _log_chance(data: _Data, sim: Sim3, weights: FloatArray, total: int) -> floa
     known = np.isfinite(data.sigmas) & (weights > 0)[:, [0, 0, 1]]
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
     costs = []
-    for residual in (data.positions - sim.act(data.centers), off - np.median(off, axis=0)):
-        axes = _axes(data, residual, shift, weights)
+    for residual in (state.residual(data), off - np.median(off, axis=0)):
+        problem = _Linear(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
-        start = np.log(np.maximum(np.concatenate([size, size]), _LEAST_M))
-        costs.append(_cost(_most_likely(axes, start, None), axes, None))
+        size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
+        start = np.log(np.concatenate([size, size]))
+        least = np.log(_LEAST_SHARE * data.stated)
+        costs.append(_cost(_most_likely(problem, start, None, least), problem, None))
     freedom = int(known.sum()) - 3
     half = (freedom - 4) / 2.0
     if half <= 0:

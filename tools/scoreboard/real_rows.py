@@ -322,6 +322,36 @@ REAL: tuple[Row, ...] = (
         minutes=15,
     ),
     Row(
+        name="position-draws",
+        group="real",
+        form="full",
+        claim="positions made worse (noise, drift, bias, outliers, one height, a lag) of three real flights and five "
+        "simulated ones, and positions that have nothing to do with the photos",
+        commands=(
+            (
+                *("tools.position_draws", "--work", "{work}/maps", "--draws", "40", *OUT, "--photos"),
+                *(f"{{data}}/{name}/images" for name in ("brighton", "lewis", "seneca")),
+            ),
+        ),
+        figures=same(
+            *("flights", "placed", "answer", "inside_68", "inside_95", "random", "random_answer"),
+            *("shuffled", "shuffled_answer", "other", "other_answer"),
+        ),
+        text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} inside "
+        "68 and 95 % bounds; of {random} at random {random_answer} answer, of {shuffled} shuffled "
+        "{shuffled_answer}, of {other} of other flights {other_answer}",
+        limits=(
+            Limit(figure="placed", least=0.95),
+            Limit(figure="inside_68", least=0.63, most=0.73),
+            Limit(figure="inside_95", least=0.92),
+            Limit(figure="random_answer", most=1),
+            Limit(figure="shuffled_answer", most=0),
+            Limit(figure="other_answer", most=0),
+        ),
+        needs=("brighton/images", "lewis/images", "seneca/images"),
+        minutes=30,
+    ),
+    Row(
         name="copr-control-points",
         group="real",
         form="full",

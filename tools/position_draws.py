@@ -1,0 +1,272 @@
+"""Are placements by positions of any quality as uncertain as they say, and can chance place a map?
+
+    python -m tools.position_draws --work DIR [--photos FOLDER ...] [--draws 25] [--chance 1000] [--json FILE]
+
+Flights are the largest maps of the folders, made by an ordinary ingest, and five simulated ones; where a
+flight's cameras are then is the truth. Positions are made from it in the ways below, and the flight is placed
+by them as if they came from a plain receiver (4 m and 10 m). Printed by kind: how many flights have a place,
+how many answer, and how often the seven parameters of the similarity lie inside their 68 % and 95 % bounds.
+
+Then positions that have nothing to do with the photos: drawn at random within a kilometre for three to eight
+photos, those of a flight shuffled, and those of another flight. Exit code 0 if the bounds hold within two
+standard deviations of the count, 95 % of the flights have a place, at most one random draw in a thousand
+answers, and none of the others does.
+"""
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import Sim3
+from ingest.own_frame import level_of
+from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import all_maps, make, photo_names
+
+_SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
+_TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
+_LEVELS = (0.68, 0.95)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Flight:
+    """Where cameras were (n, 3), metres, when (n,), seconds, in this order, and how they were turned."""
+
+    name: str
+    xyz: FloatArray
+    times_s: FloatArray
+    cam_from_local: tuple[Rigid3, ...]
+
+    def placed(self, positions: FloatArray) -> GpsPlacement:
+        """Its reconstruction by positions of a plain receiver."""
+        sigmas = np.tile(_SIGMAS, (len(positions), 1))
+        centers = _TRUE.inverse().act(self.xyz[: len(positions)])
+        held = [
+            Rigid3(rotation=pose.rotation @ _TRUE.rotation, translation=pose.translation)
+            for pose in self.cam_from_local[: len(positions)]
+        ]
+        times_s = self.times_s[: len(positions)]
+        return place_by_gps(centers, positions, sigmas, GpsOptions(), times_s, level_of(held))
+
+
+def _bias(flight: Flight, rng: np.random.Generator) -> FloatArray:
+    return np.tile(rng.normal(0.0, 1.0, 3) * _SIGMAS, (len(flight.xyz), 1))
+
+
+def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
+    """Noise, and as much bias as it leaves of what a plain receiver says."""
+
+    def error(flight: Flight, rng: np.random.Generator) -> FloatArray:
+        rest = np.sqrt(np.maximum(_SIGMAS**2 - sigma_m**2, 0.0))
+        return rng.normal(0.0, sigma_m, flight.xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
+
+    return error
+
+
+def _drift(flight: Flight, rng: np.random.Generator) -> FloatArray:
+    """As long-waved as that of a receiver without aid: a line and a wave over the flight."""
+    share = (flight.times_s - flight.times_s[0]) / max(float(np.ptp(flight.times_s)), 1.0)
+    waves = np.column_stack([share, np.sin(2.0 * np.pi * share)])
+    drift = waves @ (rng.normal(0.0, [[0.9], [0.3]], (2, 3)) * [20.0, 20.0, 60.0])
+    return np.asarray(drift + _white(1.0)(flight, rng))
+
+
+def _outliers(flight: Flight, rng: np.random.Generator) -> FloatArray:
+    """A fifth of the positions is anywhere within some hundred metres."""
+    gross = rng.random((len(flight.xyz), 1)) < 0.2
+    return np.asarray(_white(2.0)(flight, rng) + gross * rng.normal(0.0, 150.0, flight.xyz.shape))
+
+
+def _one_height(flight: Flight, rng: np.random.Generator) -> FloatArray:
+    error = _white(2.0)(flight, rng)
+    error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, _SIGMAS[2]) - flight.xyz[:, 2]
+    return error
+
+
+def _lag(flight: Flight, rng: np.random.Generator) -> FloatArray:
+    """Positions of two seconds before."""
+    speed = np.gradient(
+        flight.xyz, np.maximum.accumulate(flight.times_s + 1e-3 * np.arange(len(flight.xyz))), axis=0
+    )
+    return np.asarray(_white(1.0)(flight, rng) - 2.0 * np.clip(speed, -15.0, 15.0))
+
+
+_KINDS: dict[str, Callable[[Flight, np.random.Generator], FloatArray]] = {
+    "noise of 2 m": _white(2.0),
+    "noise of 5 m": _white(5.0),
+    "noise of 15 m": _white(15.0),
+    "drift of 20 and 60 m": _drift,
+    "a bias": lambda flight, rng: _bias(flight, rng) + rng.normal(0.0, 0.3, flight.xyz.shape),
+    "a fifth far out": _outliers,
+    "one height for all": _one_height,
+    "a lag of 2 s": _lag,
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--work", type=Path, required=True, help="maps are made there, and found again")
+    parser.add_argument("--photos", type=Path, nargs="*", default=[], metavar="FOLDER")
+    parser.add_argument("--draws", type=int, default=25, help="of each kind")
+    parser.add_argument("--chance", type=int, default=1000, help="draws of random positions")
+    parser.add_argument("--seed", type=int, default=1)
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    flights = [real_flight(folder, args.work) for folder in args.photos] + simulated_flights(args.seed)
+    figures = bounds(flights, args.draws, args.seed) | unrelated(flights, args.chance, args.seed)
+    write_figures(args.json, figures)
+    count = figures["placed"] * figures["flights"]
+    held = all(
+        abs(figures[f"inside_{100 * level:.0f}"] - level)
+        <= 2.0 * np.sqrt(level * (1.0 - level) / max(count, 1.0))
+        for level in _LEVELS
+    )
+    fine = held and figures["placed"] >= 0.95 and figures["random_answer"] <= max(args.chance / 1000.0, 1.0)
+    return 0 if fine and not figures["shuffled_answer"] and not figures["other_answer"] else 1
+
+
+def bounds(flights: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
+    """Every kind of error on every flight in turn: what is placed, and whether its bounds hold."""
+    scores: list[float] = []
+    tried = answers = 0
+    for number, (kind, error) in enumerate(_KINDS.items()):
+        own: list[float] = []
+        placed, active, reasons = 0, 0, []
+        for draw in range(draws):
+            rng = np.random.default_rng((seed, number, draw))
+            flight = flights[draw % len(flights)]
+            found = flight.placed(flight.xyz + error(flight, rng))
+            if found.reason is not None or found.local_from_sfm is None or found.covariance is None:
+                reasons.append(f"{flight.name}: {found.reason}")
+                continue
+            off = (_TRUE @ found.local_from_sfm.inverse()).log()
+            own.append(float(off @ np.linalg.solve(found.covariance, off)))
+            placed += 1
+            active += not found.provisional
+        tried, answers, scores = tried + draws, answers + active, scores + own
+        inside = " and ".join(f"{np.mean(np.array(own) <= chi2.ppf(level, 7)):.0%}" for level in _LEVELS)
+        sys.stdout.write(
+            f"{kind:<22} {placed} of {draws} placed, {active} answer, {inside} inside 68 and 95 %"
+            f"{'; ' + ', '.join(sorted(set(reasons))) if reasons else ''}\n"
+        )
+        sys.stdout.flush()
+    return {
+        "flights": float(tried),
+        "placed": len(scores) / tried,
+        "answer": answers / tried,
+        **{
+            f"inside_{100 * level:.0f}": float(np.mean(np.array(scores) <= chi2.ppf(level, 7)))
+            for level in _LEVELS
+        },
+    }
+
+
+def unrelated(flights: Sequence[Flight], chance: int, seed: int) -> dict[str, float]:
+    """Positions that have nothing to do with the photos: how many flights would answer, or have a place."""
+    found: dict[str, list[GpsPlacement]] = {"random": [], "shuffled": [], "other": []}
+    for draw in range(chance):
+        rng = np.random.default_rng((seed, 99, draw))
+        flight, count = flights[draw % len(flights)], int(rng.integers(3, 9))
+        rows = np.sort(rng.choice(len(flight.xyz), count, replace=False))
+        held = tuple(flight.cam_from_local[row] for row in rows)
+        part = Flight(
+            name=flight.name, xyz=flight.xyz[rows], times_s=flight.times_s[rows], cam_from_local=held
+        )
+        drawn = np.column_stack([rng.uniform(-500.0, 500.0, (count, 2)), rng.uniform(0.0, 100.0, count)])
+        found["random"].append(part.placed(drawn))
+    for k, flight in enumerate(flights):
+        for draw in range(4):
+            rng = np.random.default_rng((seed, 98, k, draw))
+            found["shuffled"].append(flight.placed(flight.xyz[rng.permutation(len(flight.xyz))]))
+        for other in [*flights[:k], *flights[k + 1 :]]:
+            found["other"].append(flight.placed(other.xyz[: len(flight.xyz)]))
+    figures: dict[str, float] = {}
+    for kind, placements in found.items():
+        there = [p for p in placements if p.reason is None]
+        figures |= {
+            f"{kind}_placed": float(len(there)),
+            f"{kind}_answer": float(sum(not p.provisional for p in there)),
+        }
+        figures[f"{kind}"] = float(len(placements))
+        sys.stdout.write(
+            f"{kind} positions: of {len(placements)} {len(there)} have a place, "
+            f"{figures[f'{kind}_answer']:.0f} would answer\n"
+        )
+    return figures
+
+
+def real_flight(folder: Path, work: Path) -> Flight:
+    """The cameras of the largest map of a folder of photos, by its own positions."""
+    database = work / folder.parent.name
+    if not database.exists():
+        make(database, "photos", folder, len(photo_names(folder)))
+    largest = max(all_maps(database), key=lambda one: len(one.images))
+    images = sorted(
+        largest.images, key=lambda image: (image.capture_time is None, image.capture_time, image.name)
+    )
+    times = [image.capture_time for image in images]
+    seconds = [
+        float(k) if t is None or times[0] is None else (t - times[0]).total_seconds()
+        for k, t in enumerate(times)
+    ]
+    xyz: FloatArray = np.array([image.cam_from_local.center for image in images])
+    return Flight(
+        name=folder.parent.name,
+        xyz=xyz - xyz.mean(axis=0),
+        times_s=np.array(seconds),
+        cam_from_local=tuple(image.cam_from_local for image in images),
+    )
+
+
+def simulated_flights(seed: int) -> list[Flight]:
+    """Strips to and fro, a spiral, a walk around a house, and a winding street."""
+    rng = np.random.default_rng((seed, 7))
+    flights = []
+    for name, lines, per, size in (("strips", 4, 8, 160.0), ("two strips", 2, 9, 120.0)):
+        x = np.linspace(-0.5, 0.5, per) * size
+        plan = [(v, 0.25 * size * k) for k in range(lines) for v in (x if k % 2 == 0 else x[::-1])]
+        flights.append((name, np.column_stack([plan, np.full(len(plan), 60.0)]), 4.0))
+    turn = np.linspace(0.0, 5.0 * np.pi, 40)
+    flights.append(
+        ("spiral", np.column_stack([4 * turn * np.cos(turn), 4 * turn * np.sin(turn), 30 + 2 * turn]), 3.0)
+    )
+    turn = np.linspace(0.0, 2.0 * np.pi, 24)
+    flights.append(
+        ("orbit", np.column_stack([40 * np.cos(turn), 30 * np.sin(turn), 25 + 5 * np.sin(3 * turn)]), 3.0)
+    )
+    along = np.linspace(0.0, 300.0, 50)
+    flights.append(("street", np.column_stack([along, 40 * np.sin(along / 40), 2 + 0.02 * along]), 4.0))
+    return [
+        Flight(
+            name=name,
+            xyz=xyz + rng.normal(0.0, 0.5, xyz.shape),
+            times_s=np.asarray(step * np.arange(len(xyz), dtype=np.float64)),
+            cam_from_local=tuple(_held(xyz, k, rng) for k in range(len(xyz))),
+        )
+        for name, xyz, step in flights
+    ]
+
+
+def _held(xyz: FloatArray, k: int, rng: np.random.Generator) -> Rigid3:
+    """A camera that looks ahead and down, level but for two degrees."""
+    ahead = xyz[min(k + 1, len(xyz) - 1)] - xyz[max(k - 1, 0)]
+    heading, tilt, roll = np.arctan2(ahead[1], ahead[0]), np.radians(50.0), rng.normal(0.0, np.radians(2.0))
+    view = np.array([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), -np.sin(tilt)])
+    across = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    level = np.stack([across, np.cross(view, across), view])
+    return Rigid3(rotation=so3_exp([0.0, 0.0, roll]) @ level, translation=np.zeros(3))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
