@@ -325,8 +325,8 @@ REAL: tuple[Row, ...] = (
         name="position-draws",
         group="real",
         form="full",
-        claim="positions made worse (noise, drift, bias, outliers, one height, a lag) of three real flights and five "
-        "simulated ones, and positions that have nothing to do with the photos",
+        claim="positions made worse (noise, drift, bias, outliers, one height, a lag) of three real flights and "
+        "five simulated ones, and positions that have nothing to do with the photos",
         commands=(
             (
                 *("tools.position_draws", "--work", "{work}/maps", "--draws", "40", *OUT, "--photos"),
@@ -337,8 +337,8 @@ REAL: tuple[Row, ...] = (
             *("flights", "placed", "answer", "inside_68", "inside_95", "random", "random_answer"),
             *("shuffled", "shuffled_answer", "other", "other_answer"),
         ),
-        text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} inside "
-        "68 and 95 % bounds; of {random} at random {random_answer} answer, of {shuffled} shuffled "
+        text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
+        "inside 68 and 95 % bounds; of {random} at random {random_answer} answer, of {shuffled} shuffled "
         "{shuffled_answer}, of {other} of other flights {other_answer}",
         limits=(
             Limit(figure="placed", least=0.95),
