@@ -7,9 +7,11 @@ import pytest
 from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import nearest_rotation, so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
+from ingest.own_frame import level_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 
 _OPTIONS = GpsOptions()
@@ -139,6 +141,48 @@ def test_a_line_of_photos_is_refused(across_m: float) -> None:
     along, across = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.0, 1.0])
     assert np.sqrt(along @ placed.covariance[1:4, 1:4] @ along) > 0.17
     assert np.sqrt(across @ placed.covariance[1:4, 1:4] @ across) < 0.02
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_line_of_photos_that_are_held_level_has_a_place(seed: int) -> None:
+    """Their horizontal image axes tell the turn about the line, and which side is up."""
+    rng = np.random.default_rng(seed)
+    along = np.array([0.8, 0.6, 0.0])
+    positions = np.outer(np.linspace(-60, 60, 12), along) + rng.normal(0, 0.3, (12, 3))
+    held = []
+    for _ in range(12):  # looking ahead and down, rolled by two degrees
+        view = so3_exp(rng.normal(0, 0.03, 3)) @ np.array([0.5 * along[0], 0.5 * along[1], -0.87])
+        across = np.array([along[1], -along[0], 0.0])
+        across = across - (across @ view) * view
+        across /= np.linalg.norm(across)
+        roll = so3_exp([0.0, 0.0, rng.normal(0, np.radians(2.0))])
+        local = roll @ np.stack([across, np.cross(view, across), view])
+        held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
+    noise, sigmas = rng.normal(0, 0.5, (12, 3)), np.tile([4.0, 4.0, 10.0], (12, 1))
+    placed = place_by_gps(
+        _TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, level=level_of(held)
+    )
+    assert placed.reason is None
+    assert placed.local_from_sfm is not None
+    assert placed.covariance is not None
+    error = (_TRUE @ placed.local_from_sfm.inverse()).log()
+    assert np.degrees(np.abs(error[1:4]).max()) < 5.0
+    assert float(error @ np.linalg.solve(placed.covariance, error)) < chi2.ppf(0.999, 7)
+
+
+def test_positions_that_are_late_say_by_how_much() -> None:
+    """Strips to and fro at 5 m/s, positions of two seconds before."""
+    rng = np.random.default_rng(11)
+    x = np.linspace(-60, 60, 7)
+    plan = [(v, 30.0 * k) for k in range(4) for v in (x if k % 2 == 0 else x[::-1])]
+    positions = np.column_stack([plan, rng.normal(50, 1, len(plan))])
+    times = 4.0 * np.arange(len(plan))
+    speed = np.gradient(positions, times, axis=0)
+    late = positions - 2.0 * speed + rng.normal(0, 0.3, positions.shape)
+    sigmas = np.tile([4.0, 4.0, 10.0], (len(plan), 1))
+    placed = place_by_gps(_TRUE.inverse().act(positions), late, sigmas, _OPTIONS, times)
+    assert placed.reason is None
+    assert placed.figures["lag_s"] == pytest.approx(2.0, abs=0.3)
 
 
 def test_a_wide_strip_is_no_line() -> None:

@@ -325,8 +325,8 @@ REAL: tuple[Row, ...] = (
         name="position-draws",
         group="real",
         form="full",
-        claim="positions made worse (noise, drift, bias, outliers, one height, a lag) of three real flights and "
-        "five simulated ones, and positions that have nothing to do with the photos",
+        claim="positions made worse (noise, drift, bias, outliers, one height, a lag) of three real flights "
+        "and five simulated ones, and positions that have nothing to do with the photos",
         commands=(
             (
                 *("tools.position_draws", "--work", "{work}/maps", "--draws", "40", *OUT, "--photos"),
