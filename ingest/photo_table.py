@@ -7,7 +7,8 @@ Columns (all optional but the first two, of which one must be there):
 | path    | of the file, from the table's folder |
 | id      | instead of a path: a file of that name, with or without .jpg, .jpeg, .png, in the table's folder |
 | lat, lon | WGS84 degrees |
-| accuracy | standard deviation of the position per axis, metres |
+| height  | metres, counted as the maps' heights are |
+| accuracy, accuracy_height | standard deviations per horizontal axis and of the height, metres |
 | time    | ISO 8601, or as EXIF writes it |
 | owner, licence, title | attribution |
 
@@ -25,9 +26,24 @@ from typing import Any
 
 from featuredb.errors import IngestError
 
-COLUMNS = ("path", "id", "lat", "lon", "accuracy", "time", "owner", "licence", "title")
+COLUMNS = (
+    "path",
+    "id",
+    "lat",
+    "lon",
+    "height",
+    "accuracy",
+    "accuracy_height",
+    "time",
+    "owner",
+    "licence",
+    "title",
+)
 TABLE_SUFFIXES = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson")
-_ALIASES = {"latitude": "lat", "longitude": "lon", "lng": "lon", "license": "licence"}
+_ALIASES = {
+    **{"latitude": "lat", "longitude": "lon", "lng": "lon", "license": "licence"},
+    **{"alt": "height", "altitude": "height", "elevation": "height"},
+}
 _PHOTO_SUFFIXES = ("", ".jpg", ".jpeg", ".png", ".JPG", ".JPEG", ".PNG")
 
 
@@ -40,7 +56,7 @@ class TableRow:
         name: what the table calls it, its path or id.
         path: where the file should lie.
         latitude_deg, longitude_deg: WGS84, both or none.
-        accuracy_m: standard deviation per axis, or None.
+        height_m: or None. accuracy_m, accuracy_height_m: standard deviations per axis, or None.
         warnings: values that were left out.
     """
 
@@ -49,7 +65,9 @@ class TableRow:
     path: Path
     latitude_deg: float | None = None
     longitude_deg: float | None = None
+    height_m: float | None = None
     accuracy_m: float | None = None
+    accuracy_height_m: float | None = None
     time: datetime | None = None
     owner: str = ""
     licence: str = ""
@@ -183,7 +201,9 @@ def _row(number: int, record: Mapping[str, Any], folder: Path) -> TableRow | Bad
         path=folder / name if named else _file_of(folder, name),
         latitude_deg=latitude,
         longitude_deg=longitude,
-        accuracy_m=_accuracy(record, warnings),
+        height_m=_height(record, warnings),
+        accuracy_m=_accuracy(record, "accuracy", warnings),
+        accuracy_height_m=_accuracy(record, "accuracy_height", warnings),
         time=_time(record, warnings),
         owner=_text(record, "owner"),
         licence=_text(record, "licence"),
@@ -212,10 +232,18 @@ def _position(record: Mapping[str, Any], warnings: list[str]) -> tuple[float | N
     return latitude, longitude
 
 
-def _accuracy(record: Mapping[str, Any], warnings: list[str]) -> float | None:
-    value = _number(record, "accuracy", warnings)
+def _height(record: Mapping[str, Any], warnings: list[str]) -> float | None:
+    value = _number(record, "height", warnings)
+    if value is not None and not -12_000.0 < value < 100_000.0:
+        warnings.append(f"table: a height of {value} m is none; it is left out")
+        return None
+    return value
+
+
+def _accuracy(record: Mapping[str, Any], name: str, warnings: list[str]) -> float | None:
+    value = _number(record, name, warnings)
     if value is not None and not 0 < value < 1e7:
-        warnings.append(f"table: an accuracy of {value} m is none; it is left out")
+        warnings.append(f"table: an {name} of {value} m is none; it is left out")
         return None
     return value
 

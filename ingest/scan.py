@@ -16,6 +16,7 @@ from pathlib import Path
 from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, probe, read_image_bytes
 from featuredb.features.exif import read_exif
+from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.features.image_header import check_signature
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
@@ -283,21 +284,23 @@ def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) 
 
 
 def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
-    """The photo with what the table says of it.
-
-    The height, which tables have none of, stays EXIF's.
-    """
+    """The photo with what the table says of it; all else stays as EXIF has it."""
     gps = photo.gps
     if row.latitude_deg is not None and row.longitude_deg is not None:
         gps = GeoPrior(
             latitude_deg=row.latitude_deg,
             longitude_deg=row.longitude_deg,
-            height_m=None if photo.gps is None else photo.gps.height_m,
+            height_m=row.height_m if row.height_m is not None or gps is None else gps.height_m,
             sigma_horizontal_m=row.accuracy_m or options.geotag_sigma_m,
-            sigma_vertical_m=options.geotag_sigma_m if photo.gps is None else photo.gps.sigma_vertical_m,
+            sigma_vertical_m=_sigma_of_height(row, photo, options),
         )
-    elif gps is not None and row.accuracy_m is not None:
-        gps = replace(gps, sigma_horizontal_m=row.accuracy_m)
+    elif gps is not None:
+        gps = replace(
+            gps,
+            height_m=gps.height_m if row.height_m is None else row.height_m,
+            sigma_horizontal_m=row.accuracy_m or gps.sigma_horizontal_m,
+            sigma_vertical_m=row.accuracy_height_m or gps.sigma_vertical_m,
+        )
     return replace(
         photo,
         gps=gps,
@@ -308,6 +311,16 @@ def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
         title=row.title,
         warnings=(*photo.warnings, *row.warnings),
     )
+
+
+def _sigma_of_height(row: TableRow, photo: Photo, options: ScanOptions) -> float:
+    """As the table says; a height of its own is worse than its position by as much as a plain receiver's."""
+    if row.accuracy_height_m is not None:
+        return row.accuracy_height_m
+    if row.height_m is not None:
+        ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
+        return ratio * (row.accuracy_m or options.geotag_sigma_m)
+    return options.geotag_sigma_m if photo.gps is None else photo.gps.sigma_vertical_m
 
 
 def _mark_exact(photos: list[Photo]) -> list[Photo]:

@@ -35,8 +35,9 @@ _DJI_NAMES = (
     "RelativeAltitude|AbsoluteAltitude|GimbalYawDegree|GimbalPitchDegree|GimbalRollDegree"
     "|RtkFlag|RtkStdLat|RtkStdLon|RtkStdHgt"
 )
-_DJI_VALUE = re.compile(
-    rf"drone-dji:({_DJI_NAMES})\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
+_PIX4D_NAMES = "GPSXYAccuracy|GPSZAccuracy"  # of Pix4D's namespace, which Parrot, senseFly and others write
+_XMP_VALUE = re.compile(
+    rf"(?:drone-dji:({_DJI_NAMES})|Camera:({_PIX4D_NAMES}))\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
 )
 
 
@@ -54,7 +55,7 @@ class ExifInfo:
         latitude_deg, longitude_deg: WGS84 degrees, both or none.
         altitude_m: metres above `altitude_reference`, which for drones is often neither.
         sigma_horizontal_m, sigma_vertical_m: one standard deviation per axis of the position.
-        sigma_source: what the deviations come from: rtk, positioning_error, dop or default.
+        sigma_source: what the deviations come from: rtk, stated, positioning_error, dop or default.
         relative_altitude_m, absolute_altitude_m: DJI: above take-off, and as in EXIF.
         gimbal_yaw_deg, gimbal_pitch_deg, gimbal_roll_deg: DJI: clockwise from north; -90 looks down.
         artist, copyright: attribution.
@@ -118,10 +119,10 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         width, height: of the stored image, pixels; the focal length is given for these.
     """
     main, exif, gps, warnings = _directories(tiff)
-    dji = _dji_values(xmp)
+    values = _xmp_values(xmp)
     position = gps_position(gps, warnings)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
-    sigma_h, sigma_v, source = gps_sigmas(gps, dji, warnings)
+    sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
     return ExifInfo(
         width=width,
         height=height,
@@ -139,11 +140,11 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         sigma_horizontal_m=sigma_h,
         sigma_vertical_m=sigma_v,
         sigma_source=source,
-        relative_altitude_m=dji.get("RelativeAltitude"),
-        absolute_altitude_m=dji.get("AbsoluteAltitude"),
-        gimbal_yaw_deg=dji.get("GimbalYawDegree"),
-        gimbal_pitch_deg=dji.get("GimbalPitchDegree"),
-        gimbal_roll_deg=dji.get("GimbalRollDegree"),
+        relative_altitude_m=values.get("RelativeAltitude"),
+        absolute_altitude_m=values.get("AbsoluteAltitude"),
+        gimbal_yaw_deg=values.get("GimbalYawDegree"),
+        gimbal_pitch_deg=values.get("GimbalPitchDegree"),
+        gimbal_roll_deg=values.get("GimbalRollDegree"),
         artist=main.text(315)[:_MAX_TEXT],
         copyright=main.text(33432)[:_MAX_TEXT],
         warnings=tuple(warnings[:_MAX_WARNINGS]),
@@ -303,8 +304,6 @@ def _with_offset(time: datetime, text: str, warnings: list[str]) -> datetime:
     return time.replace(tzinfo=timezone(timedelta(minutes=-minutes if match[1] == "-" else minutes)))
 
 
-def _dji_values(xmp: bytes) -> dict[str, float]:
-    """Numbers of DJI's namespace, written as attributes or as elements."""
-    if b"drone-dji:" not in xmp:
-        return {}
-    return {m[1].decode(): float(m[2]) for m in _DJI_VALUE.finditer(xmp)}
+def _xmp_values(xmp: bytes) -> dict[str, float]:
+    """Numbers of DJI's and Pix4D's namespaces, written as attributes or as elements."""
+    return {(m[1] or m[2]).decode(): float(m[3]) for m in _XMP_VALUE.finditer(xmp)}

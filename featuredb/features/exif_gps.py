@@ -85,13 +85,19 @@ def gps_altitude(gps: Ifd, warnings: list[str]) -> tuple[float | None, AltitudeR
     return (-abs(value) if code in (1, 3) else value), reference
 
 
-def gps_sigmas(gps: Ifd, dji: dict[str, float], warnings: list[str]) -> tuple[float, float, str]:
+def gps_sigmas(gps: Ifd, xmp: dict[str, float], warnings: list[str]) -> tuple[float, float, str]:
     """Deviations of the position (horizontal per axis, vertical) in metres, and their source."""
     low, high = _SIGMA_RANGE_M
-    std = [dji.get(name, 0.0) for name in ("RtkStdLat", "RtkStdLon", "RtkStdHgt")]
-    if dji.get("RtkFlag") in _DJI_RTK_FLOAT_OR_FIXED and min(std) > 0:
+    std = [xmp.get(name, 0.0) for name in ("RtkStdLat", "RtkStdLon", "RtkStdHgt")]
+    if xmp.get("RtkFlag") in _DJI_RTK_FLOAT_OR_FIXED and min(std) > 0:
         return min(max(std[0], std[1], low), high), min(max(std[2], low), high), "rtk"
     ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
+    stated = xmp.get("GPSXYAccuracy", 0.0)
+    if stated > 0:
+        vertical = xmp.get("GPSZAccuracy", 0.0) or ratio * stated
+        if max(stated, vertical) <= high:
+            return max(stated, low), max(vertical, low), "stated"
+        warnings.append(f"XMP: an accuracy of {stated}, {vertical} is absurd")
     for tag, factor, source in ((31, 1 / _RADIUS_68, "positioning_error"), (11, RANGE_ERROR_M, "dop")):
         value = gps.number(tag)
         if value is None or value == 0:

@@ -449,7 +449,7 @@ def _weights(squared: FloatArray) -> FloatArray:
 
 def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> float:
     """See `NoisyFit`: four of the degrees of freedom are the scale's and the turn's, so that the ratio of the
-    sums of squares, which is the likelihoods', has a beta distribution.
+    sums of squares, which is the likelihoods', has a beta distribution. A lag counts as two.
 
     Args:
         total: positions before any was left out.
@@ -466,12 +466,14 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
         start = np.log(np.concatenate([size, size]))
         least = np.log(_LEAST_SHARE * data.stated)
         costs.append(_cost(_most_likely(problem, start, None, least), problem, None))
-    freedom = int(known.sum()) - 3
-    half = (freedom - 4) / 2.0
+    freedom, taken_up = int(known.sum()) - 3, 6 if data.speed.any() else 4
+    half = (freedom - taken_up) / 2.0
     if half <= 0:
         return 0.0
     log_ratio = min((costs[0] - costs[1]) / freedom, 0.0)
-    tail = half * log_ratio + np.log1p(half * -np.expm1(log_ratio))  # of beta(half, 2)
+    rest = half * -np.expm1(log_ratio)
+    beta = 1.0 + rest + (0.0 if taken_up == 4 else 0.5 * (1.0 + 1.0 / half) * rest**2)
+    tail = half * log_ratio + np.log(beta)  # of beta(half, taken_up / 2)
     kept = int((weights > 0).all(axis=1).sum())
     ways = gammaln(total + 1) - gammaln(kept + 1) - gammaln(total - kept + 1)
     return float(min(tail + ways + np.log(_TURNS), 0.0))

@@ -236,6 +236,15 @@ def test_dji_single_point_solution_is_not_rtk() -> None:
     assert found.sigma_source == "default"
 
 
+def test_accuracies_as_pix4d_names_them() -> None:
+    xmp = b'<x Camera:GPSXYAccuracy="0.021"><Camera:GPSZAccuracy>0.04</Camera:GPSZAccuracy></x>'
+    found = info(None, None, gps_tags(), xmp=xmp)
+    assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.021, 0.04, "stated")
+    absurd = info(None, None, gps_tags(), xmp=b'<x Camera:GPSXYAccuracy="99999"/>')
+    assert absurd.sigma_source == "default"
+    assert any("absurd" in warning for warning in absurd.warnings)
+
+
 def test_camera_key_tells_zoom_positions_and_bodies_apart() -> None:
     key = camera_key("Maker", " Model", 400, 300, 277.4)
     assert key == "maker|model|400x300|f277"

@@ -7,9 +7,11 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from PIL import Image
 
 from featuredb.errors import IngestError
 from ingest.photo_table import is_table, read_table, summary_of
+from ingest.scan import ScanOptions, scan_table
 
 _ROWS = [
     {"path": "a/one.jpg", "lat": 48.99, "lon": 8.41, "accuracy": 25.0, "time": "2026-03-01T12:00:00+00:00",
@@ -77,6 +79,16 @@ def test_what_is_wrong_costs_its_row_or_its_value_only(tmp_path: Path) -> None:
     assert "row 6 is left out: expected 6 values, found 3" in told
 
 
+def test_heights_and_how_good_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "ppk.csv"
+    path.write_text(
+        "path,lat,lon,altitude,accuracy,accuracy_height\none.jpg,48,8,123.45,0.02,0.03\ntwo.jpg,48,8,1e9,,-1\n"
+    )
+    one, two = read_table(path).rows
+    assert (one.height_m, one.accuracy_m, one.accuracy_height_m) == (123.45, 0.02, 0.03)
+    assert (two.height_m, two.accuracy_height_m, len(two.warnings)) == (None, None, 2)
+
+
 def test_lines_of_json_that_are_none_are_told(tmp_path: Path) -> None:
     path = tmp_path / "photos.jsonl"
     path.write_text('{"id": "17"}\n\nnot json\n[1]\n{"id": 18, "lat": 1, "lon": 2}\n')
@@ -105,3 +117,17 @@ def test_a_folder_is_no_table(tmp_path: Path) -> None:
     (tmp_path / "holidays.csv").mkdir()
     assert not is_table(tmp_path / "holidays.csv")
     assert not is_table(tmp_path / "photo.jpg")
+
+
+def test_what_the_table_says_of_heights_goes_before_exif(tmp_path: Path) -> None:
+    Image.new("L", (64, 48)).save(tmp_path / "one.jpg")
+    Image.new("L", (64, 48), 9).save(tmp_path / "two.jpg")
+    table = tmp_path / "ppk.csv"
+    table.write_text(
+        "path,lat,lon,height,accuracy,accuracy_height\none.jpg,48,8,123.45,0.02,0.03\ntwo.jpg,48,8,130,2,\n"
+    )
+    one, two = (photo.gps for photo in scan_table(read_table(table), ScanOptions(trust_geotags=True)).photos)
+    assert one is not None
+    assert two is not None
+    assert (one.height_m, one.sigma_horizontal_m, one.sigma_vertical_m) == (123.45, 0.02, 0.03)
+    assert (two.height_m, two.sigma_horizontal_m, two.sigma_vertical_m) == (130.0, 2.0, 5.0)
