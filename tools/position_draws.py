@@ -139,10 +139,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 def bounds(flights: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
     """Every kind of error on every flight in turn: what is placed, and whether its bounds hold."""
     scores: list[float] = []
-    tried = answers = 0
+    answering: list[float] = []
+    tried = 0
     for number, (kind, error) in enumerate(_KINDS.items()):
         own: list[float] = []
-        placed, active, reasons = 0, 0, []
+        active: list[float] = []
+        reasons: list[str] = []
         for draw in range(draws):
             rng = np.random.default_rng((seed, number, draw))
             flight = flights[draw % len(flights)]
@@ -152,19 +154,19 @@ def bounds(flights: Sequence[Flight], draws: int, seed: int) -> dict[str, float]
                 continue
             off = (_TRUE @ found.local_from_sfm.inverse()).log()
             own.append(float(off @ np.linalg.solve(found.covariance, off)))
-            placed += 1
-            active += not found.provisional
-        tried, answers, scores = tried + draws, answers + active, scores + own
+            active += own[-1:] if not found.provisional else []
+        tried, answering, scores = tried + draws, answering + active, scores + own
         inside = " and ".join(f"{np.mean(np.array(own) <= chi2.ppf(level, 7)):.0%}" for level in _LEVELS)
         sys.stdout.write(
-            f"{kind:<22} {placed} of {draws} placed, {active} answer, {inside} inside 68 and 95 %"
+            f"{kind:<22} {len(own)} of {draws} placed, {len(active)} answer, {inside} inside 68 and 95 %"
             f"{'; ' + ', '.join(sorted(set(reasons))) if reasons else ''}\n"
         )
         sys.stdout.flush()
     return {
         "flights": float(tried),
         "placed": len(scores) / tried,
-        "answer": answers / tried,
+        "answer": len(answering) / tried,
+        "answering_inside_95": float(np.mean(np.array(answering) <= chi2.ppf(0.95, 7))),
         **{
             f"inside_{100 * level:.0f}": float(np.mean(np.array(scores) <= chi2.ppf(level, 7)))
             for level in _LEVELS

@@ -334,16 +334,19 @@ REAL: tuple[Row, ...] = (
             ),
         ),
         figures=same(
-            *("flights", "placed", "answer", "inside_68", "inside_95", "random", "random_answer"),
+            *("flights", "placed", "answer", "inside_68", "inside_95", "answering_inside_95"),
+            *("random", "random_answer"),
             *("shuffled", "shuffled_answer", "other", "other_answer"),
         ),
         text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
-        "inside 68 and 95 % bounds; of {random} at random {random_answer} answer, of {shuffled} shuffled "
-        "{shuffled_answer}, of {other} of other flights {other_answer}",
+        "inside 68 and 95 % bounds ({answering_inside_95:.1%} of those that answer); of {random} at "
+        "random {random_answer} answer, of {shuffled} shuffled {shuffled_answer}, of {other} of other flights "
+        "{other_answer}",
         limits=(
             Limit(figure="placed", least=0.95),
             Limit(figure="inside_68", least=0.63, most=0.73),
             Limit(figure="inside_95", least=0.92),
+            Limit(figure="answering_inside_95", least=0.95),
             Limit(figure="random_answer", most=1),
             Limit(figure="shuffled_answer", most=0),
             Limit(figure="other_answer", most=0),
