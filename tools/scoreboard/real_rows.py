@@ -340,8 +340,8 @@ REAL: tuple[Row, ...] = (
         ),
         text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
         "inside 68 and 95 % bounds ({answering_inside_95:.1%} of those that answer); of {random} at "
-        "random {random_answer} answer, of {shuffled} shuffled {shuffled_answer}, of {other} of other flights "
-        "{other_answer}",
+        "random {random_answer} answer, of {shuffled} shuffled {shuffled_answer}, of {other} of other "
+        "flights {other_answer}",
         limits=(
             Limit(figure="placed", least=0.95),
             Limit(figure="inside_68", least=0.63, most=0.73),
