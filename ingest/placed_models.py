@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import norm
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
@@ -31,6 +32,8 @@ _ELSEWHERE = (
     "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
     "that looks like it, or their positions have one error"
 )
+_EXIF_SPREAD = 0.3  # of the logarithm of a focal length over EXIF's: pictures are cut, scaled, zoomed
+_WRONG_LENS = 0.001  # of such focal lengths are further off
 HINTS = "placed by geotags that nobody answers for"
 
 
@@ -195,10 +198,28 @@ def _component(
             reason_code="NO_POINTS",
             reason="no point is placed well enough: the photos' rays are parallel",
         )
-    held_back = placed.provisional or (HINTS if any(hints) else "")
+    held_back = placed.provisional or impossible_lens(model, chosen) or (HINTS if any(hints) else "")
     if held_back:
         feature_map = replace(feature_map, status="quarantined")
     return replace(component, feature_map=feature_map, reason_code="", reason=held_back)
+
+
+def impossible_lens(model: Model, chosen: Sequence[Photo]) -> str:
+    """Why most of the photos have a focal length that theirs cannot be; "" where they have not."""
+    ratio = np.array(
+        [
+            np.log(model.cameras[int(c)].focal_px / photo.focal_px) if photo.focal_px else 0.0
+            for photo, c in zip(chosen, model.camera_of, strict=True)
+        ]
+    )
+    wrong = np.flatnonzero(np.abs(ratio) > norm.isf(_WRONG_LENS / 2.0) * _EXIF_SPREAD)
+    if 2 * len(wrong) <= len(chosen):
+        return ""
+    photo, camera = chosen[int(wrong[0])], model.cameras[int(model.camera_of[wrong[0]])]
+    return (
+        f"the focal length of {photo.name} became {camera.focal_px:.0f} px where EXIF says "
+        f"{photo.focal_px:.0f}: a rolling shutter, a zoom or wrong EXIF bends the map"
+    )
 
 
 def _without_place(

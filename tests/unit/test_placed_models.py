@@ -1,17 +1,18 @@
 """What hangs on a reconstruction by little is placed by itself, or in no map."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
 
+from featuredb.geometry.camera import Camera
 from ingest.clusters.reconstruct import Reconstruction
 from ingest.colmap_bridge import Model
 from ingest.extract import FeatureFiles
 from ingest.map_builder import MapIdentity
 from ingest.photo import Photo
-from ingest.placed_models import Component, place_models
+from ingest.placed_models import Component, impossible_lens, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from tests.support.posed_models import model_of
 
@@ -72,3 +73,14 @@ def test_photos_that_are_too_few_for_a_map_are_named_together() -> None:
     one = range(200)
     model = model_of(one, one, one, range(180, 400), range(300, 400), range(10))
     assert _said(_placed(model)) == [("TOO_FEW", ["0", "1", "2"]), ("WEAKLY_TIED", ["3", "4", "5"])]
+
+
+@pytest.mark.parametrize(("focal_px", "word"), [(1265.0, "EXIF says 1265"), (None, ""), (420.0, "")])
+def test_a_focal_length_that_cannot_be_holds_a_map_back(focal_px: float | None, word: str) -> None:
+    """A rolling shutter bent a map until its lens was a fifth of EXIF's; a picture may be cut by a third."""
+    model = model_of(range(200), range(200), range(200))
+    model = replace(model, cameras=tuple(Camera.from_focal(640, 480, 262.0) for _ in model.cameras))
+    photos = [Photo(name=f"{k}.jpg", path=Path(f"{k}.jpg"), focal_px=focal_px) for k in range(3)]
+    reason = impossible_lens(model, photos)
+    assert word in reason
+    assert bool(reason) == bool(word)
