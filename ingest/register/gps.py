@@ -111,8 +111,10 @@ def place_by_gps(
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
     fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, level)
     if level is not None and (fit.local_from_sfm.rotation @ level.down)[2] > 0:  # a line, the wrong side up
-        over = _turned_over(fit.local_from_sfm, centers_sfm)
-        fit = fit_noisy(over, centers_sfm, positions_local, sigmas_m, times_s, level)
+        turned = _turned_over(fit.local_from_sfm, centers_sfm)
+        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, level)
+        if over.log_chance <= fit.log_chance + np.log(1.0 / options.wrong):  # else pictures are upside down
+            fit = over
     return _judged(fit, centers_sfm, positions_local, sigmas_m, figures, options)
 
 

@@ -1,6 +1,7 @@
 """Placement by GPS: known similarities, honest covariance, and every gate."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -168,6 +169,25 @@ def test_a_line_of_photos_that_are_held_level_has_a_place(seed: int) -> None:
     error = (_TRUE @ placed.local_from_sfm.inverse()).log()
     assert np.degrees(np.abs(error[1:4]).max()) < 5.0
     assert float(error @ np.linalg.solve(placed.covariance, error)) < chi2.ppf(0.999, 7)
+
+
+def test_pictures_that_are_stored_upside_down_do_not_turn_a_flight_over() -> None:
+    rng = np.random.default_rng(3)
+    positions = _flight(20)
+    held = []
+    for heading in rng.uniform(0, 2 * np.pi, 20):
+        across = np.array([np.sin(heading), -np.cos(heading), 0.0])
+        view = np.array([0.5 * np.cos(heading), 0.5 * np.sin(heading), -np.sqrt(0.75)])
+        local = np.stack([across, np.cross(view, across), view])
+        held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
+    level = level_of(held)
+    assert level is not None
+    level = replace(level, down=-level.down)
+    noise, sigmas = rng.normal(0, 1.0, (20, 3)), np.tile([4.0, 4.0, 10.0], (20, 1))
+    placed = place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, level=level)
+    assert placed.reason is None
+    assert placed.local_from_sfm is not None
+    assert np.degrees(np.abs((_TRUE @ placed.local_from_sfm.inverse()).log()[1:4]).max()) < 5.0
 
 
 def test_positions_that_are_late_say_by_how_much() -> None:
