@@ -338,14 +338,33 @@ def _normal(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray
 
 def _cost(theta: FloatArray, problem: _Linear, stated: FloatArray | None) -> float:
     """Minus twice the logarithm of the restricted likelihood, with the prior where `stated` is given."""
+    return _cost_and_slope(theta, problem, stated)[0]
+
+
+def _cost_and_slope(
+    theta: FloatArray, problem: _Linear, stated: FloatArray | None
+) -> tuple[float, FloatArray]:
+    """`_cost` and its derivative (4,)."""
     matrix, right, squared, logs = _normal(problem, theta)
     factor, lower = cho_factor(matrix)
-    determinant = 2.0 * float(np.log(np.diag(factor)).sum())
-    cost = logs + determinant + squared - float(right @ cho_solve((factor, lower), right))
+    covariance = cho_solve((factor, lower), np.eye(len(matrix)))
+    step = covariance @ right
+    cost = logs + 2.0 * float(np.log(np.diag(factor)).sum()) + squared - float(right @ step)
+    slope = np.zeros(4)
+    for axis in problem.axes:
+        white, drift = np.exp(2.0 * theta[axis.group]), np.exp(2.0 * theta[2 + axis.group]) * axis.walk
+        variance = white + drift
+        left = (axis.residual - axis.jacobian @ step) ** 2
+        left += ((axis.jacobian @ covariance) * axis.jacobian).sum(axis=1)
+        by_variance = 2.0 * (1.0 / variance - left / variance**2)
+        slope[axis.group] += white * float(by_variance.sum())
+        slope[2 + axis.group] += float((drift * by_variance).sum())
     if stated is not None:
         spread = np.array([_NOISE_SPREAD] * 2 + [_DRIFT_SPREAD] * 2)
-        cost += float((((theta - _prior_mean(stated)) / spread) ** 2).sum())
-    return cost
+        off = (theta - _prior_mean(stated)) / spread
+        cost += float((off**2).sum())
+        slope += 2.0 * off / spread
+    return cost, slope
 
 
 def _most_likely(
@@ -355,7 +374,7 @@ def _most_likely(
     bounds = [(value - _RANGE, value + _RANGE) for value in start]
     if least is not None:
         bounds[:2] = [(float(low), high) for low, (_, high) in zip(least, bounds, strict=False)]
-    return np.asarray(minimize(_cost, start, (problem, stated), "L-BFGS-B", bounds=bounds).x)
+    return np.asarray(minimize(_cost_and_slope, start, (problem, stated), "L-BFGS-B", True, bounds=bounds).x)
 
 
 def _solution(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -377,22 +396,21 @@ def _integrated(
     problem: _Linear, modes: list[FloatArray], stated: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Mean and covariance of the step over what the components may be."""
-    base = _cost(modes[0], problem, stated)
     widths = np.array([_widths(problem, mode, stated) for mode in modes])
     draws = np.random.default_rng(0).standard_t(_PROPOSAL, (len(modes), _SAMPLES // len(modes), 4))
-    total, mean, spread = 0.0, np.zeros(8), np.zeros((8, 8))
-    for at in (np.array(modes)[:, None] + widths[:, None] * draws).reshape(-1, 4):
-        off = (at - np.array(modes)) / widths
-        density = (
-            np.exp(-0.5 * (_PROPOSAL + 1.0) * np.log1p(off**2 / _PROPOSAL).sum(axis=1)) / widths.prod(axis=1)
-        ).sum()
-        weight = float(np.exp(-0.5 * (_cost(at, problem, stated) - base)) / density)
-        step, covariance = _solution(problem, at)
-        total += weight
+    at = (np.array(modes)[:, None] + widths[:, None] * draws).reshape(-1, 4)
+    off = (at[:, None] - np.array(modes)) / widths
+    parts = -0.5 * (_PROPOSAL + 1.0) * np.log1p(off**2 / _PROPOSAL).sum(axis=2) - np.log(widths).sum(axis=1)
+    density = np.logaddexp.reduce(parts, axis=1)
+    log_weight = np.array([-0.5 * _cost(theta, problem, stated) for theta in at]) - density
+    weights = np.exp(log_weight - log_weight.max())
+    weights /= weights.sum()
+    mean, spread = np.zeros(8), np.zeros((8, 8))
+    for theta, weight in zip(at, weights.tolist(), strict=True):
+        step, covariance = _solution(problem, theta)
         mean += weight * step
         spread += weight * (covariance + np.outer(step, step))
-    mean /= total
-    return mean, spread / total - np.outer(mean, mean)
+    return mean, spread - np.outer(mean, mean)
 
 
 def _widths(problem: _Linear, theta: FloatArray, stated: FloatArray) -> FloatArray:
