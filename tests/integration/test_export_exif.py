@@ -144,7 +144,8 @@ def test_copies_have_the_pose_and_the_very_picture(tmp_path: Path) -> None:
         assert (found.gimbal_yaw_deg or 0.0) % 360 == pytest.approx(heading, abs=1e-4)
         assert found.gimbal_pitch_deg == pytest.approx(pitch, abs=1e-4)
         assert found.gimbal_roll_deg == pytest.approx(roll, abs=1e-4)
-        assert found.sigma_source == "positioning_error"
+        assert found.sigma_source == "stated"
+        assert found.sigma_vertical_m == pytest.approx(max(shot.sigma_enu_m[2], 0.005), abs=1e-3)
         per_axis = np.sqrt((shot.sigma_enu_m[:2] ** 2).mean())
         assert found.sigma_horizontal_m == pytest.approx(max(per_axis, 0.005), abs=1e-3)
         by_pillow = Image.open(io.BytesIO(data)).getexif().get_ifd(ExifTags.IFD.GPSInfo)
