@@ -338,10 +338,10 @@ REAL: tuple[Row, ...] = (
             *("random", "random_answer"),
             *("shuffled", "shuffled_answer", "other", "other_answer"),
         ),
-        text="{placed:.1%} of {flights} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
-        "inside 68 and 95 % bounds ({answering_inside_95:.1%} of those that answer); of {random} at "
-        "random {random_answer} answer, of {shuffled} shuffled {shuffled_answer}, of {other} of other "
-        "flights {other_answer}",
+        text="{placed:.1%} of {flights:.0f} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
+        "inside 68 and 95 % bounds ({answering_inside_95:.1%} of those that answer); of {random:.0f} at "
+        "random {random_answer:.0f} answer, of {shuffled:.0f} shuffled {shuffled_answer:.0f}, of "
+        "{other:.0f} of other flights {other_answer:.0f}",
         limits=(
             Limit(figure="placed", least=0.95),
             Limit(figure="inside_68", least=0.63, most=0.73),
