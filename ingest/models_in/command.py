@@ -108,7 +108,9 @@ def run_model(args: argparse.Namespace) -> int:
         )
         return 0
     if made.status != "active":
-        state += f", {made.status}: it was placed by maps that this database may not have"
+        by_maps = "it was placed by maps that this database may not have"
+        too_few = "too few positions are left to check its place by; named by --map it answers"
+        state += f", {made.status}: {too_few if made.placement.method == 'gps' else by_maps}"
     sys.stdout.write(
         f"map {made.map_id} ({made.name}): {state}, {len(made.images)} photos, {len(made.points)} points, "
         f"{int(made.observations.has_descriptor.sum())} descriptors, EPSG:{made.epsg}, placed by "
