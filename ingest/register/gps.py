@@ -22,7 +22,7 @@ from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import NOISE_SHARE, Level, NoisyFit, fit_noisy
+from ingest.register.position_noise import NOISE_SHARE, Level, NoisyFit, fit_noisy, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -129,7 +129,7 @@ def _judged(
     """Covariance, figures and tests of an estimated similarity."""
     known = np.isfinite(sigmas)
     residuals = np.where(known, positions - fit.local_from_sfm.act(centers), np.nan)
-    stated = np.array([_median(sigmas[:, k]) for k in range(3)])
+    stated = np.array([stated_sigma(sigmas[:, k]) for k in range(3)])
     white, drift = (np.array([of[0], of[0], of[1]]) for of in (fit.noise.white, fit.noise.drift))
     bias = np.sqrt(np.maximum(stated**2 - white**2, 0.0))
     covariance = fit.covariance.copy()
@@ -146,10 +146,8 @@ def _judged(
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "turn_sigma_deg": turn_deg,
         "log10_chance": chance / np.log(10.0),
-        "rms_horizontal_m": float(np.sqrt(np.nansum(residuals[inliers, :2] ** 2, axis=1).mean())),
-        "rms_vertical_m": float(np.sqrt(np.nanmean(residuals[inliers, 2] ** 2)))
-        if known[inliers, 2].any()
-        else None,
+        "rms_horizontal_m": _rms(residuals[fit.used[:, 0], :2]),
+        "rms_vertical_m": _rms(residuals[fit.used[:, 1] & known[:, 2], 2:]),
     }
 
     def outcome(reason: GpsReason | None, message: str, provisional: str = "") -> GpsPlacement:
@@ -167,14 +165,14 @@ def _judged(
     rms = np.sqrt(white**2 + drift**2 / 3.0)[known.any(axis=0)]
     usual = np.maximum(stated, _PLAIN_M)[known.any(axis=0)] * NOISE_SHARE
     above = float(np.log(rms / usual).max())  # standard deviations of a receiver's noise
-    if above > norm.isf(options.wrong) or (
-        above > norm.isf(options.no_place) and chance > np.log(options.no_place)
-    ):
+    refused = norm.isf(options.wrong if chance <= np.log(options.no_place) else options.no_place)
+    if above > refused or inliers.sum() < _LEAST_PHOTOS:
+        height = f" and {rms[2]:.0f} m in height" if len(rms) == 3 else ""
         return outcome(
             "RESIDUALS",
-            f"the photos' GPS does not fit the reconstruction: it would be noisy by {rms[0]:.0f} m "
-            f"horizontally and {rms[-1]:.0f} m in height; positions of other photos would fit as well in "
-            f"{np.exp(chance):.1g} of cases",
+            f"the photos' GPS does not fit the reconstruction: {inliers.sum()} of {len(inliers)} positions "
+            f"agree, noisy by {rms[0]:.0f} m horizontally{height}; positions of other photos would fit as "
+            f"well in {np.exp(chance):.1g} of cases",
         )
     if turn_deg > options.max_turn_deg:
         return outcome(
@@ -199,6 +197,11 @@ def _judged(
     return outcome(None, "placed by GPS")
 
 
+def _rms(residuals_m: FloatArray) -> float | None:
+    """Root mean square length of residuals (n, d); None without any."""
+    return float(np.sqrt((residuals_m**2).sum(axis=1).mean())) if len(residuals_m) else None
+
+
 def _turned_over(sim: Sim3, centers: FloatArray) -> Sim3:
     """Turned by half a turn about the main line of the centres."""
     placed = sim.act(centers)
@@ -206,11 +209,6 @@ def _turned_over(sim: Sim3, centers: FloatArray) -> Sim3:
     axis = np.linalg.svd(placed - middle, full_matrices=False)[2][0]
     turn = 2.0 * np.outer(axis, axis) - np.eye(3)
     return Sim3(scale=1.0, rotation=turn, translation=middle - turn @ middle) @ sim
-
-
-def _median(values: FloatArray) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
 
 
 def _start(

@@ -2,13 +2,12 @@
 
     position_i = S center_i + bias + drift(t_i) + noise_i
 
-For the horizontal axes and the vertical each: noise has heavy tails (Student's t with four degrees of
-freedom, as weights of normal ones: Lange, Little, Taylor 1989), drift is a line
-and a random walk along the time of the flight, the bias is shared by the flight and cannot be told from the
-similarity's translation. What positions say of
-themselves is a prior of these components of variance; they are estimated by restricted maximum likelihood
-(Patterson, Thompson 1971) under it. Their own uncertainty is integrated over (importance sampling around
-the mode), so that few positions give wide answers.
+For the horizontal axes and the vertical each: noise is independent, drift is a line and a random walk along
+the time of the flight, the bias is shared by the flight and cannot be told from the similarity's
+translation. What positions say of themselves is a prior of these components of variance; they are estimated
+by restricted maximum likelihood (Patterson, Thompson 1971) under it. Their own uncertainty is integrated
+over (importance sampling around the modes), so that few positions give wide answers. Positions far out are
+found with weights of Student's t (Lange, Little, Taylor 1989) and then left out.
 """
 
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from scipy.stats import chi2
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 
-_TAIL = 4.0  # degrees of freedom of the noise
+_TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
 _MOST_STEP = 0.5  # of the logarithm of the scale and of a turn; further it is not linear
 _SETTLED = 1e-3  # of a step over its standard deviation
@@ -108,6 +107,7 @@ class _Data:
         stated: (2,) median sigma, horizontal and vertical.
         speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
         lag_sigma_s: of the time between a photo and its position.
+        level: how the photos are held, or None.
     """
 
     centers: FloatArray
@@ -177,6 +177,7 @@ class _Linear:
     """A linear problem whose noise is independent once its components are given.
 
     Attributes:
+        axes: east, north, up.
         known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside positions.
     """
 
@@ -202,12 +203,13 @@ def fit_noisy(
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
         level: how the photos are held.
     """
-    stated = np.array([_median(sigmas[:, axes]) for axes in _AXES])
+    stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
     speed, order = np.zeros_like(centers), np.arange(len(centers), dtype=np.float64)
     if times_s is not None:
         speed, order = _speeds(centers, times_s), times_s
-    fastest = start.scale * float(np.median(np.linalg.norm(speed, axis=1)))
+    moving = np.linalg.norm(speed, axis=1)
+    usual = start.scale * float(np.median(moving[moving > 0])) if moving.any() else 0.0
     data = _Data(
         centers=centers,
         positions=middle.inverse().act(positions),
@@ -215,7 +217,7 @@ def fit_noisy(
         walk=_walk(order),
         stated=stated,
         speed=speed,
-        lag_sigma_s=min(_LAG_SHARE * stated[0] / fastest, _MOST_LAG_S) if fastest > 0 else _MOST_LAG_S,
+        lag_sigma_s=min(_LAG_SHARE * stated[0] / usual, _MOST_LAG_S) if usual > 0 else _MOST_LAG_S,
         level=level,
     )
     state, theta = _State(middle.inverse() @ start, 0.0), _prior_mean(stated)
@@ -273,8 +275,8 @@ def _speeds(centers: FloatArray, times_s: FloatArray) -> FloatArray:
     return speed
 
 
-def _median(sigmas: FloatArray) -> float:
-    """Of those that are known; any where none is."""
+def stated_sigma(sigmas: FloatArray) -> float:
+    """The median of those that are known, metres; one where none is."""
     known = sigmas[np.isfinite(sigmas)]
     return float(np.median(known)) if len(known) else 1.0
 
@@ -443,20 +445,22 @@ def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: Float
 def _squared(data: _Data, state: _State, weights: FloatArray, theta: FloatArray) -> FloatArray:
     """(n, 2) squared residuals over the noise, horizontal and vertical, less the walk; 0 where not known."""
     residual = state.residual(data)
-    rest = residual - _walked(data, residual, weights, theta)
-    result = np.zeros_like(weights)
+    return _relative(data, residual - _walked(data, residual, weights, theta)) / np.exp(2.0 * theta[:2])
+
+
+def _relative(data: _Data, residual: FloatArray) -> FloatArray:
+    """(n, 2) squares of residuals (n, 3), square metres at the median sigma, horizontal and vertical."""
+    result = np.zeros((len(residual), 2))
     for group, axes in enumerate(_AXES):
         known = np.isfinite(data.sigmas[:, axes]).all(axis=1)
         ratio = data.sigmas[known][:, axes] / data.stated[group]
-        result[known, group] = (rest[known][:, axes] ** 2 / ratio**2).sum(axis=1)
-        result[known, group] /= np.exp(2.0 * theta[group])
+        result[known, group] = (residual[known][:, axes] ** 2 / ratio**2).sum(axis=1)
     return result
 
 
 def _start_weights(data: _Data, state: _State) -> FloatArray:
     """As if all were noise of the size that residuals have at the median."""
-    nothing = _prior_mean(data.stated) - 20.0
-    squared = _squared(data, state, np.ones((len(data.centers), 2)), nothing * [0.0, 0.0, 1.0, 1.0])
+    squared = _relative(data, state.residual(data))
     return _weights(squared / np.maximum(np.median(squared, axis=0) / chi2.ppf(0.5, _SIZES), _LEAST_M))
 
 

@@ -273,6 +273,17 @@ def test_positions_without_heights_place_a_map() -> None:
     assert np.sqrt(placed.covariance[6, 6]) > 1000.0  # nobody knows the height
 
 
+def test_a_refusal_without_heights_names_none() -> None:
+    rng = np.random.default_rng(1)
+    positions = _flight(25)
+    sigmas = np.tile([4.0, 4.0, np.inf], (25, 1))
+    centers = _TRUE.inverse().act(positions)
+    placed = place_by_gps(centers, positions[rng.permutation(25)] * [9.0, 9.0, 0.0], sigmas, _OPTIONS)
+    assert placed.reason == "RESIDUALS"
+    assert "in height" not in placed.message
+    assert placed.figures["rms_vertical_m"] is None
+
+
 def test_many_positions_are_thinned_and_all_are_judged() -> None:
     rng = np.random.default_rng(10)
     positions = _flight(900)
