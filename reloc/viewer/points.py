@@ -74,7 +74,7 @@ def shares(wanted: ArrayLike, limit: int) -> NDArray[np.int64]:
     counts = np.array(wanted, dtype=np.int64)
     total = int(counts.sum())
     if total > limit:
-        counts[:] = np.floor(counts * (limit / total))
+        counts = counts * limit // total  # whole numbers: a rounded ratio loses a point
     return counts
 
 

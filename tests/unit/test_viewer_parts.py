@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from featuredb.geo.local_frame import LocalFrame
@@ -41,6 +41,7 @@ def test_a_pose_without_spread_has_an_ellipse_without_extent() -> None:
 
 
 @given(st.lists(st.integers(0, 10_000), max_size=12), st.integers(0, 20_000))
+@example([10_000], 7857)
 def test_shares_stay_within_the_limit_and_the_counts(counts: list[int], limit: int) -> None:
     given_out = shares(counts, limit)
     assert int(given_out.sum()) <= limit
