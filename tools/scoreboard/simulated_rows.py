@@ -205,9 +205,8 @@ SIMULATED: tuple[Row, ...] = (
         ),
         minutes=4,
     ),
-    _track("smooth", "map", "short", 1200, 0.10, 15),
-    _track("jerky", "map", "short", 1200, 0.25, 15),
-    _track("smooth", "scan", "short", 1200, 0.20, 15),
+    _track("jerky", "map", "short", 600, 0.25, 10),
+    _track("smooth", "scan", "short", 600, 0.20, 10),
     Row(
         name="film-map",
         group="simulated",
@@ -264,16 +263,16 @@ SIMULATED: tuple[Row, ...] = (
         minutes=5,
     ),
     _growth(
-        *("growth-community", "300 photos of the town by twelve people: growth finds their places"),
-        *(("tools.growth_community", "--size", "full"), "community", 240),
+        *("growth-community", "48 photos of a small town by twelve people: growth finds their places"),
+        *(("tools.growth_community", "--size", "short"), "community", 25),
     ),
     _growth(
-        *("growth-poison", "210 photos of look-alikes, liars and forgers: nothing wrong is promoted"),
-        *(("tools.growth_poison", "--size", "full", "--poison", "all together"), "poison", 180),
+        *("growth-poison", "look-alikes, liars and forgers in a small town: nothing wrong is promoted"),
+        *(("tools.growth_poison", "--size", "short", "--poison", "all together"), "poison", 25),
     ),
     _growth(
-        *("growth-walk", "a walk of 25 steps from one anchor by contributed photos alone: the bound is true"),
-        *(("tools.growth_walk", "--size", "full", "--budget", "2.0"), "walk", 180),
+        *("growth-walk", "a walk of 270 m from one anchor by contributed photos alone: the bound is true"),
+        *(("tools.growth_walk", "--size", "short", "--budget", "2.0"), "walk", 25),
     ),
     Row(
         name="studies",
