@@ -51,18 +51,18 @@ def map_errors(
     options = options or AdjustOptions()
     block = whole_lens(block)
     terms = terms_of_map(block, focal_px, centers, options)
-    joint = _joint(block, Problem(block, terms, options.threads).marginals())
+    found, weighted = Problem(block, terms, options.threads).honest_marginals()
+    joint = _joint(block, found)
     size = 6 * len(block.names)
     factor = _factor(joint, size)
     noise = joint[:size, :size] - factor[:size] @ factor[:size].T
-    # Priors count `dilution` times in the problem; in truth observations count so much less.
-    factor *= np.sqrt(options.dilution)
     moved, fit = _similarity_of(block)
     factor[:size] -= moved @ (fit @ factor[:size])
     noise -= moved @ (fit @ noise)
     noise -= (noise @ fit.T) @ moved.T
     poses = noise + factor[:size] @ factor[:size].T
-    lenses = [part @ part.T for part in factor[size:].reshape(len(block.cameras), LENS_SIZE, -1)]
+    # Photos agree on a wrong lens: parameters are off by more than poses made with them.
+    lenses = [options.dilution * weighted.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     return MapErrors(
         lenses=uncertainty_of_lenses(block.cameras, lenses, photos, options.dilution),

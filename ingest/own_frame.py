@@ -67,7 +67,8 @@ def level_of(poses: Sequence[Rigid3]) -> Level | None:
     kept, sigma, _, _ = found
     return Level(
         across=np.array([pose.rotation[0] for pose in poses])[kept],
-        sigma_rad=float(np.sqrt(sigma**2 + kept.sum() * _COMMON_ROLL_RAD**2)),
+        sigma_rad=sigma,
+        common_rad=_COMMON_ROLL_RAD,
         down=_down(poses)[kept].mean(axis=0),
     )
 

@@ -8,7 +8,8 @@ eliminated, less the prior. The widths are those under which the lenses of all c
 likely (type II maximum likelihood): a lens of which the photos say little says little of the widths.
 
 For each width: what `AdjustOptions` has, what is measured, and between which limits it lies with 95 %
-probability (likelihood ratio, the other widths where they are most likely). Exit code 0 if all that
+probability (likelihood ratio, the other widths where they are most likely). Also how far photos of a camera
+disagree about its lens (`featuredb.adjust.lens_agreement`). Exit code 0 if all that
 `AdjustOptions` has lie within.
 """
 
@@ -24,6 +25,7 @@ from scipy.optimize import brentq, minimize
 from scipy.stats import chi2
 
 from featuredb.adjust.block import whole_lens
+from featuredb.adjust.lens_agreement import lens_squares
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import LensWidths, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
@@ -67,8 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     options = AdjustOptions()
     told: list[Told] = []
+    disagreement: list[float] = []
     for folder in args.photos:
-        found = lenses_of(_database(folder, args.work), folder, options)
+        found, factors = lenses_of(_database(folder, args.work), folder, options)
+        disagreement += factors
         sys.stderr.write(f"{folder}: {len(found)} lenses\n")
         told += found
     if not told:
@@ -87,23 +91,30 @@ def main(argv: Sequence[str] | None = None) -> int:
         "lenses": len(told),
         **{name: measured[k] for k, name in enumerate(WIDTHS)},
         "inside": sum(inside.values()),
+        "disagreement": float(np.exp(np.mean(np.log(disagreement)))) if disagreement else float("nan"),
     }
     write_figures(args.json, figures)
     return 0 if all(inside.values()) else 1
 
 
-def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> list[Told]:
-    """What the photos of each lens of a database's maps say of it."""
+def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[list[Told], list[float]]:
+    """What the photos of each lens of a database's maps say of it, and how far they disagree about it."""
     photos = {photo.name: photo for photo in scan_folder(folder).photos}
-    told = []
+    told: list[Told] = []
+    disagreement: list[float] = []
     for feature_map in all_maps(database):
         block = whole_lens(block_of_map(feature_map))
         focal_px = _focals(block.names, block.camera_of.tolist(), photos)
         terms = terms_of_map(block, focal_px, None, options)
         problem = Problem(block, terms, options.threads)
         problem.solve(options.max_iterations, 1e-6)
+        squares, freedom = lens_squares(problem.weighted())
+        for one, free in zip(squares.tolist(), freedom.tolist(), strict=True):
+            if np.isfinite(one):
+                sys.stdout.write(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)\n")
+                disagreement.append(one / free)
         told += _told(problem, terms, focal_px, options)
-    return told
+    return told, disagreement
 
 
 def _told(

@@ -5,7 +5,8 @@
 Flights are the largest maps of the folders, made by an ordinary ingest, and five simulated ones; where a
 flight's cameras are then is the truth. Positions are made from it in the ways below, and the flight is placed
 by them as if they came from a plain receiver (4 m and 10 m). Printed by kind: how many flights have a place,
-how many answer, and how often the seven parameters of the similarity lie inside their 68 % and 95 % bounds.
+how many answer, and how often position and orientation of one of its cameras lie inside the 68 % and 95 %
+bounds that the placement gives them.
 
 Then positions that have nothing to do with the photos: drawn at random within a kilometre for three to eight
 photos, those of a flight shuffled, and those of another flight. Exit code 0 if the bounds hold within two
@@ -21,12 +22,13 @@ from pathlib import Path
 
 import numpy as np
 from scipy.stats import chi2
+from threadpoolctl import threadpool_limits
 
 from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.own_frame import level_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from tools.figures import add_json_option, write_figures
@@ -34,7 +36,9 @@ from tools.made_maps import all_maps, make, photo_names
 
 _SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
+_PARTS = ("position", "orientation")
 _LEVELS = (0.68, 0.95)
+_COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,42 +127,52 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     add_json_option(parser)
     args = parser.parse_args(argv)
-    flights = [real_flight(folder, args.work) for folder in args.photos] + simulated_flights(args.seed)
-    figures = bounds(flights, args.draws, args.seed) | unrelated(flights, args.chance, args.seed)
+    real = [real_flight(folder, args.work) for folder in args.photos]
+    with threadpool_limits(1):  # matrices are small
+        figures = bounds(real, args.draws, args.seed)
+        figures |= unrelated([*real, *simulated_flights(args.seed, 0)], args.chance, args.seed)
     write_figures(args.json, figures)
     count = figures["placed"] * figures["flights"]
     held = all(
-        abs(figures[f"inside_{100 * level:.0f}"] - level)
+        abs(figures[f"{part}_{100 * level:.0f}"] - level)
         <= 2.0 * np.sqrt(level * (1.0 - level) / max(count, 1.0))
+        for part in _PARTS
         for level in _LEVELS
     )
     fine = held and figures["placed"] >= 0.95 and figures["random_answer"] <= max(args.chance / 1000.0, 1.0)
     return 0 if fine and not figures["shuffled_answer"] and not figures["other_answer"] else 1
 
 
-def bounds(flights: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
-    """Every kind of error on every flight in turn: what is placed, and whether its bounds hold."""
-    scores: list[float] = []
-    answering: list[float] = []
+def bounds(real: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
+    """Every kind of error on every flight in turn: what is placed, and whether its bounds hold.
+
+    Simulated flights are drawn anew for each draw: how their photos are held is an error as well.
+    """
+    scores: list[dict[str, float]] = []
+    answering: list[dict[str, float]] = []
     tried = 0
     for number, (kind, error) in enumerate(_KINDS.items()):
-        own: list[float] = []
-        active: list[float] = []
+        own: list[dict[str, float]] = []
+        active = 0
         reasons: list[str] = []
         for draw in range(draws):
             rng = np.random.default_rng((seed, number, draw))
+            flights = [*real, *simulated_flights(seed, draw)]
             flight = flights[draw % len(flights)]
             found = flight.placed(flight.xyz + error(flight, rng))
-            if found.reason is not None or found.local_from_sfm is None or found.covariance is None:
+            if found.reason is not None:
                 reasons.append(f"{flight.name}: {found.reason}")
                 continue
-            off = (_TRUE @ found.local_from_sfm.inverse()).log()
-            own.append(float(off @ np.linalg.solve(found.covariance, off)))
-            active += own[-1:] if not found.provisional else []
-        tried, answering, scores = tried + draws, answering + active, scores + own
-        inside = " and ".join(f"{np.mean(np.array(own) <= chi2.ppf(level, 7)):.0%}" for level in _LEVELS)
+            own.append(squares(found, flight.xyz[rng.integers(len(flight.xyz))]))
+            if not found.provisional:
+                active += 1
+                answering.append(own[-1])
+        tried, scores = tried + draws, scores + own
+        inside = "; ".join(
+            f"{part} {_inside(own, part, 0.68):.0%} and {_inside(own, part, 0.95):.0%}" for part in _PARTS
+        )
         sys.stdout.write(
-            f"{kind:<22} {len(own)} of {draws} placed, {len(active)} answer, {inside} inside 68 and 95 %"
+            f"{kind:<22} {len(own)} of {draws} placed, {active} answer, inside 68 and 95 %: {inside}"
             f"{'; ' + ', '.join(sorted(set(reasons))) if reasons else ''}\n"
         )
         sys.stdout.flush()
@@ -166,12 +180,26 @@ def bounds(flights: Sequence[Flight], draws: int, seed: int) -> dict[str, float]
         "flights": float(tried),
         "placed": len(scores) / tried,
         "answer": len(answering) / tried,
-        "answering_inside_95": float(np.mean(np.array(answering) <= chi2.ppf(0.95, 7))),
-        **{
-            f"inside_{100 * level:.0f}": float(np.mean(np.array(scores) <= chi2.ppf(level, 7)))
-            for level in _LEVELS
-        },
+        **{f"answering_{part}_95": _inside(answering, part, 0.95) for part in _PARTS},
+        **{f"{part}_{100 * level:.0f}": _inside(scores, part, level) for part in _PARTS for level in _LEVELS},
     }
+
+
+def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
+    """Squared errors over their covariance: of a camera's position (3,), and of the orientation."""
+    assert placed.local_from_sfm is not None
+    assert placed.covariance is not None
+    off = (_TRUE @ placed.local_from_sfm.inverse()).log()
+    by_similarity = {"position": point_jacobian(camera[None])[0], "orientation": np.eye(7)[1:4]}
+    result = {}
+    for part, rows in by_similarity.items():
+        error = rows @ off
+        result[part] = float(error @ np.linalg.solve(rows @ placed.covariance @ rows.T, error))
+    return result
+
+
+def _inside(scores: Sequence[dict[str, float]], part: str, level: float) -> float:
+    return float(np.mean([score[part] <= chi2.ppf(level, 3) for score in scores]))
 
 
 def unrelated(flights: Sequence[Flight], chance: int, seed: int) -> dict[str, float]:
@@ -231,10 +259,11 @@ def real_flight(folder: Path, work: Path) -> Flight:
     )
 
 
-def simulated_flights(seed: int) -> list[Flight]:
+def simulated_flights(seed: int, draw: int) -> list[Flight]:
     """Strips to and fro, a spiral, a walk around a house, and a winding street."""
-    rng = np.random.default_rng((seed, 7))
+    rng = np.random.default_rng((seed, 7, draw))
     flights = []
+    rolls = np.radians(rng.normal(0.0, _COMMON_ROLL_DEG, 5))
     for name, lines, per, size in (("strips", 4, 8, 160.0), ("two strips", 2, 9, 120.0)):
         x = np.linspace(-0.5, 0.5, per) * size
         plan = [(v, 0.25 * size * k) for k in range(lines) for v in (x if k % 2 == 0 else x[::-1])]
@@ -254,16 +283,20 @@ def simulated_flights(seed: int) -> list[Flight]:
             name=name,
             xyz=xyz + rng.normal(0.0, 0.5, xyz.shape),
             times_s=np.asarray(step * np.arange(len(xyz), dtype=np.float64)),
-            cam_from_local=tuple(_held(xyz, k, rng) for k in range(len(xyz))),
+            cam_from_local=tuple(_held(xyz, k, rolls[row], rng) for k in range(len(xyz))),
         )
-        for name, xyz, step in flights
+        for row, (name, xyz, step) in enumerate(flights)
     ]
 
 
-def _held(xyz: FloatArray, k: int, rng: np.random.Generator) -> Rigid3:
-    """A camera that looks ahead and down, level but for two degrees."""
+def _held(xyz: FloatArray, k: int, common_roll: float, rng: np.random.Generator) -> Rigid3:
+    """A camera that looks ahead and down, level but for two degrees and what all have in common."""
     ahead = xyz[min(k + 1, len(xyz) - 1)] - xyz[max(k - 1, 0)]
-    heading, tilt, roll = np.arctan2(ahead[1], ahead[0]), np.radians(50.0), rng.normal(0.0, np.radians(2.0))
+    heading, tilt, roll = (
+        np.arctan2(ahead[1], ahead[0]),
+        np.radians(50.0),
+        rng.normal(common_roll, np.radians(2.0)),
+    )
     view = np.array([np.cos(heading) * np.cos(tilt), np.sin(heading) * np.cos(tilt), -np.sin(tilt)])
     across = np.array([np.sin(heading), -np.cos(heading), 0.0])
     level = np.stack([across, np.cross(view, across), view])

@@ -152,10 +152,15 @@ def reference(database: Path) -> FeatureMap:
 
 
 def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[Row]:
-    """Localise the photos over Zenoh and compare with their poses in the reference map."""
-    return ask_poses(
-        database, photos, names, truth.frame, {image.name: image.cam_from_local for image in truth.images}
-    )
+    """Localise the photos over Zenoh and compare with their poses in the reference map.
+
+    Those that the reference map does not have are left out: nothing tells where they were taken.
+    """
+    poses = {image.name: image.cam_from_local for image in truth.images}
+    known = [name for name in names if name in poses]
+    if left_out := [name for name in names if name not in poses]:
+        sys.stdout.write(f"not in the reference map, so left out: {', '.join(left_out)}\n")
+    return ask_poses(database, photos, known, truth.frame, poses)
 
 
 def ask_poses(

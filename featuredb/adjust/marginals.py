@@ -56,21 +56,21 @@ class Marginals:
         return result
 
     def by_lenses(self) -> FloatArray:
-        """(6 k, 6 k) of the free poses' covariance: what would be gone if the lenses were exact."""
+        """(q, q) the part of `shared` that would be gone if the lenses were exact."""
         first = 6 * int((self.pose_start >= 0).sum())
-        across, lenses = self.shared[:first, first:], self.shared[first:, first:]
+        across, lenses = self.shared[:, first:], self.shared[first:, first:]
         scale = 1.0 / np.sqrt(np.maximum(np.diag(lenses), 1e-300))
         factor = lenses * scale[:, None] * scale + _DAMPING * np.eye(len(scale))
         return np.asarray((across * scale) @ np.linalg.solve(factor, (across * scale).T))
 
     def by_lens_prior(self, camera: int, gradient: FloatArray) -> FloatArray:
-        """(6 k, 6 k) the part of `by_lenses` that comes from how far a free lens is off its prior.
+        """(q, q) the part of `by_lenses` that comes from how far a free lens is off its prior.
 
         Args:
             gradient: (p, p) covariance of the prior's part of the gradient.
         """
-        first, start = 6 * int((self.pose_start >= 0).sum()), int(self.lens_start[camera])
-        across = self.shared[:first, start : start + self.lens_size[camera]]
+        start = int(self.lens_start[camera])
+        across = self.shared[:, start : start + self.lens_size[camera]]
         return np.asarray(across @ gradient @ across.T)
 
     def lens(self, camera: int) -> FloatArray:
@@ -142,22 +142,6 @@ class TargetMarginals:
     survey: Whitened
 
 
-def marginals(
-    jacobian: Any,
-    points: NDArray[np.int64],
-    poses: Sequence[int],
-    lenses: Sequence[int],
-    block: Block,
-) -> Marginals:
-    """From the Jacobian of whitened residuals.
-
-    Args:
-        jacobian: columns three for each of `points`, six for each of `poses` in COLMAP's perturbation, then
-            the parameters of `lenses`.
-    """
-    return _marginals(_without_points(jacobian, len(points)), poses, lenses, block)
-
-
 def target_marginals(
     jacobian: Any,
     own: Any,
@@ -177,7 +161,7 @@ def target_marginals(
     """
     size = 3 * len(targets)
     plain = jacobian.shape[1] - own.shape[1]
-    covariance = _without_points(jacobian, plain // 3)
+    covariance = inverse_without_points(jacobian, plain // 3)
     spread = own @ covariance
 
     def whitened(first: int, last: int, axes: int) -> Whitened:
@@ -188,7 +172,7 @@ def target_marginals(
         )
 
     return TargetMarginals(
-        block=_marginals(covariance[size:, size:], *free, block),
+        block=marginals(covariance[size:, size:], *free, block),
         points=targets,
         point=np.array([covariance[i : i + 3, i : i + 3] for i in range(0, size, 3)]),
         marks=whitened(0, 2 * marks, 2),
@@ -196,11 +180,11 @@ def target_marginals(
     )
 
 
-def _without_points(jacobian: Any, points: int) -> FloatArray:
+def inverse_without_points(jacobian: Any, points: int) -> FloatArray:
     """(q, q) covariance of all but the first `points`, which are eliminated."""
     n = 3 * points
     by_point, by_shared = jacobian[:, :n].tocsc(), jacobian[:, n:].tocsc()
-    inverse = _inverse_blocks((by_point.T @ by_point).tocoo(), points)
+    inverse = inverse_blocks((by_point.T @ by_point).tocoo(), points)
     across = (by_point.T @ by_shared).tocsr()
     normal = (by_shared.T @ by_shared).toarray() - (across.T @ (inverse @ across)).toarray()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -208,9 +192,7 @@ def _without_points(jacobian: Any, points: int) -> FloatArray:
     return np.asarray(cho_solve(cho_factor(scaled), np.eye(len(scale))) * scale[:, None] * scale)
 
 
-def _marginals(
-    covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block
-) -> Marginals:
+def marginals(covariance: FloatArray, poses: Sequence[int], lenses: Sequence[int], block: Block) -> Marginals:
     """Of the covariance of poses, in COLMAP's perturbation, and lenses."""
     size = tuple(len(camera.params) for camera in block.cameras)
     turn = _house_from_colmap([block.cam_from_block[k].translation for k in poses], len(covariance))
@@ -239,7 +221,7 @@ def _house_from_colmap(translations: Sequence[FloatArray], size: int) -> Any:
     return sparse.block_diag([*parts, sparse.eye(size - 6 * len(parts))], format="csr")
 
 
-def _inverse_blocks(blocks: Any, n: int) -> Any:
+def inverse_blocks(blocks: Any, n: int) -> Any:
     """The inverse of a matrix of n blocks of three on its diagonal."""
     dense = np.zeros((n, 3, 3))
     dense[blocks.row // 3, blocks.row % 3, blocks.col % 3] = blocks.data

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,14 @@ from pycolmap import cost_functions
 from scipy import sparse
 
 from featuredb.adjust.block import Block
-from featuredb.adjust.marginals import Marginals, TargetMarginals, marginals, target_marginals
+from featuredb.adjust.lens_agreement import Weighted, honest, lens_disagreement
+from featuredb.adjust.marginals import (
+    Marginals,
+    TargetMarginals,
+    inverse_without_points,
+    marginals,
+    target_marginals,
+)
 from featuredb.adjust.terms import (
     CenterPriors,
     LensPrior,
@@ -71,6 +79,7 @@ class Problem:
         self._points = {int(p): self._reconstruction.point3D(int(p) + 1).xyz for p in seen}
         self._loss = pyceres.CauchyLoss(terms.keypoint_px)
         self._targets: list[Any] = []  # residual blocks: the marks, then the surveyed points
+        self._diluted: list[Any] = []  # residual blocks of priors that count `dilution` times
         self._add_lenses(terms.lenses)
         if terms.marks is not None:
             self._add_marks(terms.marks)
@@ -128,17 +137,45 @@ class Problem:
         """Covariances at the parameters as they are now, for independent residuals of the stated sigmas."""
         poses, lenses = self._free()
         rows = list(self._points)
-        return marginals(
-            self._jacobian(rows, ()), np.array(rows, dtype=np.int64), poses, lenses, self.block()
+        covariance = inverse_without_points(self._jacobian(rows, ()), len(rows))
+        return marginals(covariance, poses, lenses, self.block())
+
+    def honest_marginals(self) -> tuple[Marginals, Marginals]:
+        """Covariances as the residuals and the priors as they are have them, where `dilution` is a choice of
+        weights (`featuredb.adjust.lens_agreement`); and `marginals`.
+        """
+        (poses, lenses), block, weighted = self._free(), self.block(), self.weighted()
+        covariance = honest(weighted, lens_disagreement(weighted))
+        return (
+            marginals(covariance, poses, lenses, block),
+            marginals(weighted.inverse, poses, lenses, block),
+        )
+
+    def weighted(self) -> Weighted:
+        """The adjustment, linear at the parameters as they are now."""
+        poses, lenses = self._free()
+        points = list(self._points)
+        jacobian = self._jacobian(points, ())
+        inverse = inverse_without_points(jacobian, len(points))
+        ends = 6 * len(poses) + np.cumsum([0, *(len(self._lenses[c]) for c in lenses)])
+        priors = self._jacobian((), self._diluted).toarray() if self._diluted else np.zeros((0, len(inverse)))
+        return Weighted(
+            jacobian=jacobian,
+            residual=np.asarray(self._ceres.evaluate_residuals()) / self._terms.keypoint_px,
+            points=len(points),
+            inverse=inverse,
+            lenses=[slice(int(a), int(b)) for a, b in pairwise(ends)],
+            of_priors=priors,
+            dilution=self._terms.dilution,
         )
 
     def by_lens_priors(self, found: Marginals, cameras: Collection[int]) -> FloatArray:
-        """(6 k, 6 k) the part of `found.by_lenses()` that comes from how far lenses are off their priors.
+        """(q, q) the part of `found.by_lenses()` that comes from how far lenses are off their priors.
 
         Args:
             found: by `marginals`. cameras: rows of the lenses.
         """
-        part = np.zeros_like(found.by_lenses())
+        part = np.zeros_like(found.shared)
         for c in cameras:
             prior = self._terms.lenses[c]
             if prior is not None and found.lens_start[c] >= 0:
@@ -206,7 +243,7 @@ class Problem:
         for params, prior in zip(self._lenses, priors, strict=True):
             if prior is not None and self._has(params):
                 cost = pyceres.factors.NormalPrior(np.array(prior.mean.params), unit * prior.covariance)
-                self._ceres.add_residual_block(cost, loss, [params])
+                self._diluted.append(self._ceres.add_residual_block(cost, loss, [params]))
 
     def _add_points(self, priors: PointPriors) -> None:
         unit = 1.0 / self._terms.keypoint_px**2
@@ -236,7 +273,7 @@ class Problem:
             priors.photo_of.tolist(), priors.xyz, priors.covariance, strict=True
         ):
             cost = cost_functions.AbsolutePosePositionPriorCost(unit * covariance, xyz)
-            self._ceres.add_residual_block(cost, loss, [self._poses[photo]])
+            self._diluted.append(self._ceres.add_residual_block(cost, loss, [self._poses[photo]]))
 
     def _add_orientations(self, priors: Orientations) -> None:
         unit = 1.0 / self._terms.keypoint_px**2

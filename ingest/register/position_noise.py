@@ -66,13 +66,20 @@ class Level:
 
     Attributes:
         across: (k, 3) those axes in the reconstruction's frame.
-        sigma_rad: how far one is off the level, with what all have in common.
+        sigma_rad: how far one is off the level. common_rad: what all are off to one side, by one gimbal or
+            hand; seen from where they look, so that flights to and fro do not tilt by it.
         down: (3,) about downwards.
     """
 
     across: FloatArray
     sigma_rad: float
+    common_rad: float
     down: FloatArray
+
+    def whitened(self, rows: FloatArray) -> FloatArray:
+        """(k, ...) by photo, over the root of their covariance."""
+        common = 1.0 - self.sigma_rad / np.sqrt(self.sigma_rad**2 + len(rows) * self.common_rad**2)
+        return np.asarray((rows - common * rows.mean(axis=0)) / self.sigma_rad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,14 +150,16 @@ class _State:
 
     def known(self, data: "_Data") -> tuple[FloatArray, FloatArray]:
         """Jacobian (m, 8) and residual (m,), whitened, of what is known beside positions."""
-        wide = np.array([data.lag_sigma_s, _UNKNOWN_SCALE, *[_UNKNOWN_TURN] * 3, *[_UNKNOWN_M] * 3])
-        rows, off = [np.diag(1.0 / wide)], [np.array([-self.lag_s / data.lag_sigma_s, *[0.0] * 7])]
+        # A lag has heavy tails: as Student's t of three degrees of freedom weighs it.
+        lag_s = np.sqrt(0.25 * (3.0 * data.lag_sigma_s**2 + self.lag_s**2))
+        wide = np.array([lag_s, _UNKNOWN_SCALE, *[_UNKNOWN_TURN] * 3, *[_UNKNOWN_M] * 3])
+        rows, off = [np.diag(1.0 / wide)], [np.array([-self.lag_s / lag_s, *[0.0] * 7])]
         if data.level is not None:
             across = data.level.across @ self.sim.rotation.T
             level = np.zeros((len(across), 8))
             level[:, 2], level[:, 3] = across[:, 1], -across[:, 0]
-            rows.append(level / data.level.sigma_rad)
-            off.append(-across[:, 2] / data.level.sigma_rad)
+            rows.append(data.level.whitened(level))
+            off.append(data.level.whitened(-across[:, 2]))
         return np.vstack(rows), np.concatenate(off)
 
     def _speed(self, data: "_Data") -> FloatArray:

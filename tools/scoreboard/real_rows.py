@@ -334,19 +334,30 @@ REAL: tuple[Row, ...] = (
             ),
         ),
         figures=same(
-            *("flights", "placed", "answer", "inside_68", "inside_95", "answering_inside_95"),
-            *("random", "random_answer"),
+            *(
+                "flights",
+                "placed",
+                "answer",
+                "position_68",
+                "position_95",
+                "orientation_68",
+                "orientation_95",
+            ),
+            *("answering_position_95", "answering_orientation_95", "random", "random_answer"),
             *("shuffled", "shuffled_answer", "other", "other_answer"),
         ),
-        text="{placed:.1%} of {flights:.0f} placed, {answer:.1%} answer, {inside_68:.0%} and {inside_95:.1%} "
-        "inside 68 and 95 % bounds ({answering_inside_95:.1%} of those that answer); of {random:.0f} at "
-        "random {random_answer:.0f} answer, of {shuffled:.0f} shuffled {shuffled_answer:.0f}, of "
-        "{other:.0f} of other flights {other_answer:.0f}",
+        text="{placed:.1%} of {flights:.0f} placed, {answer:.1%} answer; inside 68 and 95 % bounds: position "
+        "{position_68:.0%} and {position_95:.1%}, orientation {orientation_68:.0%} and {orientation_95:.1%} "
+        "(of those that answer {answering_position_95:.1%} and {answering_orientation_95:.1%} inside 95 %); "
+        "of {random:.0f} at random {random_answer:.0f} answer, of {shuffled:.0f} shuffled "
+        "{shuffled_answer:.0f}, of {other:.0f} of other flights {other_answer:.0f}",
         limits=(
             Limit(figure="placed", least=0.95),
-            Limit(figure="inside_68", least=0.63, most=0.73),
-            Limit(figure="inside_95", least=0.92),
-            Limit(figure="answering_inside_95", least=0.95),
+            Limit(figure="position_68", least=0.63, most=0.73),
+            Limit(figure="position_95", least=0.92),
+            Limit(figure="orientation_68", least=0.63, most=0.73),
+            Limit(figure="orientation_95", least=0.92),
+            Limit(figure="answering_position_95", least=0.95),
             Limit(figure="random_answer", most=1),
             Limit(figure="shuffled_answer", most=0),
             Limit(figure="other_answer", most=0),

@@ -1,0 +1,140 @@
+"""How photos agree on a lens, and covariances of an estimate whose priors count more than they tell.
+
+An adjustment lets priors of lenses and positions count `dilution` times, as what a lens model leaves over is
+common to whole photos and makes any lens look certain. That is a choice of weights; how far its result may be
+off follows from the residuals and from the priors as they are (White 1982; Liang and Zeger 1986, photos as
+clusters).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.adjust.marginals import inverse_blocks
+from featuredb.geometry.arrays import FloatArray
+
+_LEAST_PHOTOS = 3  # that can disagree
+_USUAL = 5.0  # of real lenses: `python -m tools.lens_widths` prints it for sets of photos
+_SIZE = 8  # parameters of a whole lens
+_USUAL_PHOTOS = 4.0  # so many photos weigh as much as what is usual
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weighted:
+    """A linearised adjustment.
+
+    Attributes:
+        jacobian: (r, 3 n + q) sparse, of whitened residuals by points, poses and lenses.
+        residual: (r,) whitened.
+        points: n. inverse: (q, q) of the normal matrix, without them.
+        lenses: columns of each free lens among q; poses come before all of them.
+        of_priors: (d, q) dense, rows of priors that count `dilution` times, by poses and lenses.
+        dilution: at least 1.
+    """
+
+    jacobian: Any
+    residual: FloatArray
+    points: int
+    inverse: FloatArray
+    lenses: Sequence[slice]
+    of_priors: FloatArray
+    dilution: float
+
+
+def lens_disagreement(problem: Weighted) -> FloatArray:
+    """Variance of what all photos of a camera say of its lens together, over that of independent residuals.
+
+    Lenses of few photos are taken to be as others are.
+
+    Returns:
+        Of each free lens.
+    """
+    squares, freedom = lens_squares(problem)
+    known = np.isfinite(squares)
+    weight = _USUAL_PHOTOS * _SIZE
+    pooled = (weight * _USUAL + squares[known].sum()) / (weight + freedom[known].sum())
+    return np.asarray(np.where(known, (weight * pooled + squares) / (weight + freedom), pooled))
+
+
+def lens_squares(problem: Weighted) -> tuple[FloatArray, FloatArray]:
+    """How far the photos of each free lens differ in what they say of it.
+
+    Of the gradient by a lens, with points, poses and other lenses eliminated, each photo has a part; how far
+    these parts differ is compared with how far they would if residuals were independent.
+
+    Returns:
+        Sums of squares, NaN for lenses of fewer than three photos, and their degrees of freedom: what
+        independent residuals give.
+    """
+    start = 3 * problem.points
+    by_point = problem.jacobian[:, :start].tocsc()
+    by_shared = problem.jacobian[:, start:].tocsr()
+    inverse = inverse_blocks((by_point.T @ by_point).tocoo(), problem.points)
+    photo_of = _photo_of(by_shared[:, : _first_lens(problem)])
+    seen = np.diff(by_point.tocsr().indptr) > 0
+    squares, freedom = np.full(len(problem.lenses), np.nan), np.zeros(len(problem.lenses))
+    for row, columns in enumerate(problem.lenses):
+        moved = problem.inverse[:, columns] @ np.linalg.inv(problem.inverse[columns, columns])
+        mine = np.diff(by_shared[:, columns].tocsr().indptr) > 0
+        rows = np.flatnonzero(mine & ((photo_of >= 0) | seen))
+        if len(np.unique(photo_of[rows])) < _LEAST_PHOTOS:
+            continue
+        score = np.asarray(by_shared @ moved)
+        score -= by_point @ (inverse @ (by_point.T @ score))
+        squares[row], freedom[row] = _between(score[rows], problem.residual[rows], photo_of[rows])
+    return squares, freedom
+
+
+def honest(problem: Weighted, disagreement: FloatArray) -> FloatArray:
+    """(q, q) covariance of an estimate whose priors counted `dilution` times.
+
+    Args:
+        disagreement: of each free lens.
+    """
+    inverse = problem.inverse
+    spread = inverse @ problem.of_priors.T
+    covariance = inverse + (problem.dilution - 1.0) * (spread @ spread.T)
+    if problem.lenses:
+        lenses = slice(_first_lens(problem), len(inverse))
+        told = np.linalg.inv(inverse[lenses, lenses])
+        told -= problem.of_priors[:, lenses].T @ problem.of_priors[:, lenses]
+        sizes = [columns.stop - columns.start for columns in problem.lenses]
+        root = np.repeat(np.sqrt(disagreement), sizes)
+        more = told * np.outer(root, root) - told
+        covariance = covariance + inverse[:, lenses] @ more @ inverse[lenses]
+    return np.asarray(0.5 * (covariance + covariance.T))
+
+
+def _first_lens(problem: Weighted) -> int:
+    return problem.lenses[0].start if problem.lenses else len(problem.inverse)
+
+
+def _photo_of(by_pose: Any) -> NDArray[np.int64]:
+    """(r,) the free pose of each row, -1 for none."""
+    entries = by_pose.tocoo()
+    result = np.full(by_pose.shape[0], -1, dtype=np.int64)
+    result[entries.row] = entries.col // 6
+    return result
+
+
+def _between(score: FloatArray, residual: FloatArray, photo_of: NDArray[np.int64]) -> tuple[float, float]:
+    """Squares of the photos' gradients over those of independent residuals, and what they would be.
+
+    Args:
+        score: (r, p) derivatives. residual: (r,). photo_of: (r,).
+    """
+    number = np.unique(photo_of, return_inverse=True)[1].reshape(-1)
+    count, size = int(number.max()) + 1, score.shape[1]
+    gradient = np.stack([np.bincount(number, score[:, i] * residual, count) for i in range(size)], axis=1)
+    products = [
+        np.bincount(number, score[:, i] * score[:, j], count) for i in range(size) for j in range(size)
+    ]
+    parts = np.stack(products, axis=1).reshape(count, size, size)
+    inverse = np.linalg.inv(parts.sum(axis=0))
+    shares = parts @ inverse
+    freedom = np.trace(shares, axis1=1, axis2=2).sum() - np.einsum("kij,kji->", shares, shares)
+    scale = count  # a sum over photos, each of about a share 1 / count of what is known
+    return scale * float(np.einsum("ki,ij,kj->", gradient, inverse, gradient)), scale * float(freedom)
