@@ -36,7 +36,7 @@ def register(subparsers: Any) -> None:
         metavar="PATH",
         type=Path,
         help="folder of photos, searched through; or a table (.csv, .parquet, .jsonl) with the columns path "
-        "or id, lat, lon, accuracy, time, owner, licence, title",
+        "or id, lat, lon, accuracy, time, owner, licence, title; or OpenDroneMap's geo.txt",
     )
     _add_selection(photos)
     _add_making(photos)

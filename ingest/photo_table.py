@@ -12,7 +12,8 @@ Columns (all optional but the first two, of which one must be there):
 | time    | ISO 8601, or as EXIF writes it |
 | owner, licence, title | attribution |
 
-Unknown columns are ignored and named. A row that cannot be read costs that row only.
+Unknown columns are ignored and named. A row that cannot be read costs that row only. `geo.txt` of
+OpenDroneMap is such a table, too (`ingest.geo_txt`).
 """
 
 import csv
@@ -25,6 +26,8 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.errors import IngestError
+from ingest.geo_txt import COLUMNS as GEO_TXT_COLUMNS
+from ingest.geo_txt import read_geo_txt
 
 COLUMNS = (
     "path",
@@ -39,6 +42,7 @@ COLUMNS = (
     "licence",
     "title",
 )
+GEO_TXT = "geo.txt"
 TABLE_SUFFIXES = (".csv", ".tsv", ".parquet", ".jsonl", ".ndjson")
 _ALIASES = {
     **{"latitude": "lat", "longitude": "lon", "lng": "lon", "license": "licence"},
@@ -100,7 +104,7 @@ class PhotoTable:
 
 def is_table(path: Path) -> bool:
     """Whether the path is a file that `read_table` knows by its name."""
-    return path.suffix.lower() in TABLE_SUFFIXES and path.is_file()
+    return (path.suffix.lower() in TABLE_SUFFIXES or path.name.lower() == GEO_TXT) and path.is_file()
 
 
 def read_table(path: Path) -> PhotoTable:
@@ -148,6 +152,8 @@ def _records(path: Path) -> tuple[list[str], _Records]:
         table = pq.read_table(path)
         return list(table.column_names), enumerate(table.to_pylist(), start=1)
     text = path.read_text(encoding="utf-8-sig")
+    if path.name.lower() == GEO_TXT:
+        return list(GEO_TXT_COLUMNS), iter(read_geo_txt(text))
     return _json_lines(text) if suffix in (".jsonl", ".ndjson") else _separated(text)
 
 

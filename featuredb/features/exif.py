@@ -13,6 +13,7 @@ from featuredb.features.exif_gps import (
     DEFAULT_SIGMA_HORIZONTAL_M,
     DEFAULT_SIGMA_VERTICAL_M,
     AltitudeReference,
+    finer_position,
     gps_altitude,
     gps_position,
     gps_sigmas,
@@ -33,7 +34,7 @@ _MAX_WARNINGS = 20
 
 _DJI_NAMES = (
     "RelativeAltitude|AbsoluteAltitude|GimbalYawDegree|GimbalPitchDegree|GimbalRollDegree"
-    "|RtkFlag|RtkStdLat|RtkStdLon|RtkStdHgt"
+    "|RtkFlag|RtkStdLat|RtkStdLon|RtkStdHgt|GpsLatitude|GpsLongitude|GpsLongtitude"
 )
 _PIX4D_NAMES = "GPSXYAccuracy|GPSZAccuracy"  # of Pix4D's namespace, which Parrot, senseFly and others write
 _XMP_VALUE = re.compile(
@@ -120,7 +121,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
     """
     main, exif, gps, warnings = _directories(tiff)
     values = _xmp_values(xmp)
-    position = gps_position(gps, warnings)
+    position = finer_position(gps_position(gps, warnings), values)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
     sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
     return ExifInfo(

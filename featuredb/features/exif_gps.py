@@ -18,6 +18,7 @@ RANGE_ERROR_M = 3.0
 # Radius of 68 % of a circular normal distribution, in units of the deviation of one axis.
 _RADIUS_68 = math.sqrt(-2.0 * math.log(1.0 - 0.68))
 _SIGMA_RANGE_M = (0.005, 1000.0)
+_SAME_DEG = 2e-5  # 2 m: EXIF's whole tenths of seconds
 _DJI_RTK_FLOAT_OR_FIXED = (34.0, 50.0)
 
 
@@ -49,6 +50,16 @@ def gps_position(gps: Ifd, warnings: list[str]) -> tuple[float, float] | None:
         warnings.append("EXIF GPS: position 0, 0 is a receiver without a fix; not used")
         return None
     return latitude, longitude
+
+
+def finer_position(position: tuple[float, float] | None, xmp: dict[str, float]) -> tuple[float, float] | None:
+    """The position of DJI's XMP where it is EXIF's own: EXIF's seconds may have two decimals, 0.3 m."""
+    latitude = xmp.get("GpsLatitude")
+    longitude = xmp.get("GpsLongitude", xmp.get("GpsLongtitude"))  # so some firmware spells it
+    if position is None or latitude is None or longitude is None:
+        return position
+    same = abs(latitude - position[0]) < _SAME_DEG and abs(longitude - position[1]) < _SAME_DEG
+    return (latitude, longitude) if same else position
 
 
 def _angle(gps: Ifd, tag: int, ref_tag: int, signs: str, limit: float, warnings: list[str]) -> float | None:

@@ -236,6 +236,15 @@ def test_dji_single_point_solution_is_not_rtk() -> None:
     assert found.sigma_source == "default"
 
 
+@pytest.mark.parametrize("longitude", ["GpsLongitude", "GpsLongtitude"])
+def test_a_position_in_xmp_is_finer_than_one_of_cut_off_seconds(longitude: str) -> None:
+    xmp = f'<x drone-dji:GpsLatitude="+46.8426071" drone-dji:{longitude}="-91.9945599"/>'.encode()
+    found = info(None, None, gps_tags(t2=(46.0, 50.0, 33.4), t4=(91.0, 59.0, 40.4)), xmp=xmp)
+    assert (found.latitude_deg, found.longitude_deg) == (46.8426071, -91.9945599)
+    elsewhere = info(None, None, gps_tags(), xmp=xmp.replace(b"46.84", b"46.94"))
+    assert elsewhere.latitude_deg == pytest.approx(46.8426071, abs=1e-6)
+
+
 def test_accuracies_as_pix4d_names_them() -> None:
     xmp = b'<x Camera:GPSXYAccuracy="0.021"><Camera:GPSZAccuracy>0.04</Camera:GPSZAccuracy></x>'
     found = info(None, None, gps_tags(), xmp=xmp)
