@@ -295,7 +295,7 @@ def _quarantine_note(quarantined: Mapping[str, str]) -> tuple[str, ...]:
         way = "--trust-geotags believes the geotags" if reason == HINTS else "; ".join(WAYS_TO_A_PLACE)
         notes.append(
             f"{len(ids)} maps ({', '.join(ids[:3])}{', ...' if len(ids) > 3 else ''}) stay in quarantine: "
-            f"{reason}. They answer no queries until something better confirms them: {way}."
+            f"{reason}. They answer only queries that name them, until something better confirms them: {way}."
         )
     return tuple(notes[:_MOST_NOTES])
 
