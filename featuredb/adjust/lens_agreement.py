@@ -72,16 +72,17 @@ def lens_squares(problem: Weighted) -> tuple[FloatArray, FloatArray]:
     start = 3 * problem.points
     by_point = problem.jacobian[:, :start].tocsc()
     by_shared = problem.jacobian[:, start:].tocsr()
+    by_column = by_shared.tocsc()
     inverse = inverse_blocks((by_point.T @ by_point).tocoo(), problem.points)
     photo_of = _photo_of(by_shared[:, : _first_lens(problem)])
     seen = np.diff(by_point.tocsr().indptr) > 0
     squares, freedom = np.full(len(problem.lenses), np.nan), np.zeros(len(problem.lenses))
     for row, columns in enumerate(problem.lenses):
-        moved = problem.inverse[:, columns] @ np.linalg.inv(problem.inverse[columns, columns])
-        mine = np.diff(by_shared[:, columns].tocsr().indptr) > 0
-        rows = np.flatnonzero(mine & ((photo_of >= 0) | seen))
+        rows = np.unique(by_column[:, columns].indices)
+        rows = rows[(photo_of[rows] >= 0) | seen[rows]]
         if len(np.unique(photo_of[rows])) < _LEAST_PHOTOS:
             continue
+        moved = problem.inverse[:, columns] @ np.linalg.inv(problem.inverse[columns, columns])
         score = np.asarray(by_shared @ moved)
         score -= by_point @ (inverse @ (by_point.T @ score))
         squares[row], freedom[row] = _between(score[rows], problem.residual[rows], photo_of[rows])
