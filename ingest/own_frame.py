@@ -24,7 +24,6 @@ _UPRIGHT_SIGMA_RAD = np.radians(2.0)
 _ROBUST_ROUNDS = 5
 _ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
 _COMMON_ROLL_RAD = np.radians(1.5)  # of all photos by one gimbal or hand
-_MOST_ALIKE = 0.95  # correlation of neighbours
 _KEPT_SIGMAS = 3.0  # photos that were held askew do not tell the vertical
 
 
@@ -63,21 +62,17 @@ def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
 def level_of(poses: Sequence[Rigid3]) -> Level | None:
     """How photos are held, for a placement: None where most of them are not held level.
 
-    A gimbal that is off stays off for a strip or more, and neighbours say less than their number: with the
-    correlation of the photos in their order (`brighton`: 1.4 degrees to one side over twelve photos, then
-    1.7 to the other) as much less as in a process of first order.
-    """
+    A gimbal that is off stays off, for a strip or for all: `brighton` is 1.4 degrees to one side over twelve
+    A gimbal that is off stays off, for a strip or for all: `brighton` is 1.4 degrees to one side over
+    twelve photos, then 1.7 to the other. So what photos have in common does not average out, wherever they
+    look.
     found = _held_level(poses)
     if found is None or found[1] > _ASKEW_RAD:
         return None
-    kept, sigma, up, _ = found
-    across = np.array([pose.rotation[0] for pose in poses])[kept]
-    roll = across @ up
-    alike = float(np.clip((roll[1:] @ roll[:-1]) / max(float(roll @ roll), 1e-12), 0.0, _MOST_ALIKE))
+    kept, sigma, _, _ = found
     return Level(
-        across=across,
-        sigma_rad=sigma * float(np.sqrt((1.0 + alike) / (1.0 - alike))),
-        common_rad=_COMMON_ROLL_RAD,
+        across=np.array([pose.rotation[0] for pose in poses])[kept],
+        sigma_rad=float(np.sqrt(sigma**2 + kept.sum() * _COMMON_ROLL_RAD**2)),
         down=_down(poses)[kept].mean(axis=0),
     )
 

@@ -66,20 +66,13 @@ class Level:
 
     Attributes:
         across: (k, 3) those axes in the reconstruction's frame.
-        sigma_rad: how far one is off the level. common_rad: what all are off to one side, by one gimbal or
-            hand; seen from where they look, so that flights to and fro do not tilt by it.
+        sigma_rad: how far one is off the level, with what all have in common.
         down: (3,) about downwards.
     """
 
     across: FloatArray
     sigma_rad: float
-    common_rad: float
     down: FloatArray
-
-    def whitened(self, rows: FloatArray) -> FloatArray:
-        """(k, ...) by photo, over the root of their covariance."""
-        common = 1.0 - self.sigma_rad / np.sqrt(self.sigma_rad**2 + len(rows) * self.common_rad**2)
-        return np.asarray((rows - common * rows.mean(axis=0)) / self.sigma_rad)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -158,8 +151,8 @@ class _State:
             across = data.level.across @ self.sim.rotation.T
             level = np.zeros((len(across), 8))
             level[:, 2], level[:, 3] = across[:, 1], -across[:, 0]
-            rows.append(data.level.whitened(level))
-            off.append(data.level.whitened(-across[:, 2]))
+            rows.append(level / data.level.sigma_rad)
+            off.append(-across[:, 2] / data.level.sigma_rad)
         return np.vstack(rows), np.concatenate(off)
 
     def _speed(self, data: "_Data") -> FloatArray:
