@@ -62,10 +62,9 @@ def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
 def level_of(poses: Sequence[Rigid3]) -> Level | None:
     """How photos are held, for a placement: None where most of them are not held level.
 
-    A gimbal that is off stays off, for a strip or for all: `brighton` is 1.4 degrees to one side over twelve
     A gimbal that is off stays off, for a strip or for all: `brighton` is 1.4 degrees to one side over
-    twelve photos, then 1.7 to the other. So what photos have in common does not average out, wherever they
-    look.
+    twelve photos, then 1.7 to the other. What photos have in common does not average out, wherever they look.
+    """
     found = _held_level(poses)
     if found is None or found[1] > _ASKEW_RAD:
         return None
