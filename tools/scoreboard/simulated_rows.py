@@ -272,7 +272,7 @@ SIMULATED: tuple[Row, ...] = (
     ),
     _growth(
         *("growth-walk", "a walk of 270 m from one anchor by contributed photos alone: the bound is true"),
-        *(("tools.growth_walk", "--size", "short", "--budget", "2.0"), "walk", 25),
+        *(("tools.growth_walk", "--size", "short"), "walk", 25),
     ),
     Row(
         name="studies",
