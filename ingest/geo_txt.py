@@ -2,7 +2,7 @@
 
 The first line names the system (`featuredb.geo.projected`). Then a line a photo: name, x (or longitude), y
 (or latitude), and as far as they are known z, yaw, pitch, roll, horizontal and vertical accuracy, all in the
-units of the system. See https://docs.opendronemap.org/geo/.
+units of the system. Angles are read over, heights are taken as those of any table. See https://docs.opendronemap.org/geo/.
 """
 
 from collections.abc import Mapping

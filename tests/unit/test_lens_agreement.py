@@ -11,6 +11,7 @@ from featuredb.adjust.lens_agreement import Weighted, lens_disagreement
 from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import CenterPriors, LensWidths, Terms, lens_prior
+from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 
@@ -97,22 +98,23 @@ def test_covariances_are_of_the_noise_whatever_the_priors_count() -> None:
     assert np.mean(by_weights, axis=0)[0] > 2.0 * pose
 
 
-def disagreement(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> float:
-    values = []
+def disagreements(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Of each lens."""
+    values: list[FloatArray] = []
 
-    def kept(weighted: Weighted) -> object:
+    def kept(weighted: Weighted) -> FloatArray:
         values.append(lens_disagreement(weighted))
         return values[-1]
 
     monkeypatch.setattr(adjust, "lens_disagreement", kept)
     problem.honest_marginals()
-    return float(values[0][0])
+    return [float(value) for value in values[0]]
 
 
 def test_photos_whose_lens_differs_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
     """A distortion that changes from photo to photo, by a pixel or two in the corners."""
     none, some, much = (
-        disagreement(solved(drawn(3, wrong), 3, 50.0), monkeypatch) for wrong in (0.0, 0.01, 0.03)
+        disagreements(solved(drawn(3, wrong), 3, 50.0), monkeypatch)[0] for wrong in (0.0, 0.01, 0.03)
     )
     assert none < 1.5
     assert 1.5 * none < some < much / 1.5
@@ -126,12 +128,5 @@ def test_a_lens_of_two_photos_is_as_others_are(monkeypatch: pytest.MonkeyPatch) 
     problem = Problem(
         alone, Terms(keypoint_px=NOISE_PX, dilution=50.0, lenses=(prior, prior), held_photos=(0, 3))
     )
-    values = []
-
-    def kept(weighted: Weighted) -> object:
-        values.append(lens_disagreement(weighted))
-        return values[-1]
-
-    monkeypatch.setattr(adjust, "lens_disagreement", kept)
-    problem.honest_marginals()
-    assert values[0][1] > values[0][0]
+    many, two = disagreements(problem, monkeypatch)
+    assert two > many

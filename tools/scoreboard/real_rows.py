@@ -358,6 +358,7 @@ REAL: tuple[Row, ...] = (
             Limit(figure="orientation_68", least=0.63, most=0.73),
             Limit(figure="orientation_95", least=0.92),
             Limit(figure="answering_position_95", least=0.95),
+            Limit(figure="answering_orientation_95", least=0.95),
             Limit(figure="random_answer", most=1),
             Limit(figure="shuffled_answer", most=0),
             Limit(figure="other_answer", most=0),
