@@ -227,7 +227,8 @@ XMP = b"""<x:xmpmeta><rdf:Description drone-dji:RelativeAltitude="+39.80" drone-
 
 def test_dji_values_as_attributes_and_elements() -> None:
     found = info(None, None, gps_tags(), xmp=XMP)
-    assert (found.relative_altitude_m, found.gimbal_yaw_deg, found.gimbal_pitch_deg) == (39.8, -45.0, -89.9)
+    assert found.angles is not None
+    assert (found.relative_altitude_m, found.angles.yaw_deg, found.angles.pitch_deg) == (39.8, -45.0, -89.9)
     assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.015, 0.03, "rtk")
 
 
