@@ -24,10 +24,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from featuredb.errors import IngestError
-from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
+from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG, MOST_PITCH_DEG
 from featuredb.geometry.camera_angles import CameraAngles
 from ingest.geo_txt import COLUMNS as GEO_TXT_COLUMNS
 from ingest.geo_txt import read_geo_txt
@@ -265,19 +265,19 @@ def _accuracy(record: Mapping[str, Any], name: str, warnings: list[str]) -> floa
 
 def _angles(record: Mapping[str, Any], warnings: list[str]) -> CameraAngles | None:
     """None where neither yaw nor pitch is told, and where all are zero, as tables write that nobody knows."""
-    if "angles" in record:
-        told = record["angles"]
-        return told if isinstance(told, CameraAngles) else None
+    if isinstance(record.get("angles"), CameraAngles):  # of geo.txt
+        return cast(CameraAngles, record["angles"])
     yaw, pitch, roll = (_number(record, name, warnings) for name in ("yaw", "pitch", "roll"))
-    if any(angle is not None and abs(angle) > 360.0 for angle in (yaw, pitch, roll)):
+    told = (yaw or 0.0, pitch or 0.0, roll or 0.0)
+    if abs(told[0]) > 360.0 or abs(told[1]) > MOST_PITCH_DEG or abs(told[2]) > 360.0:
         warnings.append(f"table: {yaw}, {pitch}, {roll} are no angles in degrees; they are left out")
         return None
-    if (yaw is None and pitch is None) or not (yaw or pitch or roll):
+    if (yaw is None and pitch is None) or not any(told):
         return None
     return CameraAngles(
         yaw_deg=yaw,
         pitch_deg=pitch,
-        roll_deg=roll or 0.0,
+        roll_deg=told[2],
         sigma_yaw_deg=DEFAULT_SIGMA_YAW_DEG,
         sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
     )

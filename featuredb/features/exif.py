@@ -131,6 +131,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
     values = _xmp_values(xmp)
     position = finer_position(gps_position(gps, warnings), values)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
+    orientation = _orientation(main, warnings)
     sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
     return ExifInfo(
         width=width,
@@ -138,7 +139,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         make=main.text(271)[:_MAX_TEXT],
         model=main.text(272)[:_MAX_TEXT],
         serial=exif.text(42033)[:_MAX_TEXT],
-        orientation=_orientation(main, warnings),
+        orientation=orientation,
         focal_px=_focal_px(exif, width, height, warnings),
         capture_time=_capture_time(main, exif, warnings),
         gps_time=gps_time(gps, warnings),
@@ -151,7 +152,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         sigma_source=source,
         relative_altitude_m=values.get("RelativeAltitude"),
         absolute_altitude_m=values.get("AbsoluteAltitude"),
-        angles=camera_angles(gps, values, main.text(271), warnings),
+        angles=camera_angles(gps, values, main.text(271), orientation, warnings),
         artist=main.text(315)[:_MAX_TEXT],
         copyright=main.text(33432)[:_MAX_TEXT],
         warnings=tuple(warnings[:_MAX_WARNINGS]),

@@ -9,6 +9,7 @@ from featuredb.geometry.camera_angles import CameraAngles
 # photo and 1.5 of a strip, of yaw 1.8 and 2.2, widened for other compasses.
 DEFAULT_SIGMA_YAW_DEG, DEFAULT_SIGMA_TILT_DEG = 4.0, 2.0
 _COMPASS_SIGMA_DEG = 20.0  # of a phone, magnetic north among it; chosen
+MOST_PITCH_DEG = 95.0  # straight up or down, and what gimbals overshoot
 _LEAST_SIGMA_DEG = 0.05
 XMP_ANGLES = {  # namespace: names, whose angles are the camera's, not the aircraft's
     "drone-dji": ("GimbalYawDegree", "GimbalPitchDegree", "GimbalRollDegree"),
@@ -17,16 +18,20 @@ XMP_ANGLES = {  # namespace: names, whose angles are the camera's, not the aircr
 }
 
 
-def camera_angles(gps: Ifd, xmp: Mapping[str, float], make: str, warnings: list[str]) -> CameraAngles | None:
+def camera_angles(
+    gps: Ifd, xmp: Mapping[str, float], make: str, orientation: int, warnings: list[str]
+) -> CameraAngles | None:
     """By gimbal, by IMU, by compass, whichever comes first; None where the photo does not say.
 
-    All angles zero are how a camera writes that it knows none.
+    All angles zero are how a camera writes that it knows none. Of a photo that is stored turned
+    (`orientation`) only the compass counts: whether angles are those of the turned picture is not known.
     """
+    xmp = xmp if orientation == 1 else {}
     for space in ("drone-dji", "drone-parrot"):
         yaw, pitch, roll = (xmp.get(name) for name in XMP_ANGLES[space])
         if pitch is None or (not yaw and not pitch and not roll):
             continue
-        if abs(pitch) > 180.0:
+        if abs(pitch) > MOST_PITCH_DEG:
             warnings.append(f"XMP: a camera's pitch of {pitch} degrees is absurd")
             continue
         return CameraAngles(

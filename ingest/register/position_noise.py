@@ -277,7 +277,7 @@ def fit_noisy(
     checked = covariance[2:5, 2:5]
     if held is not None and not held.told:
         free = _at(replace(data, held=None), state, weights)
-        checked = _solution(free, modes[0])[1][2:5, 2:5]
+        checked = _integrated(free, modes, stated)[1][2:5, 2:5]
     state, theta = state.moved(step), modes[0]
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(

@@ -367,6 +367,53 @@ REAL: tuple[Row, ...] = (
         minutes=30,
     ),
     Row(
+        name="strip-draws",
+        group="real",
+        form="full",
+        claim="single strips of photos, nine of `brighton` and simulated ones, placed by positions with the "
+        "cameras' angles and without",
+        commands=(
+            ("tools.scan_poses", SCAN, BRIGHTON, "--poses", "{cache}/brighton_poses.json"),
+            (
+                *("tools.strip_draws", "--poses", "{cache}/brighton_poses.json", "--photos", BRIGHTON),
+                *("--draws", "300", *OUT),
+            ),
+        ),
+        figures=same(
+            *(
+                f"{kind}_{name}"
+                for kind in ("real", "simulated")
+                for name in (
+                    *("strips", "answer", "turn_deg", "without_placed", "without_answer", "without_turn_deg"),
+                    *("position_68", "position_95", "orientation_68", "orientation_95"),
+                    *("without_position_95", "without_orientation_95"),
+                )
+            )
+        ),
+        text="; ".join(
+            f"{{{kind}_strips:.0f}} {kind}: with angles {{{kind}_answer:.0%}} answer, turn "
+            f"{{{kind}_turn_deg:.1f}} degrees, inside 68 and 95 % bounds position "
+            f"{{{kind}_position_68:.0%}} and {{{kind}_position_95:.1%}}, orientation "
+            f"{{{kind}_orientation_68:.0%}} and {{{kind}_orientation_95:.1%}}; without {{{kind}_without_answer:.0%}} answer, turn "
+            f"{{{kind}_without_turn_deg:.1f}} degrees, inside 95 % {{{kind}_without_position_95:.1%}} and "
+            f"{{{kind}_without_orientation_95:.1%}}"
+            for kind in ("real", "simulated")
+        ),
+        limits=(
+            Limit(figure="real_answer", least=1),
+            Limit(figure="real_without_answer", most=0),
+            Limit(figure="simulated_answer", least=0.85),
+            Limit(figure="simulated_without_answer", most=0.05),
+            *(
+                Limit(figure=f"{kind}_{part}_95", least=0.92)
+                for kind in ("real", "simulated")
+                for part in ("position", "orientation", "without_position", "without_orientation")
+            ),
+        ),
+        needs=("brighton",),
+        minutes=5,
+    ),
+    Row(
         name="copr-control-points",
         group="real",
         form="full",
