@@ -394,8 +394,8 @@ REAL: tuple[Row, ...] = (
             f"{{{kind}_strips:.0f}} {kind}: with angles {{{kind}_answer:.0%}} answer, turn "
             f"{{{kind}_turn_deg:.1f}} degrees, inside 68 and 95 % bounds position "
             f"{{{kind}_position_68:.0%}} and {{{kind}_position_95:.1%}}, orientation "
-            f"{{{kind}_orientation_68:.0%}} and {{{kind}_orientation_95:.1%}}; without {{{kind}_without_answer:.0%}} answer, turn "
-            f"{{{kind}_without_turn_deg:.1f}} degrees, inside 95 % {{{kind}_without_position_95:.1%}} and "
+            f"{{{kind}_orientation_68:.0%}} and {{{kind}_orientation_95:.1%}}; without "
+            f"{{{kind}_without_answer:.0%}} answer, turn {{{kind}_without_turn_deg:.1f}} degrees, inside 95 % {{{kind}_without_position_95:.1%}} and "
             f"{{{kind}_without_orientation_95:.1%}}"
             for kind in ("real", "simulated")
         ),
