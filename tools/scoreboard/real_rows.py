@@ -86,6 +86,14 @@ def _laser(name: str, photos: int, form: Form) -> Row:
     )
 
 
+_STRIPS = (
+    "{KIND_strips:.0f} KIND: with angles {KIND_answer:.0%} answer, turn {KIND_turn_deg:.1f} degrees, inside 68 "
+    "and 95 % bounds position {KIND_position_68:.0%} and {KIND_position_95:.1%}, orientation "
+    "{KIND_orientation_68:.0%} and {KIND_orientation_95:.1%}; without {KIND_without_answer:.0%} answer, turn "
+    "{KIND_without_turn_deg:.1f} degrees, inside 95 % {KIND_without_position_95:.1%} and "
+    "{KIND_without_orientation_95:.1%}"
+)
+
 REAL: tuple[Row, ...] = (
     Row(
         name="brighton-held-out",
@@ -390,15 +398,7 @@ REAL: tuple[Row, ...] = (
                 )
             )
         ),
-        text="; ".join(
-            f"{{{kind}_strips:.0f}} {kind}: with angles {{{kind}_answer:.0%}} answer, turn "
-            f"{{{kind}_turn_deg:.1f}} degrees, inside 68 and 95 % bounds position "
-            f"{{{kind}_position_68:.0%}} and {{{kind}_position_95:.1%}}, orientation "
-            f"{{{kind}_orientation_68:.0%}} and {{{kind}_orientation_95:.1%}}; without "
-            f"{{{kind}_without_answer:.0%}} answer, turn {{{kind}_without_turn_deg:.1f}} degrees, inside 95 % {{{kind}_without_position_95:.1%}} and "
-            f"{{{kind}_without_orientation_95:.1%}}"
-            for kind in ("real", "simulated")
-        ),
+        text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
         limits=(
             Limit(figure="real_answer", least=1),
             Limit(figure="real_without_answer", most=0),
