@@ -87,8 +87,8 @@ def _laser(name: str, photos: int, form: Form) -> Row:
 
 
 _STRIPS = (
-    "{KIND_strips:.0f} KIND: with angles {KIND_answer:.0%} answer, turn {KIND_turn_deg:.1f} degrees, inside 68 "
-    "and 95 % bounds position {KIND_position_68:.0%} and {KIND_position_95:.1%}, orientation "
+    "{KIND_strips:.0f} KIND: with angles {KIND_answer:.0%} answer, turn {KIND_turn_deg:.1f} degrees, inside "
+    "68 and 95 % bounds position {KIND_position_68:.0%} and {KIND_position_95:.1%}, orientation "
     "{KIND_orientation_68:.0%} and {KIND_orientation_95:.1%}; without {KIND_without_answer:.0%} answer, turn "
     "{KIND_without_turn_deg:.1f} degrees, inside 95 % {KIND_without_position_95:.1%} and "
     "{KIND_without_orientation_95:.1%}"
