@@ -22,12 +22,11 @@ from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import NOISE_SHARE, Held, NoisyFit, fit_noisy, stated_sigma
+from ingest.register.position_noise import ANGLES_WRONG, NOISE_SHARE, Held, NoisyFit, fit_noisy, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
 _LEAST_PHOTOS = 3  # fix a similarity
-_CONTRADICTS = 4.0  # standard deviations at the median photo
 _PLAIN_M = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 
 
@@ -131,7 +130,7 @@ def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
         if rows.any():
             result |= {
                 f"{name}_off_deg": float(np.degrees(np.median(off[rows]))),
-                f"{name}_contradicts": bool(np.median(off[rows] / held.sigma_rad[rows]) > _CONTRADICTS),
+                f"{name}_contradicts": bool(np.median(off[rows] / held.sigma_rad[rows]) > ANGLES_WRONG),
             }
     return result
 

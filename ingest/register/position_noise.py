@@ -38,6 +38,7 @@ _RANGE = 7.0  # of logarithms: a thousand times more or less
 _LEAST_PHOTOS = 3
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
+ANGLES_WRONG = 4.0  # standard deviations
 _MOST_LAG_S = 1.0  # standard deviation of a lag
 _STEADY_S = 20.0
 _MOST_POSITIONS = 400  # more are thinned out evenly in time
@@ -180,9 +181,8 @@ class _State:
         rows, off = [np.diag(1.0 / wide)], [np.array([-self.lag_s / lag_s, *[0.0] * 7])]
         if data.held is not None:
             square, slope, angle = data.held.terms(self.sim.rotation)
-            # Gimbals and compasses err like Student's t of three degrees of freedom.
-            tail = np.sqrt(0.25 * (3.0 + (angle / data.held.sigma_rad) ** 2))
-            joint = data.held.joint_rad * np.maximum(tail, 1.0)
+            # Beyond some deviations angles are wrong altogether, and pull the less the further off they are.
+            joint = data.held.joint_rad * np.maximum(angle / (ANGLES_WRONG * data.held.sigma_rad), 1.0)
             rows.append(np.pad(slope / joint[:, None], ((0, 0), (2, 3))))
             off.append(-square / joint)
         return np.vstack(rows), np.concatenate(off)
