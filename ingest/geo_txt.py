@@ -2,16 +2,20 @@
 
 The first line names the system (`featuredb.geo.projected`). Then a line a photo: name, x (or longitude), y
 (or latitude), and as far as they are known z, yaw, pitch, roll, horizontal and vertical accuracy, all in the
-units of the system. Angles are read over, heights are taken as those of any table. See https://docs.opendronemap.org/geo/.
+units of the system. Angles are in degrees as OpenDroneMap counts them: yaw clockwise from true north, pitch
+0 looks straight down and 90 ahead, roll to the right; all zero where nobody knows them. Heights are taken as
+those of any table. See https://docs.opendronemap.org/geo/.
 """
 
 from collections.abc import Mapping
 from typing import Any
 
 from featuredb.errors import GeodesyError
+from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
 from featuredb.geo.projected import SurveyCrs, geodetic_from_survey, survey_crs
+from featuredb.geometry.camera_angles import CameraAngles
 
-COLUMNS = ("path", "lat", "lon", "height", "accuracy", "accuracy_height")
+COLUMNS = ("path", "lat", "lon", "height", "accuracy", "accuracy_height", "yaw", "pitch", "roll")
 _VALUES = ("x", "y", "height", "yaw", "pitch", "roll", "accuracy", "accuracy_height")
 _NONE = -9999.0  # how OpenDroneMap writes a height that nobody knows
 
@@ -55,9 +59,19 @@ def _row(line: str, crs: SurveyCrs) -> Mapping[str, Any] | str:
         "lat": latitude,
         "lon": longitude,
         "height": height if known else None,
+        "angles": _angles([values.get(key, 0.0) for key in ("yaw", "pitch", "roll")]),
         **{
             key: values[key] * crs.height_unit_m
             for key in ("accuracy", "accuracy_height")
             if values.get(key, 0.0) > 0.0
         },
     }
+
+
+def _angles(ypr_deg: list[float]) -> CameraAngles | None:
+    if not any(ypr_deg) or not all(abs(angle) <= 360.0 for angle in ypr_deg):
+        return None
+    yaw, pitch, roll = ypr_deg
+    return CameraAngles.of_body(
+        yaw, pitch, roll, sigma_yaw_deg=DEFAULT_SIGMA_YAW_DEG, sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG
+    )

@@ -1,16 +1,18 @@
 """The frame of a map without a place: a size that people expect, and up where the photos show it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap_bridge import Model
-from ingest.register.position_noise import Level
+from ingest.register.position_noise import Held
 
 # What gives a map without a place its place; for people.
 WAYS_TO_A_PLACE = (
@@ -24,6 +26,8 @@ _UPRIGHT_SIGMA_RAD = np.radians(2.0)
 _ROBUST_ROUNDS = 5
 _ASKEW_RAD = np.radians(15.0)  # of one photo: then they are not held level
 _COMMON_ROLL_RAD = np.radians(1.5)  # of all photos by one gimbal or hand
+_COMMON_SHARE = 0.6  # of the variance of angles that photos tell: 1.5 of 2 degrees, squared; `brighton` again
+_LEAST_TOLD = 3
 _KEPT_SIGMAS = 3.0  # photos that were held askew do not tell the vertical
 
 
@@ -59,20 +63,101 @@ def vertical_of(poses: Sequence[Rigid3]) -> FloatArray | None:
     return np.asarray(up if float((_down(poses)[kept] @ up).mean()) < 0 else -up)
 
 
-def level_of(poses: Sequence[Rigid3]) -> Level | None:
-    """How photos are held, for a placement: None where most of them are not held level.
+def held_of(poses: Sequence[Rigid3], angles: Sequence[CameraAngles | None] = ()) -> Held | None:
+    """How photos are held, for a placement; None where nothing tells.
 
-    A gimbal that is off stays off, for a strip or for all: `brighton` is 1.4 degrees to one side over
-    twelve photos, then 1.7 to the other. What photos have in common does not average out, wherever they look.
+    Tilts that photos tell come first; where less than three do, photos are taken to be held level, unless
+    most of them are not. What photos have in common does not average out, wherever they look: a gimbal that
+    is off stays off, for a strip or for all. `brighton` is 1.4 degrees to one side over twelve photos, then
+    1.7 to the other.
+
+    Args:
+        angles: of each photo, or none at all.
     """
+    told = [(pose.rotation, one) for pose, one in zip(poses, angles, strict=False) if one is not None]
+    tilted = [(turn, one) for turn, one in told if one.pitch_deg is not None]
+    parts = [part for part in (_by_yaw(told), _by_tilt(tilted) or _level(poses)) if part is not None]
+    if not parts:
+        return None
+    last = parts[-1]
+    return replace(
+        last,
+        directions=np.concatenate([part.directions for part in parts]),
+        across=np.concatenate([part.across for part in parts]),
+        along=np.concatenate([part.along for part in parts]),
+        sigma_rad=np.concatenate([part.sigma_rad for part in parts]),
+        joint_rad=np.concatenate([part.joint_rad for part in parts]),
+    )
+
+
+def _by_tilt(photos: Sequence[tuple[FloatArray, CameraAngles]]) -> Held | None:
+    """Where photos say that up is."""
+    if len(photos) < _LEAST_TOLD:
+        return None
+    up = np.array(
+        [turn.T @ cam_from_enu(0.0, told.pitch_deg or 0.0, told.roll_deg)[:, 2] for turn, told in photos]
+    )
+    sigma = np.radians([told.sigma_tilt_deg for _, told in photos])
+    return Held(
+        directions=np.repeat(up, 2, axis=0),
+        across=np.tile(np.eye(3)[:2], (len(up), 1)),
+        along=np.tile(np.eye(3)[2], (2 * len(up), 1)),
+        sigma_rad=np.repeat(sigma, 2),
+        joint_rad=np.repeat(_joint(sigma), 2),
+        down=-up.mean(axis=0),
+        told=True,
+    )
+
+
+def _by_yaw(photos: Sequence[tuple[FloatArray, CameraAngles]]) -> Held | None:
+    """Where photos say that north is; by the optical axis, where only that one's is told."""
+    directions, across, along, sigma = [], [], [], []
+    for turn, told in photos:
+        if told.yaw_deg is None:
+            continue
+        if told.pitch_deg is None:
+            yaw = np.radians(told.yaw_deg)
+            directions.append(turn[2])
+            along.append([np.sin(yaw), np.cos(yaw), 0.0])
+            across.append([np.cos(yaw), -np.sin(yaw), 0.0])
+        else:
+            directions.append(turn.T @ cam_from_enu(told.yaw_deg, told.pitch_deg, told.roll_deg)[:, 1])
+            along.append([0.0, 1.0, 0.0])
+            across.append([1.0, 0.0, 0.0])
+        sigma.append(np.radians(told.sigma_yaw_deg))
+    if len(sigma) < _LEAST_TOLD:
+        return None
+    return Held(
+        directions=np.array(directions),
+        across=np.array(across),
+        along=np.array(along),
+        sigma_rad=np.array(sigma),
+        joint_rad=_joint(np.array(sigma)),
+        down=np.zeros(3),
+        told=True,
+    )
+
+
+def _joint(sigma: FloatArray) -> FloatArray:
+    """So wide that the mean of all is no better than what they share."""
+    own = sigma**2 * (1.0 - _COMMON_SHARE)
+    return np.asarray(np.sqrt(own + len(sigma) * _COMMON_SHARE * sigma**2))
+
+
+def _level(poses: Sequence[Rigid3]) -> Held | None:
     found = _held_level(poses)
     if found is None or found[1] > _ASKEW_RAD:
         return None
     kept, sigma, _, _ = found
-    return Level(
-        across=np.array([pose.rotation[0] for pose in poses])[kept],
-        sigma_rad=float(np.sqrt(sigma**2 + kept.sum() * _COMMON_ROLL_RAD**2)),
+    count = int(kept.sum())
+    return Held(
+        directions=np.array([pose.rotation[0] for pose in poses])[kept],
+        across=np.tile(np.eye(3)[2], (count, 1)),
+        along=np.zeros((count, 3)),
+        sigma_rad=np.full(count, np.hypot(sigma, _COMMON_ROLL_RAD)),
+        joint_rad=np.full(count, np.sqrt(sigma**2 + count * _COMMON_ROLL_RAD**2)),
         down=_down(poses)[kept].mean(axis=0),
+        told=False,
     )
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from featuredb.features.exif_gps import AltitudeReference
+from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.maps.feature_map import GeoPrior
 
 PhotoStatus = Literal["ok", "skipped"]
@@ -32,6 +33,7 @@ class Photo:
         gps: position prior from EXIF or a table, or None.
         gps_is_hint: nobody answers for the position (a photo site's table): good enough to look for
             neighbours there, not to place an active map by.
+        angles: how the camera was turned, from EXIF, XMP or a table, or None.
         altitude_reference: what gps.height_m is counted from: sea_level, ellipsoid or unknown.
         relative_altitude_m: height above take-off by a drone's barometer, or None.
         owner, licence: attribution from a table, EXIF (Artist, Copyright) or the ingest's options.
@@ -57,6 +59,7 @@ class Photo:
     capture_time: datetime | None = None
     gps: GeoPrior | None = None
     gps_is_hint: bool = False
+    angles: CameraAngles | None = None
     altitude_reference: AltitudeReference = "unknown"
     relative_altitude_m: float | None = None
     owner: str = ""

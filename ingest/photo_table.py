@@ -9,6 +9,7 @@ Columns (all optional but the first two, of which one must be there):
 | lat, lon | WGS84 degrees |
 | height  | metres, counted as the maps' heights are |
 | accuracy, accuracy_height | standard deviations per horizontal axis and of the height, metres |
+| yaw, pitch, roll | of the camera, degrees: yaw clockwise from true north, pitch -90 looks down |
 | time    | ISO 8601, or as EXIF writes it |
 | owner, licence, title | attribution |
 
@@ -23,9 +24,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from featuredb.errors import IngestError
+from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG, MOST_PITCH_DEG
+from featuredb.geometry.camera_angles import CameraAngles
 from ingest.geo_txt import COLUMNS as GEO_TXT_COLUMNS
 from ingest.geo_txt import read_geo_txt
 
@@ -37,6 +40,9 @@ COLUMNS = (
     "height",
     "accuracy",
     "accuracy_height",
+    "yaw",
+    "pitch",
+    "roll",
     "time",
     "owner",
     "licence",
@@ -61,6 +67,7 @@ class TableRow:
         path: where the file should lie.
         latitude_deg, longitude_deg: WGS84, both or none.
         height_m: or None. accuracy_m, accuracy_height_m: standard deviations per axis, or None.
+        angles: of the camera, or None.
         warnings: values that were left out.
     """
 
@@ -72,6 +79,7 @@ class TableRow:
     height_m: float | None = None
     accuracy_m: float | None = None
     accuracy_height_m: float | None = None
+    angles: CameraAngles | None = None
     time: datetime | None = None
     owner: str = ""
     licence: str = ""
@@ -210,6 +218,7 @@ def _row(number: int, record: Mapping[str, Any], folder: Path) -> TableRow | Bad
         height_m=_height(record, warnings),
         accuracy_m=_accuracy(record, "accuracy", warnings),
         accuracy_height_m=_accuracy(record, "accuracy_height", warnings),
+        angles=_angles(record, warnings),
         time=_time(record, warnings),
         owner=_text(record, "owner"),
         licence=_text(record, "licence"),
@@ -252,6 +261,26 @@ def _accuracy(record: Mapping[str, Any], name: str, warnings: list[str]) -> floa
         warnings.append(f"table: an {name} of {value} m is none; it is left out")
         return None
     return value
+
+
+def _angles(record: Mapping[str, Any], warnings: list[str]) -> CameraAngles | None:
+    """None where neither yaw nor pitch is told, and where all are zero, as tables write that nobody knows."""
+    if isinstance(record.get("angles"), CameraAngles):  # of geo.txt
+        return cast(CameraAngles, record["angles"])
+    yaw, pitch, roll = (_number(record, name, warnings) for name in ("yaw", "pitch", "roll"))
+    told = (yaw or 0.0, pitch or 0.0, roll or 0.0)
+    if abs(told[0]) > 360.0 or abs(told[1]) > MOST_PITCH_DEG or abs(told[2]) > 360.0:
+        warnings.append(f"table: {yaw}, {pitch}, {roll} are no angles in degrees; they are left out")
+        return None
+    if (yaw is None and pitch is None) or not any(told):
+        return None
+    return CameraAngles(
+        yaw_deg=yaw,
+        pitch_deg=pitch,
+        roll_deg=told[2],
+        sigma_yaw_deg=DEFAULT_SIGMA_YAW_DEG,
+        sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
+    )
 
 
 def _number(record: Mapping[str, Any], name: str, warnings: list[str]) -> float | None:

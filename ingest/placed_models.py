@@ -15,7 +15,7 @@ from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
 from ingest.links import tied_parts
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
-from ingest.own_frame import WAYS_TO_A_PLACE, level_of
+from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photo import Photo
 from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
@@ -116,9 +116,9 @@ def placed_by_gps(
     positions, sigmas = gps_priors(chosen, frame)
     with_gps = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([chosen[i] for i in with_gps.tolist()])
-    level = level_of(model.cam_from_sfm)
+    held = held_of(model.cam_from_sfm, [photo.angles for photo in chosen])
     placed = place_by_gps(
-        model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options, times_s, level
+        model.centers()[with_gps], positions[with_gps], sigmas[with_gps], options, times_s, held
     )
     return frame, tuple(with_gps.tolist()), placed
 

@@ -29,7 +29,7 @@ from ingest.scan_cache import Examined, read_cache, write_cache
 from ingest.walk import FoundFile, walk
 
 # Raised when the same file would be judged differently, so that old caches are not used.
-_VERSION = 1
+_VERSION = 2
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
 
@@ -274,6 +274,7 @@ def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) 
         focal_px=exif.focal_px,
         capture_time=exif.capture_time,
         gps=prior_from_exif(exif),
+        angles=exif.angles,
         altitude_reference=exif.altitude_reference,
         relative_altitude_m=exif.relative_altitude_m,
         owner=exif.artist or options.owner,
@@ -305,6 +306,7 @@ def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
         photo,
         gps=gps,
         gps_is_hint=gps is not None and not options.trust_geotags,
+        angles=row.angles or photo.angles,
         capture_time=row.time or photo.capture_time,
         owner=row.owner or photo.owner,
         licence=row.licence or photo.licence,

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.features.exif import ExifInfo
+from featuredb.geometry.camera_angles import CameraAngles
 from ingest.workspace import write_json
 
 _log = logging.getLogger(__name__)
@@ -73,4 +74,5 @@ def _from_json(record: dict[str, Any]) -> Examined:
     for field in _TIMES:
         exif[field] = datetime.fromisoformat(exif[field]) if exif[field] else None
     exif["warnings"] = tuple(exif["warnings"])
+    exif["angles"] = CameraAngles(**exif["angles"]) if exif["angles"] else None
     return Examined(**record, exif=ExifInfo(**exif))

@@ -138,7 +138,7 @@ def exif_prior(data: bytes, cloud: PointCloud) -> FramePrior:
         raise SystemExit("a photo without GPS cannot be registered from EXIF alone")
     center = cloud.frame.enu_from_geodetic([exif.latitude_deg, exif.longitude_deg, 0.0])
     center[2] = exif.altitude_m
-    pitch = -90.0 if exif.gimbal_pitch_deg is None else exif.gimbal_pitch_deg
+    pitch = -90.0 if exif.angles is None or exif.angles.pitch_deg is None else exif.angles.pitch_deg
     return FramePrior(
         cam_from_local=_posed(_looking_north(np.radians(pitch)), center),
         sigma_horizontal_m=5.0,

@@ -26,18 +26,19 @@ from threadpoolctl import threadpool_limits
 
 from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.own_frame import level_of
+from ingest.own_frame import held_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from tools.figures import add_json_option, write_figures
 from tools.made_maps import all_maps, make, photo_names
 
-_SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
+SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
-_PARTS = ("position", "orientation")
-_LEVELS = (0.68, 0.95)
+PARTS = ("position", "orientation")
+LEVELS = (0.68, 0.95)
 _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
 
 
@@ -50,27 +51,27 @@ class Flight:
     times_s: FloatArray
     cam_from_local: tuple[Rigid3, ...]
 
-    def placed(self, positions: FloatArray) -> GpsPlacement:
-        """Its reconstruction by positions of a plain receiver."""
-        sigmas = np.tile(_SIGMAS, (len(positions), 1))
+    def placed(self, positions: FloatArray, angles: Sequence[CameraAngles | None] = ()) -> GpsPlacement:
+        """Its reconstruction by positions of a plain receiver, and by the cameras' angles."""
+        sigmas = np.tile(SIGMAS, (len(positions), 1))
         centers = _TRUE.inverse().act(self.xyz[: len(positions)])
         held = [
             Rigid3(rotation=pose.rotation @ _TRUE.rotation, translation=pose.translation)
             for pose in self.cam_from_local[: len(positions)]
         ]
         times_s = self.times_s[: len(positions)]
-        return place_by_gps(centers, positions, sigmas, GpsOptions(), times_s, level_of(held))
+        return place_by_gps(centers, positions, sigmas, GpsOptions(), times_s, held_of(held, angles))
 
 
 def _bias(flight: Flight, rng: np.random.Generator) -> FloatArray:
-    return np.tile(rng.normal(0.0, 1.0, 3) * _SIGMAS, (len(flight.xyz), 1))
+    return np.tile(rng.normal(0.0, 1.0, 3) * SIGMAS, (len(flight.xyz), 1))
 
 
 def _white(sigma_m: float) -> Callable[[Flight, np.random.Generator], FloatArray]:
     """Noise, and as much bias as it leaves of what a plain receiver says."""
 
     def error(flight: Flight, rng: np.random.Generator) -> FloatArray:
-        rest = np.sqrt(np.maximum(_SIGMAS**2 - sigma_m**2, 0.0))
+        rest = np.sqrt(np.maximum(SIGMAS**2 - sigma_m**2, 0.0))
         return rng.normal(0.0, sigma_m, flight.xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
 
     return error
@@ -92,7 +93,7 @@ def _outliers(flight: Flight, rng: np.random.Generator) -> FloatArray:
 
 def _one_height(flight: Flight, rng: np.random.Generator) -> FloatArray:
     error = _white(2.0)(flight, rng)
-    error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, _SIGMAS[2]) - flight.xyz[:, 2]
+    error[:, 2] = float(np.median(flight.xyz[:, 2])) + rng.normal(0.0, SIGMAS[2]) - flight.xyz[:, 2]
     return error
 
 
@@ -136,8 +137,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     held = all(
         abs(figures[f"{part}_{100 * level:.0f}"] - level)
         <= 2.0 * np.sqrt(level * (1.0 - level) / max(count, 1.0))
-        for part in _PARTS
-        for level in _LEVELS
+        for part in PARTS
+        for level in LEVELS
     )
     fine = held and figures["placed"] >= 0.95 and figures["random_answer"] <= max(args.chance / 1000.0, 1.0)
     return 0 if fine and not figures["shuffled_answer"] and not figures["other_answer"] else 1
@@ -168,11 +169,11 @@ def bounds(real: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
                 active += 1
                 answering.append(own[-1])
         tried, scores = tried + draws, scores + own
-        inside = "; ".join(
-            f"{part} {_inside(own, part, 0.68):.0%} and {_inside(own, part, 0.95):.0%}" for part in _PARTS
+        held_in = "; ".join(
+            f"{part} {inside(own, part, 0.68):.0%} and {inside(own, part, 0.95):.0%}" for part in PARTS
         )
         sys.stdout.write(
-            f"{kind:<22} {len(own)} of {draws} placed, {active} answer, inside 68 and 95 %: {inside}"
+            f"{kind:<22} {len(own)} of {draws} placed, {active} answer, inside 68 and 95 %: {held_in}"
             f"{'; ' + ', '.join(sorted(set(reasons))) if reasons else ''}\n"
         )
         sys.stdout.flush()
@@ -180,8 +181,8 @@ def bounds(real: Sequence[Flight], draws: int, seed: int) -> dict[str, float]:
         "flights": float(tried),
         "placed": len(scores) / tried,
         "answer": len(answering) / tried,
-        **{f"answering_{part}_95": _inside(answering, part, 0.95) for part in _PARTS},
-        **{f"{part}_{100 * level:.0f}": _inside(scores, part, level) for part in _PARTS for level in _LEVELS},
+        **{f"answering_{part}_95": inside(answering, part, 0.95) for part in PARTS},
+        **{f"{part}_{100 * level:.0f}": inside(scores, part, level) for part in PARTS for level in LEVELS},
     }
 
 
@@ -198,7 +199,7 @@ def squares(placed: GpsPlacement, camera: FloatArray) -> dict[str, float]:
     return result
 
 
-def _inside(scores: Sequence[dict[str, float]], part: str, level: float) -> float:
+def inside(scores: Sequence[dict[str, float]], part: str, level: float) -> float:
     return float(np.mean([score[part] <= chi2.ppf(level, 3) for score in scores]))
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
 
 from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.exif_angles import XMP_ANGLES, camera_angles
 from featuredb.features.exif_gps import (
     DEFAULT_SIGMA_HORIZONTAL_M,
     DEFAULT_SIGMA_VERTICAL_M,
@@ -21,6 +22,7 @@ from featuredb.features.exif_gps import (
 )
 from featuredb.features.image_header import ImageHeader, read_header
 from featuredb.features.tiff_ifd import Ifd, TiffReader
+from featuredb.geometry.camera_angles import CameraAngles
 
 # Diagonal of the 24 x 36 mm frame to which "35 mm equivalent" refers (CIPA DCG-001).
 FULL_FRAME_DIAGONAL_MM = 43.2666
@@ -32,13 +34,21 @@ _FOCAL_RANGE = (0.1, 40.0)
 _MAX_TEXT = 200
 _MAX_WARNINGS = 20
 
-_DJI_NAMES = (
-    "RelativeAltitude|AbsoluteAltitude|GimbalYawDegree|GimbalPitchDegree|GimbalRollDegree"
-    "|RtkFlag|RtkStdLat|RtkStdLon|RtkStdHgt|GpsLatitude|GpsLongitude|GpsLongtitude"
-)
-_PIX4D_NAMES = "GPSXYAccuracy|GPSZAccuracy"  # of Pix4D's namespace, which Parrot, senseFly and others write
+_XMP_NAMES = {
+    "drone-dji": (
+        *XMP_ANGLES["drone-dji"],
+        *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
+        *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
+    ),
+    "drone-parrot": XMP_ANGLES["drone-parrot"],
+    "Camera": (  # Pix4D's, which Parrot, senseFly and others write
+        *XMP_ANGLES["Camera"],
+        *("GPSXYAccuracy", "GPSZAccuracy", "IMUYawAccuracy", "IMUPitchAccuracy", "IMURollAccuracy"),
+    ),
+}
+_XMP_TAGS = "|".join(f"{space}:(?:{'|'.join(names)})" for space, names in _XMP_NAMES.items())
 _XMP_VALUE = re.compile(
-    rf"(?:drone-dji:({_DJI_NAMES})|Camera:({_PIX4D_NAMES}))\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
+    rf"({_XMP_TAGS})\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
 )
 
 
@@ -58,7 +68,7 @@ class ExifInfo:
         sigma_horizontal_m, sigma_vertical_m: one standard deviation per axis of the position.
         sigma_source: what the deviations come from: rtk, stated, positioning_error, dop or default.
         relative_altitude_m, absolute_altitude_m: DJI: above take-off, and as in EXIF.
-        gimbal_yaw_deg, gimbal_pitch_deg, gimbal_roll_deg: DJI: clockwise from north; -90 looks down.
+        angles: how the camera was turned.
         artist, copyright: attribution.
         warnings: what was wrong, for people.
     """
@@ -81,9 +91,7 @@ class ExifInfo:
     sigma_source: str = "default"
     relative_altitude_m: float | None = None
     absolute_altitude_m: float | None = None
-    gimbal_yaw_deg: float | None = None
-    gimbal_pitch_deg: float | None = None
-    gimbal_roll_deg: float | None = None
+    angles: CameraAngles | None = None
     artist: str = ""
     copyright: str = ""
     warnings: tuple[str, ...] = ()
@@ -123,6 +131,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
     values = _xmp_values(xmp)
     position = finer_position(gps_position(gps, warnings), values)
     altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
+    orientation = _orientation(main, warnings)
     sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
     return ExifInfo(
         width=width,
@@ -130,7 +139,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         make=main.text(271)[:_MAX_TEXT],
         model=main.text(272)[:_MAX_TEXT],
         serial=exif.text(42033)[:_MAX_TEXT],
-        orientation=_orientation(main, warnings),
+        orientation=orientation,
         focal_px=_focal_px(exif, width, height, warnings),
         capture_time=_capture_time(main, exif, warnings),
         gps_time=gps_time(gps, warnings),
@@ -143,9 +152,7 @@ def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
         sigma_source=source,
         relative_altitude_m=values.get("RelativeAltitude"),
         absolute_altitude_m=values.get("AbsoluteAltitude"),
-        gimbal_yaw_deg=values.get("GimbalYawDegree"),
-        gimbal_pitch_deg=values.get("GimbalPitchDegree"),
-        gimbal_roll_deg=values.get("GimbalRollDegree"),
+        angles=camera_angles(gps, values, main.text(271), orientation, warnings),
         artist=main.text(315)[:_MAX_TEXT],
         copyright=main.text(33432)[:_MAX_TEXT],
         warnings=tuple(warnings[:_MAX_WARNINGS]),
@@ -306,5 +313,5 @@ def _with_offset(time: datetime, text: str, warnings: list[str]) -> datetime:
 
 
 def _xmp_values(xmp: bytes) -> dict[str, float]:
-    """Numbers of DJI's and Pix4D's namespaces, written as attributes or as elements."""
-    return {(m[1] or m[2]).decode(): float(m[3]) for m in _XMP_VALUE.finditer(xmp)}
+    """Numbers of drones' namespaces, written as attributes or as elements."""
+    return {m[1].decode().split(":")[1]: float(m[2]) for m in _XMP_VALUE.finditer(xmp)}

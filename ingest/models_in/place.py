@@ -16,7 +16,7 @@ from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap_bridge import Model
-from ingest.own_frame import WAYS_TO_A_PLACE, level_of
+from ingest.own_frame import WAYS_TO_A_PLACE, held_of
 from ingest.photo import Photo
 from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps
@@ -170,9 +170,9 @@ def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
     positions, sigmas = gps_priors(photos, frame)
     known = np.flatnonzero(np.isfinite(positions).all(axis=1))
     times_s = capture_seconds([photos[i] for i in known.tolist()])
-    level = level_of(model.cam_from_sfm)
+    held = held_of(model.cam_from_sfm, [photo.angles for photo in photos])
     placed = place_by_gps(
-        model.centers()[known], positions[known], sigmas[known], GpsOptions(), times_s, level
+        model.centers()[known], positions[known], sigmas[known], GpsOptions(), times_s, held
     )
     if (
         placed.reason is not None

@@ -22,7 +22,7 @@ from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import NOISE_SHARE, Level, NoisyFit, fit_noisy, stated_sigma
+from ingest.register.position_noise import ANGLES_WRONG, NOISE_SHARE, Held, NoisyFit, fit_noisy, stated_sigma
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 
@@ -40,6 +40,7 @@ class GpsOptions:
         answers: chance below which a map may answer.
         max_scale_sigma, max_turn_deg: standard deviations beyond which covariances say nothing, as they are
             linear.
+        answers_turn_deg: standard deviation of the turn beyond which a map may not answer.
         max_ransac_samples: of three positions; fewer photos are tried exhaustively.
         seed: of the samples.
     """
@@ -48,7 +49,8 @@ class GpsOptions:
     no_place: float = 0.05
     answers: float = 0.001
     max_scale_sigma: float = 0.1
-    max_turn_deg: float = 10.0
+    max_turn_deg: float = 25.0
+    answers_turn_deg: float = 10.0
     max_ransac_samples: int = 500
     seed: int = 0
 
@@ -89,7 +91,7 @@ def place_by_gps(
     sigmas_m: FloatArray,
     options: GpsOptions,
     times_s: FloatArray | None = None,
-    level: Level | None = None,
+    held: Held | None = None,
 ) -> GpsPlacement:
     """Robust similarity from camera centres to GPS positions.
 
@@ -99,7 +101,7 @@ def place_by_gps(
         sigmas_m: (n, 3) standard deviations of the positions along the local axes; infinite for a coordinate
             that is not known.
         times_s: (n,) of capture; None: in the order given.
-        level: how the photos are held.
+        held: how the photos are held.
     """
     count = len(centers_sfm)
     figures: dict[str, Any] = {"photos_with_gps": count, "options": asdict(options)}
@@ -109,13 +111,28 @@ def place_by_gps(
     start = _start(centers_sfm, positions_local, sigmas_m, options)
     if start is None:
         return _refused("DEGENERATE_LINE", "the camera centres or positions coincide", count, figures)
-    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, level)
-    if level is not None and (fit.local_from_sfm.rotation @ level.down)[2] > 0:  # a line, the wrong side up
+    fit = fit_noisy(start, centers_sfm, positions_local, sigmas_m, times_s, held)
+    if held is not None and (fit.local_from_sfm.rotation @ held.down)[2] > 0:  # a line, the wrong side up
         turned = _turned_over(fit.local_from_sfm, centers_sfm)
-        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, level)
+        over = fit_noisy(turned, centers_sfm, positions_local, sigmas_m, times_s, held)
         if over.log_chance <= fit.log_chance + np.log(1.0 / options.wrong):  # else pictures are upside down
             fit = over
+    if held is not None:
+        figures["angles"] = _angles(fit, held)
     return _judged(fit, centers_sfm, positions_local, sigmas_m, figures, options)
+
+
+def _angles(fit: NoisyFit, held: Held) -> dict[str, Any]:
+    """How far off photos are held from what they say, or from level, at the median."""
+    off = held.terms(fit.local_from_sfm.rotation)[2]
+    result: dict[str, Any] = {"told": held.told}
+    for name, rows in (("tilt", ~held.by_yaw), ("yaw", held.by_yaw)):
+        if rows.any():
+            result |= {
+                f"{name}_off_deg": float(np.degrees(np.median(off[rows]))),
+                f"{name}_contradicts": bool(np.median(off[rows] / held.sigma_rad[rows]) > ANGLES_WRONG),
+            }
+    return result
 
 
 def _judged(
@@ -137,6 +154,7 @@ def _judged(
     chance = fit.log_chance
     inliers = np.asarray(fit.used.all(axis=1))
     turn_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])))
+    checked_deg = max(turn_deg, float(np.degrees(fit.checked_turn_rad)))
     figures = figures | {
         "inliers": int(inliers.sum()),
         "noise_m": fit.noise.white,
@@ -145,6 +163,7 @@ def _judged(
         "bias_sigma_m": bias.tolist(),
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "turn_sigma_deg": turn_deg,
+        "checked_turn_sigma_deg": checked_deg,
         "log10_chance": chance / np.log(10.0),
         "rms_horizontal_m": _rms(residuals[fit.used[:, 0], :2]),
         "rms_vertical_m": _rms(residuals[fit.used[:, 1] & known[:, 2], 2:]),
@@ -178,8 +197,8 @@ def _judged(
         return outcome(
             "DEGENERATE_LINE",
             f"the photos lie along a line: their GPS tells the orientation to {turn_deg:.0f} degrees, "
-            f"{options.max_turn_deg:.0f} are needed; add photos beside the line, or place it by control "
-            "points (--gcp) or a scan",
+            f"{options.max_turn_deg:.0f} are needed; add photos beside the line or the camera's angles, or "
+            "place it by control points (--gcp) or a scan",
         )
     if figures["scale_sigma"] > options.max_scale_sigma:
         return outcome(
@@ -194,7 +213,31 @@ def _judged(
             f"positions that have nothing to do with these photos would fit as well in {np.exp(chance):.1%} "
             f"of cases (limit {options.answers:.1%}): too few are left to check the place by",
         )
-    return outcome(None, "placed by GPS")
+    if checked_deg > options.answers_turn_deg:
+        return outcome(
+            None,
+            "placed by GPS",
+            f"the photos lie along a line: their GPS tells the turn about it to {checked_deg:.0f} degrees, "
+            f"{options.answers_turn_deg:.0f} are needed, and no camera angles do",
+        )
+    return outcome(None, _words("placed by GPS", figures))
+
+
+def _words(placed: str, figures: dict[str, Any]) -> str:
+    """With what angles contradict positions by."""
+    angles = figures.get("angles", {})
+    against = (
+        [
+            f"{name} by {angles[f'{name}_off_deg']:.0f} degrees"
+            for name in ("tilt", "yaw")
+            if angles["told"] and angles.get(f"{name}_contradicts")
+        ]
+        if angles
+        else []
+    )
+    if not against:
+        return placed
+    return f"{placed}; the cameras' angles contradict it and hardly count: {', '.join(against)} (median)"
 
 
 def _rms(residuals_m: FloatArray) -> float | None:

@@ -10,7 +10,7 @@ over (importance sampling around the modes), so that few positions give wide ans
 found with weights of Student's t (Lange, Little, Taylor 1989) and then left out.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ _RANGE = 7.0  # of logarithms: a thousand times more or less
 _LEAST_PHOTOS = 3
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
+ANGLES_WRONG = 4.0  # standard deviations
 _MOST_LAG_S = 1.0  # standard deviation of a lag
 _STEADY_S = 20.0
 _MOST_POSITIONS = 400  # more are thinned out evenly in time
@@ -61,18 +62,47 @@ class Noise:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Level:
-    """How photos are held: their horizontal image axes are level.
+class Held:
+    """How photos are held: directions of the reconstruction that are square to a local axis.
+
+    Level photos: their horizontal image axes, to up. Photos that tell their tilt: where they say that up is,
+    to east and to north. Photos that tell their yaw: where they say that north is, to east.
 
     Attributes:
-        across: (k, 3) those axes in the reconstruction's frame.
-        sigma_rad: how far one is off the level, with what all have in common.
-        down: (3,) about downwards.
+        directions: (m, 3) unit vectors in the reconstruction's frame.
+        across: (m, 3) local axes that they are square to.
+        along: (m, 3) local axes that they point along; 0 where either side will do.
+        sigma_rad: (m,) how far one is off.
+        joint_rad: (m,) the same, so widened that all of them are worth no more than what they have in common.
+        down: (3,) about downwards, in the reconstruction's frame.
+        told: the photos say so; otherwise it is assumed.
     """
 
+    directions: FloatArray
     across: FloatArray
-    sigma_rad: float
+    along: FloatArray
+    sigma_rad: FloatArray
+    joint_rad: FloatArray
     down: FloatArray
+    told: bool
+
+    @property
+    def by_yaw(self) -> NDArray[np.bool_]:
+        """(m,) those that tell the turn about up, and nothing else."""
+        return np.asarray((self.across[:, 2] == 0.0) & (self.along[:, 2] == 0.0))
+
+    def terms(self, rotation: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residuals (m,), their derivatives (m, 3) by a turn, and how far each is off (m,), radians.
+
+        Args:
+            rotation: (3, 3) from the reconstruction to the local frame.
+        """
+        placed = self.directions @ rotation.T
+        off = (placed * self.across).sum(axis=1)
+        slope = np.cross(placed, self.across)
+        slope[self.by_yaw, :2] = 0.0
+        turned = np.where((placed * self.along).sum(axis=1) < 0.0, np.pi, 0.0)
+        return off, slope, np.abs(turned - np.arcsin(np.clip(np.abs(off), 0.0, 1.0)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,6 +114,7 @@ class NoisyFit:
         covariance: (7, 7) of its left perturbation about the local origin, without the bias.
         noise: its most likely components.
         lag_s: by which positions are late.
+        checked_turn_rad: largest standard deviation of its turn, were nothing assumed of how photos are held.
         used: (n, 2) horizontal and vertical; others are so far out that one of a thousand honest ones is.
         log_chance: natural logarithm of how often positions that know nothing of the reconstruction fit as
             well, by the ratio of the likelihoods, both with their own components.
@@ -93,6 +124,7 @@ class NoisyFit:
     covariance: FloatArray
     noise: Noise
     lag_s: float
+    checked_turn_rad: float
     used: NDArray[np.bool_]
     log_chance: float
 
@@ -107,7 +139,7 @@ class _Data:
         stated: (2,) median sigma, horizontal and vertical.
         speed: (n, 3) metres of the reconstruction a second; 0 where it is not known.
         lag_sigma_s: of the time between a photo and its position.
-        level: how the photos are held, or None.
+        held: how the photos are held, or None.
     """
 
     centers: FloatArray
@@ -117,7 +149,7 @@ class _Data:
     stated: FloatArray
     speed: FloatArray
     lag_sigma_s: float
-    level: Level | None
+    held: Held | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,12 +179,12 @@ class _State:
         lag_s = np.sqrt(0.25 * (3.0 * data.lag_sigma_s**2 + self.lag_s**2))
         wide = np.array([lag_s, _UNKNOWN_SCALE, *[_UNKNOWN_TURN] * 3, *[_UNKNOWN_M] * 3])
         rows, off = [np.diag(1.0 / wide)], [np.array([-self.lag_s / lag_s, *[0.0] * 7])]
-        if data.level is not None:
-            across = data.level.across @ self.sim.rotation.T
-            level = np.zeros((len(across), 8))
-            level[:, 2], level[:, 3] = across[:, 1], -across[:, 0]
-            rows.append(level / data.level.sigma_rad)
-            off.append(-across[:, 2] / data.level.sigma_rad)
+        if data.held is not None:
+            square, slope, angle = data.held.terms(self.sim.rotation)
+            # Beyond some deviations angles are wrong altogether, and pull the less the further off they are.
+            joint = data.held.joint_rad * np.maximum(angle / (ANGLES_WRONG * data.held.sigma_rad), 1.0)
+            rows.append(np.pad(slope / joint[:, None], ((0, 0), (2, 3))))
+            off.append(-square / joint)
         return np.vstack(rows), np.concatenate(off)
 
     def _speed(self, data: "_Data") -> FloatArray:
@@ -194,7 +226,7 @@ def fit_noisy(
     positions: FloatArray,
     sigmas: FloatArray,
     times_s: FloatArray | None = None,
-    level: Level | None = None,
+    held: Held | None = None,
 ) -> NoisyFit:
     """The similarity with all components of variance.
 
@@ -203,7 +235,7 @@ def fit_noisy(
         centers: (n, 3) camera centres of the reconstruction. positions: (n, 3) local, metres.
         sigmas: (n, 3) as stated, of the whole error; infinite where a coordinate is not known.
         times_s: (n,) of capture; None: in the order given, and nothing is known of a lag.
-        level: how the photos are held.
+        held: how the photos are held.
     """
     stated = np.array([stated_sigma(sigmas[:, axes]) for axes in _AXES])
     middle = Sim3(scale=1.0, rotation=np.eye(3), translation=np.median(np.nan_to_num(positions), axis=0))
@@ -220,7 +252,7 @@ def fit_noisy(
         stated=stated,
         speed=speed,
         lag_sigma_s=min(_LAG_SHARE * stated[0] / usual, _MOST_LAG_S) if usual > 0 else _MOST_LAG_S,
-        level=level,
+        held=held,
     )
     state, theta = _State(middle.inverse() @ start, 0.0), _prior_mean(stated)
     taken = np.zeros((len(centers), 1))
@@ -242,6 +274,10 @@ def fit_noisy(
     problem = _at(data, state, weights)
     modes = _modes(problem, theta, stated)
     step, covariance = _integrated(problem, modes, stated)
+    checked = covariance[2:5, 2:5]
+    if held is not None and not held.told:
+        free = _at(replace(data, held=None), state, weights)
+        checked = _integrated(free, modes, stated)[1][2:5, 2:5]
     state, theta = state.moved(step), modes[0]
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
@@ -249,6 +285,7 @@ def fit_noisy(
         covariance=middle.adjoint() @ covariance[1:, 1:] @ middle.adjoint().T,
         noise=Noise(white=(float(white[0]), float(white[1])), drift=(float(drift[0]), float(drift[1]))),
         lag_s=state.lag_s,
+        checked_turn_rad=float(np.sqrt(np.linalg.eigvalsh(checked)[-1])),
         used=used,
         log_chance=_log_chance(data, state, weights, int(taken.sum())),
     )

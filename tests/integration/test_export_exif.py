@@ -141,9 +141,10 @@ def test_copies_have_the_pose_and_the_very_picture(tmp_path: Path) -> None:
         enu = feature_map.frame.enu_from_geodetic((found.latitude_deg, found.longitude_deg, height))
         np.testing.assert_allclose(enu, image.cam_from_local.center, atol=1e-3)
         heading, pitch, roll = shot.geopose.heading_pitch_roll_deg
-        assert (found.gimbal_yaw_deg or 0.0) % 360 == pytest.approx(heading, abs=1e-4)
-        assert found.gimbal_pitch_deg == pytest.approx(pitch, abs=1e-4)
-        assert found.gimbal_roll_deg == pytest.approx(roll, abs=1e-4)
+        assert found.angles is not None
+        assert (found.angles.yaw_deg or 0.0) % 360 == pytest.approx(heading, abs=1e-4)
+        assert found.angles.pitch_deg == pytest.approx(pitch, abs=1e-4)
+        assert found.angles.roll_deg == pytest.approx(roll, abs=1e-4)
         assert found.sigma_source == "stated"
         assert found.sigma_vertical_m == pytest.approx(max(shot.sigma_enu_m[2], 0.005), abs=1e-3)
         per_axis = np.sqrt((shot.sigma_enu_m[:2] ** 2).mean())

@@ -8,6 +8,7 @@ import pytest
 
 from featuredb.errors import RegistrationError
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
@@ -17,7 +18,6 @@ from ingest.register.anchor.page import FramePicture, flick_page
 from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
 from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
 from ingest.register.anchor.proposals import ProposalOptions, propose_frames, small_camera
-from ingest.register.anchor.start import cam_from_grid
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
 from tests.support.maps import random_map
@@ -26,7 +26,7 @@ CAMERA = Camera(model="SIMPLE_RADIAL", width=800, height=600, params=(700.0, 400
 
 
 def down(east: float, north: float, up: float = 50.0, pitch_deg: float = -90.0) -> Rigid3:
-    rotation = cam_from_grid(0.0, pitch_deg, 0.0)
+    rotation = cam_from_enu(0.0, pitch_deg, 0.0)
     return Rigid3(rotation=rotation, translation=-rotation @ np.array([east, north, up]))
 
 

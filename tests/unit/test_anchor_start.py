@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from featuredb.errors import RegistrationError
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
@@ -17,7 +18,6 @@ from ingest.register.anchor.picks import Picks, pose_from_picks
 from ingest.register.anchor.start import (
     RoughPose,
     StartOptions,
-    cam_from_grid,
     height_shift,
     image_named,
     look_at_angles,
@@ -32,7 +32,7 @@ OPTIONS = StartOptions()
 
 
 def looking_down(height_m: float = 60.0, yaw_deg: float = 30.0) -> Rigid3:
-    rotation = cam_from_grid(yaw_deg, -90.0, 0.0)
+    rotation = cam_from_enu(yaw_deg, -90.0, 0.0)
     return Rigid3(rotation=rotation, translation=-rotation @ np.array([5.0, -3.0, height_m]))
 
 
@@ -114,7 +114,7 @@ def test_angles_against_scipy() -> None:
     for yaw, pitch, roll in ((0, 0, 0), (90, -90, 0), (37, -62, 11), (-120, 15, -40)):
         body_from_ned = Rotation.from_euler("ZYX", [yaw, pitch, roll], degrees=True).as_matrix().T
         expected = camera_from_body @ body_from_ned @ ned_from_enu
-        np.testing.assert_allclose(cam_from_grid(yaw, pitch, roll), expected, atol=1e-12)
+        np.testing.assert_allclose(cam_from_enu(yaw, pitch, roll), expected, atol=1e-12)
 
 
 def test_a_rough_pose_looks_where_it_says() -> None:

@@ -7,12 +7,14 @@ import struct
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
 
+import numpy as np
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from featuredb.features.exif import ExifInfo, camera_key, parse_exif, read_exif
 from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.maps.exif_prior import prior_from_exif
 
 WIDTH, HEIGHT = 400, 300
@@ -227,8 +229,60 @@ XMP = b"""<x:xmpmeta><rdf:Description drone-dji:RelativeAltitude="+39.80" drone-
 
 def test_dji_values_as_attributes_and_elements() -> None:
     found = info(None, None, gps_tags(), xmp=XMP)
-    assert (found.relative_altitude_m, found.gimbal_yaw_deg, found.gimbal_pitch_deg) == (39.8, -45.0, -89.9)
+    assert found.angles is not None
+    assert (found.relative_altitude_m, found.angles.yaw_deg, found.angles.pitch_deg) == (39.8, -45.0, -89.9)
     assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.015, 0.03, "rtk")
+
+
+def angles_of(xmp: bytes, make: str = "") -> CameraAngles | None:
+    return info({271: make} if make else None, None, xmp=xmp).angles
+
+
+def test_parrot_tells_the_camera_as_dji_does() -> None:
+    found = angles_of(
+        b'<x drone-parrot:CameraYawDegree="12.5" drone-parrot:CameraPitchDegree="-60" '
+        b'drone-parrot:CameraRollDegree="1"/>'
+    )
+    assert found is not None
+    assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == (12.5, -60.0, 1.0)
+
+
+@pytest.mark.parametrize(("make", "right"), [("Parrot", -1.0), ("senseFly", 1.0)])
+def test_pix4d_counts_pitch_from_straight_down(make: str, right: float) -> None:
+    """The nose 10 degrees up lets the camera look ahead, the right wing down lets it look to the left."""
+    found = angles_of(
+        b"<Camera:Yaw>90.0</Camera:Yaw><Camera:Pitch>10.0</Camera:Pitch><Camera:Roll>5.0</Camera:Roll>"
+        b"<Camera:IMUYawAccuracy>10</Camera:IMUYawAccuracy><Camera:IMUPitchAccuracy>5</Camera:IMUPitchAccuracy>",
+        make,
+    )
+    assert found is not None
+    assert found.yaw_deg is not None
+    assert found.pitch_deg is not None
+    assert (found.sigma_yaw_deg, found.sigma_tilt_deg) == (10.0, 5.0)
+    view = cam_from_enu(found.yaw_deg, found.pitch_deg, found.roll_deg)[2]
+    pitch, roll = np.radians([10.0, right * 5.0])
+    np.testing.assert_allclose(
+        view, [np.cos(roll) * np.sin(pitch), -np.sin(roll), -np.cos(roll) * np.cos(pitch)]
+    )
+
+
+@pytest.mark.parametrize(
+    "xmp",
+    [
+        b'<x drone-dji:GimbalYawDegree="+0.00" drone-dji:GimbalPitchDegree="0"/>',
+        b'<x Camera:Yaw="0.0" Camera:Pitch="0.0" Camera:Roll="0.0"/>',
+        b'<x drone-dji:FlightYawDegree="10" drone-dji:FlightPitchDegree="3" drone-dji:FlightRollDegree="1"/>',
+    ],
+)
+def test_zeros_and_the_aircrafts_angles_are_none_of_the_camera(xmp: bytes) -> None:
+    assert angles_of(xmp) is None
+
+
+def test_a_compass_tells_only_yaw() -> None:
+    found = info(None, None, gps_tags(t17=123.0)).angles
+    assert found is not None
+    assert (found.yaw_deg, found.pitch_deg) == (123.0, None)
+    assert found.sigma_yaw_deg == 20.0
 
 
 def test_dji_single_point_solution_is_not_rtk() -> None:

@@ -51,3 +51,15 @@ def test_a_line_that_cannot_be_read_costs_that_photo(tmp_path: Path) -> None:
 def test_without_a_system_nothing_is_guessed(tmp_path: Path) -> None:
     with pytest.raises(IngestError, match="first line has to name a coordinate system"):
         read_table(table(tmp_path, "a.jpg 8.4 49.0 120\n"))
+
+
+def test_angles_count_from_straight_down(tmp_path: Path) -> None:
+    """Pitch 0 looks down, 90 ahead; all zero is how nobody's angles are written."""
+    lines = ("a.jpg 8.4 49 120 30 0 0", "b.jpg 8.4 49 120 30 60 0", "c.jpg 8.4 49 120 0 0 0 0.02 0.04")
+    text = "\n".join(("EPSG:4326", *lines))
+    a, b, c = (row.angles for row in read_table(table(tmp_path, text)).rows)
+    assert a is not None
+    assert b is not None
+    assert (a.yaw_deg, a.pitch_deg) == pytest.approx((30.0, -90.0))
+    assert (b.yaw_deg, b.pitch_deg) == pytest.approx((30.0, -30.0))
+    assert c is None

@@ -8,12 +8,14 @@ import pytest
 from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import nearest_rotation, so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.own_frame import level_of
+from ingest.own_frame import held_of
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
+from ingest.register.position_noise import Held
 
 _OPTIONS = GpsOptions()
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.3, -0.2, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
@@ -130,14 +132,14 @@ def test_two_photos_are_too_few() -> None:
     assert "2 registered photos" in placed.message
 
 
-@pytest.mark.parametrize("across_m", [0.0, 0.3])
-def test_a_line_of_photos_is_refused(across_m: float) -> None:
-    """Nothing tells the turn about the line."""
+@pytest.mark.parametrize(("across_m", "reason"), [(0.0, "DEGENERATE_LINE"), (0.3, None)])
+def test_a_line_of_photos_does_not_answer(across_m: float, reason: str | None) -> None:
+    """Little or nothing tells the turn about the line."""
     rng = np.random.default_rng(1)
     positions = np.outer(np.linspace(-60, 60, 12), [0.8, 0.6, 0.0]) + rng.normal(0, 1, (12, 3)) * across_m
     placed = _place(positions, rng.normal(0, 0.5, (12, 3)), np.full((12, 3), 1.0))
-    assert placed.reason == "DEGENERATE_LINE"
-    assert "line" in placed.message
+    assert placed.reason == reason
+    assert "along a line" in (placed.provisional if reason is None else placed.message)
     assert placed.covariance is not None
     along, across = np.array([0.8, 0.6, 0.0]), np.array([0.0, 0.0, 1.0])
     assert np.sqrt(along @ placed.covariance[1:4, 1:4] @ along) > 0.17
@@ -161,9 +163,10 @@ def test_a_line_of_photos_that_are_held_level_has_a_place(seed: int) -> None:
         held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
     noise, sigmas = rng.normal(0, 0.5, (12, 3)), np.tile([4.0, 4.0, 10.0], (12, 1))
     placed = place_by_gps(
-        _TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, level=level_of(held)
+        _TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=held_of(held)
     )
     assert placed.reason is None
+    assert "no camera angles" in placed.provisional  # nothing has measured that they are level
     assert placed.local_from_sfm is not None
     assert placed.covariance is not None
     error = (_TRUE @ placed.local_from_sfm.inverse()).log()
@@ -180,14 +183,121 @@ def test_pictures_that_are_stored_upside_down_do_not_turn_a_flight_over() -> Non
         view = np.array([0.5 * np.cos(heading), 0.5 * np.sin(heading), -np.sqrt(0.75)])
         local = np.stack([across, np.cross(view, across), view])
         held.append(Rigid3(rotation=nearest_rotation(local @ _TRUE.rotation), translation=np.zeros(3)))
-    level = level_of(held)
+    level = held_of(held)
     assert level is not None
     level = replace(level, down=-level.down)
     noise, sigmas = rng.normal(0, 1.0, (20, 3)), np.tile([4.0, 4.0, 10.0], (20, 1))
-    placed = place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, level=level)
+    placed = place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=level)
     assert placed.reason is None
     assert placed.local_from_sfm is not None
     assert np.degrees(np.abs((_TRUE @ placed.local_from_sfm.inverse()).log()[1:4]).max()) < 5.0
+
+
+def _told(
+    local: FloatArray,
+    yaw_deg: float = 30.0,
+    pitch_deg: float = -60.0,
+    off_deg: float = 0.0,
+    flips: float = 0.0,
+) -> tuple[list[Rigid3], list[CameraAngles | None]]:
+    """Cameras at positions (n, 3) that look one way, and angles off by a degree or two and `off_deg`.
+
+    Args:
+        flips: share of photos whose yaw is off by 180 degrees.
+    """
+    rng = np.random.default_rng(5)
+    held: list[Rigid3] = []
+    told: list[CameraAngles | None] = []
+    for k in range(len(local)):
+        cam = so3_exp(rng.normal(0, np.radians(1.3), 3)) @ cam_from_enu(yaw_deg, pitch_deg, 0.0)
+        held.append(Rigid3(rotation=nearest_rotation(cam @ _TRUE.rotation), translation=np.zeros(3)))
+        told.append(
+            CameraAngles(
+                yaw_deg=yaw_deg + (180.0 if k < flips * len(local) else 0.0),
+                pitch_deg=pitch_deg + off_deg,
+                sigma_yaw_deg=4.0,
+                sigma_tilt_deg=2.0,
+            )
+        )
+    return held, told
+
+
+def _strip(count: int = 12) -> FloatArray:
+    rng = np.random.default_rng(2)
+    return np.asarray(np.outer(np.linspace(-60, 60, count), [0.8, 0.6, 0.0]) + rng.normal(0, 0.2, (count, 3)))
+
+
+def _placed_by(positions: FloatArray, held: Held | None) -> GpsPlacement:
+    noise = np.random.default_rng(3).normal(0, 0.5, positions.shape)
+    sigmas = np.tile([4.0, 4.0, 10.0], (len(positions), 1))
+    return place_by_gps(_TRUE.inverse().act(positions), positions + noise, sigmas, _OPTIONS, held=held)
+
+
+def _turn_deg(placed: GpsPlacement) -> float:
+    assert placed.local_from_sfm is not None
+    return float(np.degrees(np.linalg.norm((_TRUE @ placed.local_from_sfm.inverse()).log()[1:4])))
+
+
+@pytest.mark.parametrize("yaw_deg", [30.0, 143.0, 250.0])
+def test_a_strip_with_the_cameras_angles_answers(yaw_deg: float) -> None:
+    """Whichever way the cameras look, along the line or across, and whichever side up the start is."""
+    held, told = _told(_strip(), yaw_deg=yaw_deg)
+    placed = _placed_by(_strip(), held_of(held, told))
+    assert (placed.reason, placed.provisional, placed.message) == (None, "", "placed by GPS")
+    assert placed.figures["turn_sigma_deg"] < 3.0
+    assert _turn_deg(placed) < 3.0
+
+
+def test_a_strip_whose_photos_look_across_waits_without_angles() -> None:
+    """That photos are level tells nothing of the turn about a line along their horizontal axes."""
+    held, _ = _told(_strip(), yaw_deg=np.degrees(np.arctan2(-0.6, 0.8)), pitch_deg=-80.0)
+    placed = _placed_by(_strip(), held_of(held))
+    assert placed.reason == "DEGENERATE_LINE" or "no camera angles" in placed.provisional
+    assert placed.figures["turn_sigma_deg"] > 10.0
+
+
+@pytest.mark.parametrize("positions", [_strip(), _flight(20)], ids=["strip", "block"])
+def test_yaws_off_by_180_degrees_in_all_photos_are_said_and_drag_nothing(positions: FloatArray) -> None:
+    held, told = _told(positions, flips=1.0)
+    placed = _placed_by(positions, held_of(held, told))
+    assert placed.reason is None
+    assert placed.figures["angles"]["yaw_contradicts"]
+    assert "angles contradict" in placed.message
+    assert "yaw by 1" in placed.message
+    assert _turn_deg(placed) < 3.0
+
+
+def test_tilts_off_by_180_degrees_turn_no_flight_over() -> None:
+    positions = _flight(20)
+    held, told = _told(positions, off_deg=180.0)
+    placed = _placed_by(positions, held_of(held, told))
+    assert placed.reason is None
+    assert "tilt by 1" in placed.message
+    assert _turn_deg(placed) < 3.0
+
+
+def test_a_third_of_yaws_off_by_180_degrees_drags_nothing() -> None:
+    positions = _flight(20)
+    held, told = _told(positions, flips=0.34)
+    placed = _placed_by(positions, held_of(held, told))
+    assert placed.message == "placed by GPS"
+    assert _turn_deg(placed) < 3.0
+
+
+def test_a_compass_tells_the_heading_of_a_small_flight() -> None:
+    """Photos within four metres, positions noisy by half a metre; they look at the horizon."""
+    positions = _flight(12) * 0.04
+    held, told = _told(positions, pitch_deg=-5.0)
+    compass = [
+        CameraAngles(yaw_deg=one.yaw_deg, pitch_deg=None, sigma_yaw_deg=5.0, sigma_tilt_deg=180.0)
+        for one in told
+        if one is not None
+    ]
+    with_compass, without = (_placed_by(positions, held_of(held, angles)) for angles in (compass, ()))
+    assert with_compass.covariance is not None
+    assert without.covariance is not None
+    up_with, up_without = (np.degrees(np.sqrt(p.covariance[3, 3])) for p in (with_compass, without))  # type: ignore[index]
+    assert up_with < 5.0 < up_without
 
 
 def test_positions_that_are_late_say_by_how_much() -> None:

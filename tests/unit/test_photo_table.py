@@ -131,3 +131,18 @@ def test_what_the_table_says_of_heights_goes_before_exif(tmp_path: Path) -> None
     assert two is not None
     assert (one.height_m, one.sigma_horizontal_m, one.sigma_vertical_m) == (123.45, 0.02, 0.03)
     assert (two.height_m, two.sigma_horizontal_m, two.sigma_vertical_m) == (130.0, 2.0, 5.0)
+
+
+def test_the_cameras_angles(tmp_path: Path) -> None:
+    path = tmp_path / "photos.csv"
+    path.write_text(
+        "path,yaw,pitch,roll\na.jpg,30,-90,1\nb.jpg,30,,\nc.jpg,0,0,0\nd.jpg,900,-90,0\n", encoding="utf-8"
+    )
+    a, b, c, d = read_table(path).rows
+    assert a.angles is not None
+    assert b.angles is not None
+    assert (a.angles.yaw_deg, a.angles.pitch_deg, a.angles.roll_deg) == (30.0, -90.0, 1.0)
+    assert (b.angles.yaw_deg, b.angles.pitch_deg) == (30.0, None)
+    assert c.angles is None
+    assert d.angles is None
+    assert len(d.warnings) == 1

@@ -86,6 +86,14 @@ def _laser(name: str, photos: int, form: Form) -> Row:
     )
 
 
+_STRIPS = (
+    "{KIND_strips:.0f} KIND: with angles {KIND_answer:.0%} answer, turn {KIND_turn_deg:.1f} degrees, inside "
+    "68 and 95 % bounds position {KIND_position_68:.0%} and {KIND_position_95:.1%}, orientation "
+    "{KIND_orientation_68:.0%} and {KIND_orientation_95:.1%}; without {KIND_without_answer:.0%} answer, turn "
+    "{KIND_without_turn_deg:.1f} degrees, inside 95 % {KIND_without_position_95:.1%} and "
+    "{KIND_without_orientation_95:.1%}"
+)
+
 REAL: tuple[Row, ...] = (
     Row(
         name="brighton-held-out",
@@ -365,6 +373,45 @@ REAL: tuple[Row, ...] = (
         ),
         needs=("brighton/images", "lewis/images", "seneca/images"),
         minutes=30,
+    ),
+    Row(
+        name="strip-draws",
+        group="real",
+        form="full",
+        claim="single strips of photos, nine of `brighton` and simulated ones, placed by positions with the "
+        "cameras' angles and without",
+        commands=(
+            ("tools.scan_poses", SCAN, BRIGHTON, "--poses", "{cache}/brighton_poses.json"),
+            (
+                *("tools.strip_draws", "--poses", "{cache}/brighton_poses.json", "--photos", BRIGHTON),
+                *("--draws", "300", *OUT),
+            ),
+        ),
+        figures=same(
+            *(
+                f"{kind}_{name}"
+                for kind in ("real", "simulated")
+                for name in (
+                    *("strips", "answer", "turn_deg", "without_placed", "without_answer", "without_turn_deg"),
+                    *("position_68", "position_95", "orientation_68", "orientation_95"),
+                    *("without_position_95", "without_orientation_95"),
+                )
+            )
+        ),
+        text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
+        limits=(
+            Limit(figure="real_answer", least=1),
+            Limit(figure="real_without_answer", most=0),
+            Limit(figure="simulated_answer", least=0.85),
+            Limit(figure="simulated_without_answer", most=0.05),
+            *(
+                Limit(figure=f"{kind}_{part}_95", least=0.92)
+                for kind in ("real", "simulated")
+                for part in ("position", "orientation", "without_position", "without_orientation")
+            ),
+        ),
+        needs=("brighton",),
+        minutes=5,
     ),
     Row(
         name="copr-control-points",

@@ -8,8 +8,8 @@ from scipy.spatial import cKDTree
 from featuredb.errors import RegistrationError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.camera_angles import cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import AnyMap
@@ -169,7 +169,7 @@ def prior_from_rough_pose(rough: RoughPose, frame: LocalFrame, epsg: int) -> Fra
     """The rough pose, given in a UTM zone, in a local frame."""
     center = frame.enu_from_utm(rough.utm, epsg)
     grid_from_local = frame.grid_from_enu(center, epsg)
-    rotation = cam_from_grid(rough.yaw_deg, rough.pitch_deg, rough.roll_deg) @ grid_from_local
+    rotation = cam_from_enu(rough.yaw_deg, rough.pitch_deg, rough.roll_deg) @ grid_from_local
     return FramePrior(
         cam_from_local=Rigid3(rotation=rotation, translation=-rotation @ center),
         sigma_horizontal_m=rough.sigma_horizontal_m,
@@ -177,15 +177,6 @@ def prior_from_rough_pose(rough: RoughPose, frame: LocalFrame, epsg: int) -> Fra
         sigma_heading_deg=rough.sigma_heading_deg,
         sigma_tilt_deg=rough.sigma_tilt_deg,
     )
-
-
-def cam_from_grid(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
-    """Rotation (3, 3) from east, north, up to camera axes; angles as in RoughPose."""
-    level = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # looks north
-    yaw = so3_exp([0.0, 0.0, np.radians(yaw_deg)])  # turns the world left, so the camera right
-    pitch = so3_exp([-np.radians(pitch_deg), 0.0, 0.0])
-    roll = so3_exp([0.0, 0.0, -np.radians(roll_deg)])
-    return np.asarray(roll @ pitch @ level @ yaw, dtype=np.float64)
 
 
 def look_at_angles(utm: FloatArray, target_utm: FloatArray) -> tuple[float, float]:

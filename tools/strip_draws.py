@@ -1,0 +1,181 @@
+"""Single strips of photos, placed by positions with the cameras' angles and without: are the bounds true?
+
+    python -m tools.strip_draws --poses POSES.json --photos FOLDER [--draws 200] [--seed 1] [--json FILE]
+
+Real strips are runs of five or six photos along one line of the folder, with the positions and angles of
+their EXIF and XMP; the truth is POSES.json (tools/scan_poses.py, from a scan alone). Simulated ones have
+noise of 0.3 to 2 m, as much bias as a plain receiver, and angles as wrong as those of `brighton`: in one
+strip of four some yaws are off by 180 degrees, as there. Each strip is placed with angles and without.
+
+Exit code 0 if 85 % of the simulated strips answer with angles, at most 5 % without (those whose positions
+alone tell the turn about the line), and the bounds of 95 % hold.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from featuredb.features.exif import read_exif
+from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from tools.anchor_brighton import read_poses
+from tools.figures import add_json_option, write_figures
+from tools.position_draws import LEVELS, PARTS, SIGMAS, Flight, inside, squares
+
+_LEAST, _MOST_BEND = 5, 0.1  # photos of a real strip; its width over its length
+_EACH_DEG, _COMMON_DEG = np.array([1.3, 1.3, 1.8]), np.array([1.5, 1.5, 2.2])  # camera x and y, up
+_FLIPPED = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Strip:
+    """Cameras along a line, and what they say of where (n, 3) and how they are."""
+
+    flight: Flight
+    positions: FloatArray
+    angles: tuple[CameraAngles | None, ...]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--poses", type=Path, required=True, metavar="JSON", help="of tools/scan_poses.py")
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER")
+    parser.add_argument("--draws", type=int, default=200, help="simulated strips")
+    parser.add_argument("--seed", type=int, default=1)
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    with threadpool_limits(1):
+        figures = measure("real", list(real_strips(args.poses, args.photos)), args.seed)
+        drawn = [simulated_strip(np.random.default_rng((args.seed, draw))) for draw in range(args.draws)]
+        figures |= measure("simulated", drawn, args.seed)
+    write_figures(args.json, figures)
+    held = min(figures[f"{kind}_{part}_95"] for kind in ("real", "simulated") for part in PARTS) >= 0.92
+    fine = held and figures["simulated_answer"] >= 0.85 and figures["simulated_without_answer"] <= 0.05
+    return 0 if fine else 1
+
+
+def measure(kind: str, strips: Sequence[Strip], seed: int) -> dict[str, float]:
+    """How many are placed and answer, and how often their errors lie inside their bounds."""
+    figures = {f"{kind}_strips": float(len(strips))}
+    for name, angles in (("", True), ("without_", False)):
+        scores: list[dict[str, float]] = []
+        turns: list[float] = []
+        answer = 0
+        for number, strip in enumerate(strips):
+            found = strip.flight.placed(strip.positions, strip.angles if angles else ())
+            if found.reason is not None:
+                continue
+            answer += not found.provisional
+            camera = np.random.default_rng((seed, 5, number)).integers(len(strip.flight.xyz))
+            scores.append(squares(found, strip.flight.xyz[camera]))
+            turns.append(found.figures["turn_sigma_deg"])
+        figures |= {
+            f"{kind}_{name}placed": len(scores) / len(strips),
+            f"{kind}_{name}answer": answer / len(strips),
+            f"{kind}_{name}turn_deg": float(np.median(turns)) if turns else float("nan"),
+            **{
+                f"{kind}_{name}{part}_{100 * level:.0f}": inside(scores, part, level)
+                for part in PARTS
+                for level in LEVELS
+            },
+        }
+        sys.stdout.write(
+            f"{kind} strips {'without' if name else 'with'} angles: {len(scores)} of {len(strips)} placed, "
+            f"{answer} answer, turn {figures[f'{kind}_{name}turn_deg']:.1f} degrees; inside 68 and 95 %: "
+            + "; ".join(
+                f"{part} {inside(scores, part, 0.68):.0%} and {inside(scores, part, 0.95):.0%}"
+                for part in PARTS
+            )
+            + "\n"
+        )
+    return figures
+
+
+def real_strips(poses: Path, photos: Path) -> Iterator[Strip]:
+    """Runs of photos, in the order of their names, that lie along a line."""
+    frame, by_name = read_poses(poses)
+    names = sorted(by_name)
+    told = [read_exif((photos / name).read_bytes()) for name in names]
+    positions = np.array(
+        [frame.enu_from_geodetic([exif.latitude_deg or 0.0, exif.longitude_deg or 0.0, 0.0]) for exif in told]
+    )
+    positions[:, 2] = [(exif.altitude_m or 0.0) - frame.height_m for exif in told]
+    xyz = np.array([by_name[name].center for name in names])
+    times = [exif.capture_time for exif in told]
+    assert times[0] is not None
+    seconds = np.array([0.0 if time is None else (time - times[0]).total_seconds() for time in times])
+    for count in (_LEAST, _LEAST + 1):
+        for first in range(len(names) - count + 1):
+            rows = slice(first, first + count)
+            size = np.linalg.svd(xyz[rows] - xyz[rows].mean(axis=0), compute_uv=False)
+            if size[1] > _MOST_BEND * size[0]:
+                continue
+            flight = Flight(
+                name=names[first],
+                xyz=xyz[rows],
+                times_s=seconds[rows] - seconds[first],
+                cam_from_local=tuple(by_name[name] for name in names[rows]),
+            )
+            yield Strip(
+                flight=flight, positions=positions[rows], angles=tuple(exif.angles for exif in told[rows])
+            )
+
+
+def simulated_strip(rng: np.random.Generator) -> Strip:
+    """Six to fifteen photos along 60 to 200 m, all turned alike, from straight down to 50 degrees down."""
+    count = int(rng.integers(6, 16))
+    heading = rng.uniform(0.0, 2.0 * np.pi)
+    along = np.array([np.sin(heading), np.cos(heading), 0.0])
+    xyz = np.outer(np.linspace(-0.5, 0.5, count) * rng.uniform(60.0, 200.0), along)
+    xyz += rng.normal([0.0, 0.0, 60.0], 0.5, xyz.shape)
+    yaw, pitch = rng.uniform(0.0, 360.0), rng.uniform(-90.0, -50.0)
+    common = rng.normal(0.0, _COMMON_DEG)
+    flipped = rng.random() < _FLIPPED
+    poses: list[Rigid3] = []
+    angles: list[CameraAngles] = []
+    for center in xyz:
+        told = CameraAngles(
+            yaw_deg=yaw + rng.normal(0.0, 3.0),
+            pitch_deg=pitch + rng.normal(0.0, 1.0),
+            roll_deg=0.0,
+            sigma_yaw_deg=DEFAULT_SIGMA_YAW_DEG,
+            sigma_tilt_deg=DEFAULT_SIGMA_TILT_DEG,
+        )
+        off = np.radians(common + rng.normal(0.0, _EACH_DEG))
+        rotation = so3_exp([off[0], off[1], 0.0]) @ cam_from_enu(
+            told.yaw_deg or 0.0, told.pitch_deg or 0.0, 0.0
+        )
+        rotation = rotation @ so3_exp([0.0, 0.0, off[2]])
+        poses.append(Rigid3(rotation=rotation, translation=-rotation @ center))
+        if flipped and rng.random() < 0.5:
+            told = CameraAngles(
+                yaw_deg=(told.yaw_deg or 0.0) + 180.0,
+                pitch_deg=told.pitch_deg,
+                sigma_yaw_deg=told.sigma_yaw_deg,
+                sigma_tilt_deg=told.sigma_tilt_deg,
+            )
+        angles.append(told)
+    noise = rng.uniform(0.3, 2.0)
+    rest = np.sqrt(np.maximum(SIGMAS**2 - noise**2, 0.0))
+    flight = Flight(
+        name="simulated",
+        xyz=xyz,
+        times_s=4.0 * np.arange(count, dtype=np.float64),
+        cam_from_local=tuple(poses),
+    )
+    positions = xyz + rng.normal(0.0, noise, xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
+    return Strip(flight=flight, positions=positions, angles=tuple(angles))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
