@@ -232,6 +232,36 @@ REAL: tuple[Row, ...] = (
         minutes=15,
     ),
     Row(
+        name="karma-placed",
+        group="real",
+        form="full",
+        claim="`karma.mp4`, 12 s by a drone straight ahead: placed by its telemetry; its track against its "
+        "own GPS, inside the 95 % radius that it states",
+        commands=(("tools.film_placed", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
+        figures=same(
+            *(
+                "keyframes",
+                "mapped",
+                "active",
+                "tracked",
+                "compared",
+                "radius_m",
+                "rms_m",
+                "largest_m",
+                "inside",
+            )
+        ),
+        text="{mapped} of {keyframes} keyframes, {tracked} frames tracked; radius {radius_m:.1f} m, off by "
+        "{rms_m:.1f} m (root mean square) and {largest_m:.1f} m at most; {inside:.1%} of {compared} inside",
+        limits=(
+            Limit(figure="mapped", least=24),
+            Limit(figure="active", least=1),
+            Limit(figure="inside", least=0.95),
+        ),
+        needs=("video/karma.mp4",),
+        minutes=1,
+    ),
+    Row(
         name="karma-in-map",
         group="real",
         form="full",
