@@ -38,7 +38,8 @@ _DJI_NAMES = (
 )
 _PIX4D_NAMES = "GPSXYAccuracy|GPSZAccuracy"  # of Pix4D's namespace, which Parrot, senseFly and others write
 _XMP_VALUE = re.compile(
-    rf"(?:drone-dji:({_DJI_NAMES})|Camera:({_PIX4D_NAMES}))\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
+    # Autel writes DJI's names in a namespace of its own, "drone"; some write Pix4D's with a small letter.
+    rf"(?:drone(?:-dji)?:({_DJI_NAMES})|[Cc]amera:({_PIX4D_NAMES}))\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
 )
 
 
