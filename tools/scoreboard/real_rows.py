@@ -262,6 +262,28 @@ REAL: tuple[Row, ...] = (
         minutes=1,
     ),
     Row(
+        name="shifted-positions",
+        group="real",
+        form="full",
+        claim="`brighton`, the positions of every second photo shifted by 50 km together: they become a map "
+        "there; `anchor` on the scan, `adjust` with the map of the others, and `grow` say by how far",
+        commands=(
+            (
+                *("tools.shifted_positions", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--work", "{work}/maps", *OUT),
+            ),
+        ),
+        figures=same("active", "photos", "anchor_km", "adjust_km", "grow_km"),
+        text="{photos} photos placed; said: {anchor_km:.1f} km from the scan, {adjust_km:.1f} km from the "
+        "other map, {grow_km:.1f} km where the photos are contributed",
+        limits=(
+            Limit(figure="active", least=1),
+            *(Limit(figure=f"{who}_km", least=49.0, most=51.0) for who in ("anchor", "adjust", "grow")),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        minutes=4,
+    ),
+    Row(
         name="karma-in-map",
         group="real",
         form="full",
