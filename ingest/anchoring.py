@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError, MapNotFoundError, RegistrationError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
+from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
+from featuredb.geo.words import way_words
 from featuredb.lidar.load import load_cloud
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -247,8 +249,9 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         cloud = load_cloud(database, feature_map.frame, plan_box(feature_map), scan_ids=scan_ids)
     if not len(cloud):
         raise RegistrationError(
-            f"scan {', '.join(scan_ids)} has no points within {MARGIN_M:.0f} m of map {summary.map_id}; "
-            "`featuredb lidar list` tells where scans lie"
+            f"scan {', '.join(scan_ids)} has no points within {MARGIN_M:.0f} m of map {summary.map_id}"
+            + (_where_scans_lie(database, summary, scan_ids) if isinstance(summary, MapSummary) else "")
+            + "; `featuredb lidar list` tells where scans lie"
         )
     return _Job(
         request=request,
@@ -303,10 +306,31 @@ def _scans_around(database: Database, feature_map: FeatureMap, summary: MapSumma
         raise RegistrationError(
             f"no scan of {database.url} lies within {MARGIN_M:.0f} m of map {summary.map_id} "
             f"(easting {box.min_easting:.0f} to {box.max_easting:.0f}, northing {box.min_northing:.0f} to "
-            f"{box.max_northing:.0f}, EPSG:{feature_map.epsg}); add one that covers it by "
-            "`featuredb lidar add`"
+            f"{box.max_northing:.0f}, EPSG:{feature_map.epsg})"
+            + _where_scans_lie(database, summary, [scan.scan_id for scan in scans])
+            + "; otherwise add one that covers it by `featuredb lidar add`"
         )
     return tuple(around)
+
+
+def _where_scans_lie(database: Database, summary: MapSummary, scan_ids: Sequence[str]) -> str:
+    """How far from the map the nearest of the scans is, and what that may mean."""
+    box = summary.box
+    ways = []
+    for scan in list_scans(database):
+        if scan.scan_id in scan_ids and box is not None:
+            middle = ((box.min_easting + box.max_easting) / 2, (box.min_northing + box.max_northing) / 2, 0.0)
+            here = utm_from_geodetic(geodetic_from_utm(middle, summary.epsg), scan.epsg)
+            low = np.array([scan.box.min_easting, scan.box.min_northing])
+            high = np.array([scan.box.max_easting, scan.box.max_northing])
+            ways.append((scan.scan_id, np.clip(here[:2], low, high) - here[:2]))
+    if not ways:
+        return ""
+    name, way = min(ways, key=lambda one: float(np.linalg.norm(one[1])))
+    return (
+        f". The nearest, {name}, lies {way_words(*way.tolist())}: if it shows the place of the photos, their "
+        "positions are all wrong by that; ingest them anew with a table of the right ones"
+    )
 
 
 def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:

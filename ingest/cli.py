@@ -243,7 +243,8 @@ def summary(report: "IngestReport") -> str:
             lines.append(
                 f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
                 f"{outcome.photos} photos, {outcome.points} points, EPSG:{outcome.epsg}, "
-                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m"
+                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m, "
+                f"place known to {outcome.radius_m or 0.0:.2f} m (95 %)"
             )
         if outcome.control is not None and outcome.control.control.marks:
             lines.extend(f"note: {text}" for text in outcome.control.file.notes)

@@ -4,9 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from ingest.photo import Photo
@@ -53,6 +55,7 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         height_datum=feature_map.height_datum,
         scale=feature_map.placement.local_from_sfm.scale,
         residual_rms_m=feature_map.placement.residual_rms_m,
+        radius_m=_radius_m(feature_map),
         gates=figures,
         cameras=_cameras(component, options),
         errors_px=feature_map.points.error_px,
@@ -60,6 +63,13 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
         plan=_plan(component, feature_map),
         control=component.control,
     )
+
+
+def _radius_m(feature_map: FeatureMap) -> float:
+    """Horizontal, of 95 %: the longer half axis of the ellipse at the median camera, metres."""
+    at = point_jacobian(np.array([image.cam_from_local.center for image in feature_map.images]))[:, :2]
+    spread = at @ feature_map.placement.covariance @ at.transpose(0, 2, 1)
+    return float(np.median(np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(spread)[:, -1])))
 
 
 def _unplaced_outcome(component: Component, unplaced: UnplacedMap, options: MapMakingOptions) -> MapOutcome:

@@ -143,6 +143,7 @@ class MapOutcome:
         gates: figures of every gate, JSON-able.
         scale: metres per unit of the reconstruction.
         residual_rms_m: of the GPS positions that were used.
+        radius_m: horizontal, in which the true place of its cameras lies with 95 %, by the covariance.
         descriptors: observations with descriptors.
         errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
         plan: None where the map has no place.
@@ -162,6 +163,7 @@ class MapOutcome:
     height_datum: str = ""
     scale: float | None = None
     residual_rms_m: float | None = None
+    radius_m: float | None = None
     gates: Mapping[str, Any] = field(default_factory=dict)
     cameras: tuple[CameraOutcome, ...] = ()
     errors_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -315,6 +317,7 @@ def _map_json(outcome: MapOutcome) -> dict[str, Any]:
         "height_datum": outcome.height_datum,
         "scale": outcome.scale,
         "residual_rms_m": outcome.residual_rms_m,
+        "radius_m": outcome.radius_m,
         "warnings": outcome.warnings,
         "gates": outcome.gates,
         "cameras": [

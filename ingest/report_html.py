@@ -68,6 +68,7 @@ def _map(outcome: MapOutcome) -> str:
         ("points", f"{outcome.points:,}"),
         ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
         (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
+        ("place known to", number(outcome.radius_m, "{:.2f} m horizontally (95 %)")),
         ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
         ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
         ("map id", outcome.map_id or "none"),

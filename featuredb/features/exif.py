@@ -34,14 +34,14 @@ _FOCAL_RANGE = (0.1, 40.0)
 _MAX_TEXT = 200
 _MAX_WARNINGS = 20
 
-_XMP_NAMES = {
-    "drone-dji": (
+_XMP_NAMES = {  # by namespace, which Autel writes without "-dji", and some Pix4D's with a small letter
+    "drone(?:-dji)?": (
         *XMP_ANGLES["drone-dji"],
         *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
         *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
     ),
     "drone-parrot": XMP_ANGLES["drone-parrot"],
-    "Camera": (  # Pix4D's, which Parrot, senseFly and others write
+    "[Cc]amera": (  # Pix4D's, which Parrot, senseFly and others write
         *XMP_ANGLES["Camera"],
         *("GPSXYAccuracy", "GPSZAccuracy", "IMUYawAccuracy", "IMUPitchAccuracy", "IMURollAccuracy"),
     ),

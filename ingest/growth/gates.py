@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom, chi2
 
+from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
 
 # Chi-square with two degrees of freedom is above this once in 10,000 honest positions (as in reloc.prior).
@@ -137,7 +138,9 @@ def runner_up(rival_photos: int, agreeing: int, limit: float) -> Gate:
     )
 
 
-def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, least: int = 2) -> Gate:
+def geotags(
+    offsets_m: FloatArray, covariances: FloatArray, limit: float, least: int = 2, by: str = ""
+) -> Gate:
     """Share of the photos with a position that their place contradicts.
 
     At least `least` must contradict before it counts: a photo may lie about its place. Then most of them may
@@ -147,11 +150,17 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, least:
     Args:
         offsets_m: (n, 2) placed centre minus position, east and north.
         covariances: (n, 2, 2) of both together.
+        by: the maps that place the photos.
     """
-    against = 0
+    against, where = 0, ""
     if len(offsets_m):
         solved = np.linalg.solve(covariances, offsets_m[:, :, None])[:, :, 0]
-        against = int((np.einsum("ni,ni->n", offsets_m, solved) > GPS_LIMIT).sum())
+        contradict = np.einsum("ni,ni->n", offsets_m, solved) > GPS_LIMIT
+        against = int(contradict.sum())
+        if against:
+            where = (
+                f" by {by}" * bool(by) + f", which is {way_words(*np.median(offsets_m[contradict], axis=0))}"
+            )
     share = against / len(offsets_m) if len(offsets_m) else 0.0
     by_accident = float(binom.sf(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
     return Gate(
@@ -160,7 +169,7 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, least:
         figure=share,
         limit=limit,
         passes=against < least or (share <= limit and by_accident >= _ACCIDENT),
-        message=f"{against} of {len(offsets_m)} positions contradict the placement (chi-square above "
+        message=f"{against} of {len(offsets_m)} positions contradict the placement{where} (chi-square above "
         f"{GPS_LIMIT}), a share of {limit:.0%} is allowed, and what happens once in {1 / _ACCIDENT:.0f} "
         f"times if {_WRONG_TAGS:.0%} of all positions are wrong",
     )

@@ -232,7 +232,9 @@ def _ask(
         gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
         gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
         gates.runner_up(rivals, len(agree), options.max_rival),
-        gates.geotags(offsets_gps, spreads_gps, options.max_against_gps),
+        gates.geotags(
+            offsets_gps, spreads_gps, options.max_against_gps, by=", ".join(e.map_id for e in edges)
+        ),
         gates.visibility(shows[np.isfinite(shows)], options.visibility.min_visible, options.max_blind),
     )
 

@@ -63,7 +63,13 @@ def adjust_together(
         return JointAdjustment(
             reason="UNCONNECTED",
             message=f"maps {', '.join(alone)} have fewer than {options.min_shared_points} points in common "
-            f"with the others; {links.heard} photos were found in other maps",
+            f"with the others; {links.heard} photos were found in other maps"
+            + (
+                f", {len(links.elsewhere)} others {links.elsewhere_m:,.0f} m from where their own map has "
+                "them: the positions of one of the maps are wrong, or the places look alike"
+                if links.elsewhere
+                else ""
+            ),
             shared_points=shared,
             elsewhere=links.elsewhere,
         )

@@ -4,20 +4,18 @@ What a map keeps of its images, observations with descriptors, is asked of the o
 An image that the others have elsewhere than its own map is not heard: it shows a place that looks alike.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.canaries import features_and_points
 from ingest.growth.localised import LocaliseEachOptions, in_frame
 from ingest.growth.overlaps import localise_image
-from ingest.growth.values import LocalisedPhoto
 from reloc.candidates import IndexedArea
 
 
@@ -46,7 +44,7 @@ class Links:
         map_a, point_a, map_b, point_b: (k,) indices of the maps, a below b, and rows of their points.
         votes: (k,) images that say so.
         heard: number of images that were localised in other maps where their own has them.
-        elsewhere: names of those that were localised elsewhere.
+        elsewhere: names of those that were localised elsewhere. elsewhere_m: how far, their median.
     """
 
     map_a: NDArray[np.int64]
@@ -56,12 +54,13 @@ class Links:
     votes: NDArray[np.int64]
     heard: int
     elsewhere: tuple[str, ...]
+    elsewhere_m: float = 0.0
 
 
 def find_links(maps: Sequence[FeatureMap], options: LinkOptions) -> Links:
     """Links between any two of the maps; they have one extractor and one height datum."""
     found: list[NDArray[np.int64]] = []
-    heard, elsewhere = 0, []
+    heard, elsewhere = 0, dict[str, float]()
     for a, feature_map in enumerate(maps):
         others = [m for m in maps if m is not feature_map]
         index = {m.map_id: b for b, m in enumerate(maps)}
@@ -74,8 +73,12 @@ def find_links(maps: Sequence[FeatureMap], options: LinkOptions) -> Links:
             photo = localise_image(feature_map, image, row, [indexed], options.localise)
             if photo is None:
                 continue
-            if _shift_rel(feature_map, image, points, photo, feature_map.frame) > options.max_shift_rel:
-                elsewhere.append(image.name)
+            center = image.cam_from_local.center
+            there = in_frame(photo, feature_map.frame).cam_from_local.center
+            reach = float(np.median(np.linalg.norm(feature_map.points_local()[points] - center, axis=1)))
+            shift = float(np.linalg.norm(there - center))
+            if shift > options.max_shift_rel * max(reach, 1e-9):
+                elsewhere[image.name] = shift
                 continue
             heard += 1
             b = np.array([index[m] for m in photo.map_ids], dtype=np.int64)[photo.map_of]
@@ -84,24 +87,12 @@ def find_links(maps: Sequence[FeatureMap], options: LinkOptions) -> Links:
             swap = b < a
             quads[swap] = quads[swap][:, [2, 3, 0, 1]]
             found.append(quads)
-    return _voted(np.concatenate([np.zeros((0, 4), np.int64), *found]), heard, tuple(elsewhere), options)
+    return _voted(np.concatenate([np.zeros((0, 4), np.int64), *found]), heard, elsewhere, options)
 
 
-def _shift_rel(
-    feature_map: FeatureMap,
-    image: MapImage,
-    points: NDArray[np.int64],
-    photo: LocalisedPhoto,
-    frame: LocalFrame,
-) -> float:
-    """Way between the image's two centres over its median viewing distance."""
-    center = image.cam_from_local.center
-    reach = float(np.median(np.linalg.norm(feature_map.points_local()[points] - center, axis=1)))
-    there = in_frame(photo, frame).cam_from_local.center
-    return float(np.linalg.norm(there - center)) / max(reach, 1e-9)
-
-
-def _voted(quads: NDArray[np.int64], heard: int, elsewhere: tuple[str, ...], options: LinkOptions) -> Links:
+def _voted(
+    quads: NDArray[np.int64], heard: int, elsewhere: Mapping[str, float], options: LinkOptions
+) -> Links:
     """The pairs that most of the images that have a say name, on both sides, most votes first."""
     pairs, votes = np.unique(quads, axis=0, return_counts=True)
     sure = np.ones(len(pairs), dtype=np.bool_)
@@ -120,5 +111,6 @@ def _voted(quads: NDArray[np.int64], heard: int, elsewhere: tuple[str, ...], opt
         point_b=pairs[:, 3],
         votes=votes.astype(np.int64),
         heard=heard,
-        elsewhere=elsewhere,
+        elsewhere=tuple(elsewhere),
+        elsewhere_m=float(np.median(list(elsewhere.values()))) if elsewhere else 0.0,
     )

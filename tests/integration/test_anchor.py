@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from featuredb.cli.main import main
-from featuredb.errors import ConflictError
+from featuredb.errors import ConflictError, RegistrationError
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.lidar.add import add_scan
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
+from featuredb.store.scans import list_scans
 from ingest.anchor_cli import summary
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.pipeline import IngestOptions, ingest_photos
@@ -243,6 +244,22 @@ def lost(feature_map: FeatureMap, by_m: FloatArray) -> FeatureMap:
     images = tuple(replace(i, cam_from_local=i.cam_from_local @ back) for i in feature_map.images)
     utm = feature_map.frame.utm_from_enu(feature_map.points_local() + by_m, feature_map.epsg)
     return replace(feature_map, images=images, points=replace(feature_map.points, utm=utm))
+
+
+def test_a_scan_that_lies_elsewhere_is_told_with_the_distance(
+    hills: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    photos, right, _ = hills
+    database = Database.open(shutil.copytree(right.parent / "plain", tmp_path / "db"))
+    add_scan(database, [write_hill_scan(tmp_path / "far.laz", offset_m=(-50_000.0, 0.0, 0.0))])
+    map_id = only_map(tmp_path / "db").map_id
+    scan_id = list_scans(database)[0].scan_id
+    for scans in ((), (scan_id,)):
+        request = AnchorRequest(map_id=map_id, photos=photos, scan_ids=scans, out=tmp_path / "out", auto=True)
+        with pytest.raises(
+            RegistrationError, match=r"lies (49\.9|50\.0) km to the west.*positions are all wrong"
+        ):
+            anchor(database, request)
 
 
 def test_picks_with_an_outlier_start_a_map_that_lies_elsewhere(

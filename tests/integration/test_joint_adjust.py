@@ -1,6 +1,7 @@
 """`featuredb adjust`: bent maps of one strip straighten each other; what must not happen does not."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -156,6 +157,13 @@ def test_maps_without_common_points_are_refused(anchor: FeatureMap) -> None:
     found = adjust_together([anchor, strip_map("away", 180.0)])
     assert (found.reason, found.maps) == ("UNCONNECTED", ())
     assert "0 photos were found" in found.message
+
+
+def test_maps_whose_positions_are_shifted_are_refused_with_the_distance(anchor: FeatureMap) -> None:
+    found = adjust_together([anchor, strip_map("shifted", 45.0, move=east(50_000.0), seed=4)])
+    assert found.reason == "UNCONNECTED"
+    (metres,) = re.findall(r"([0-9,]+) m from where their own map has them", found.message)
+    assert float(metres.replace(",", "")) == pytest.approx(50_000.0, abs=20.0)
 
 
 def of_another_scene(metres: float) -> FeatureMap:

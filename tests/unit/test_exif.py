@@ -285,6 +285,11 @@ def test_a_compass_tells_only_yaw() -> None:
     assert found.sigma_yaw_deg == 20.0
 
 
+def test_autel_has_djis_names_in_a_namespace_of_its_own() -> None:
+    found = info(None, None, gps_tags(), xmp=XMP.replace(b"drone-dji:", b"drone:"))
+    assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.015, 0.03, "rtk")
+
+
 def test_dji_single_point_solution_is_not_rtk() -> None:
     found = info(None, None, gps_tags(), xmp=XMP.replace(b'RtkFlag="50"', b'RtkFlag="16"'))
     assert found.sigma_source == "default"
@@ -303,6 +308,7 @@ def test_accuracies_as_pix4d_names_them() -> None:
     xmp = b'<x Camera:GPSXYAccuracy="0.021"><Camera:GPSZAccuracy>0.04</Camera:GPSZAccuracy></x>'
     found = info(None, None, gps_tags(), xmp=xmp)
     assert (found.sigma_horizontal_m, found.sigma_vertical_m, found.sigma_source) == (0.021, 0.04, "stated")
+    assert info(None, None, gps_tags(), xmp=xmp.replace(b"Camera", b"camera")).sigma_source == "stated"
     absurd = info(None, None, gps_tags(), xmp=b'<x Camera:GPSXYAccuracy="99999"/>')
     assert absurd.sigma_source == "default"
     assert any("absurd" in warning for warning in absurd.warnings)

@@ -178,13 +178,48 @@ def test_a_scale_that_is_not_known_is_refused(world: SurveyedBlock) -> None:
 def test_another_zone_contradicts_gps(world: SurveyedBlock) -> None:
     gps = LOCAL_FROM_BLOCK.act(world.block.centers()) + np.array([3_000.0, 0.0, 0.0])
     control = world.control(world.control_local)
-    placed = place_by_gcp(world.block, control, _OPTIONS, gps_local=gps, gps_sigma_m=5.0)
+    placed = place_by_gcp(world.block, control, _OPTIONS, gps_local=gps, gps_sigma_m=(5.0, 10.0))
     assert placed.reason == "CONTRADICTS_GPS"
     assert "3,000 m" in placed.message
     near = place_by_gcp(
-        world.block, control, _OPTIONS, gps_local=gps - np.array([2_990.0, 0.0, 0.0]), gps_sigma_m=5.0
+        world.block, control, _OPTIONS, gps_local=gps - np.array([2_990.0, 0.0, 0.0]), gps_sigma_m=(5.0, 10.0)
     )
     assert near.accepted
+
+
+@pytest.mark.parametrize(
+    ("off_m", "sigma_m", "told"),
+    [
+        ((0.0, 0.0, 20.0), (0.02, 0.02), ["GPS heights are 20."]),
+        ((0.0, 0.0, -20.0), (0.02, 0.02), ["below those of the control points"]),
+        ((1.5, -2.0, 0.0), (0.02, 0.02), ["GPS is 2."]),
+        ((0.03, 0.0, 0.05), (0.02, 0.02), []),
+        ((3.0, -4.0, 15.0), (4.0, 10.0), []),  # a plain receiver's
+    ],
+)
+def test_an_offset_of_the_photos_gps_is_told_beyond_noise(
+    world: SurveyedBlock, off_m: tuple[float, ...], sigma_m: tuple[float, float], told: list[str]
+) -> None:
+    noise = np.random.default_rng(4).normal(0, 0.02, (len(world.block.names), 3))
+    gps = LOCAL_FROM_BLOCK.act(world.block.centers()) + noise + np.array(off_m)
+    gps[2] += 60.0  # one receiver without a fix
+    control = world.control(_noisy(world, 0.02))
+    placed = place_by_gcp(world.block, control, _OPTIONS, gps_local=gps, gps_sigma_m=sigma_m)
+    assert placed.accepted, placed.message
+    notes = [note for note in placed.notes if "GPS" in note]
+    assert len(notes) == len(told)
+    assert all(words in note for words, note in zip(told, notes, strict=True))
+    found = np.array(placed.figures["gps_offset_m"]) - off_m
+    assert (np.abs(found) < 2.0 * np.array(placed.figures["gps_offset_sigma_m"])).all()
+
+
+def test_gps_without_heights_says_nothing_of_them(world: SurveyedBlock) -> None:
+    gps = LOCAL_FROM_BLOCK.act(world.block.centers())
+    gps[:, 2] = np.nan
+    control = world.control(world.control_local)
+    placed = place_by_gcp(world.block, control, _OPTIONS, gps_local=gps, gps_sigma_m=(0.02, 0.02))
+    assert placed.figures["gps_offset_m"][2] is None
+    assert not any("GPS" in note for note in placed.notes)
 
 
 def test_marks_that_cannot_be_used_are_told(world: SurveyedBlock) -> None:

@@ -53,6 +53,8 @@ def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
     refused = gates.geotags(most, spread, 0.5)
     assert not refused.passes
     assert refused.figure == pytest.approx(2 / 3)
+    assert "which is 2.7 km to the east" in refused.message
+    assert "placement by map, which is 5.0 km" in gates.geotags(liar, spread, 0.5, by="map").message
     assert gates.geotags(np.zeros((0, 2)), np.zeros((0, 2, 2)), 0.5).passes
 
 

@@ -240,6 +240,58 @@ REAL: tuple[Row, ...] = (
         minutes=15,
     ),
     Row(
+        name="karma-placed",
+        group="real",
+        form="full",
+        claim="`karma.mp4`, 12 s by a drone straight ahead: placed by its telemetry; its track against its "
+        "own GPS, inside the 95 % radius that it states",
+        commands=(("tools.film_placed", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
+        figures=same(
+            *(
+                "keyframes",
+                "mapped",
+                "active",
+                "tracked",
+                "compared",
+                "radius_m",
+                "rms_m",
+                "largest_m",
+                "inside",
+            )
+        ),
+        text="{mapped} of {keyframes} keyframes, {tracked} frames tracked; radius {radius_m:.1f} m, off by "
+        "{rms_m:.1f} m (root mean square) and {largest_m:.1f} m at most; {inside:.1%} of {compared} inside",
+        limits=(
+            Limit(figure="mapped", least=24),
+            Limit(figure="active", least=1),
+            Limit(figure="inside", least=0.95),
+        ),
+        needs=("video/karma.mp4",),
+        minutes=1,
+    ),
+    Row(
+        name="shifted-positions",
+        group="real",
+        form="full",
+        claim="`brighton`, the positions of every second photo shifted by 50 km together: they become a map "
+        "there; `anchor` on the scan, `adjust` with the map of the others, and `grow` say by how far",
+        commands=(
+            (
+                *("tools.shifted_positions", "--photos", BRIGHTON, "--scan", SCAN),
+                *("--work", "{work}/maps", *OUT),
+            ),
+        ),
+        figures=same("active", "photos", "anchor_km", "adjust_km", "grow_km"),
+        text="{photos} photos placed; said: {anchor_km:.1f} km from the scan, {adjust_km:.1f} km from the "
+        "other map, {grow_km:.1f} km where the photos are contributed",
+        limits=(
+            Limit(figure="active", least=1),
+            *(Limit(figure=f"{who}_km", least=49.0, most=51.0) for who in ("anchor", "adjust", "grow")),
+        ),
+        needs=("brighton/images", "brighton/model.laz"),
+        minutes=4,
+    ),
+    Row(
         name="karma-in-map",
         group="real",
         form="full",

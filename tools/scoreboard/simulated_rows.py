@@ -154,6 +154,39 @@ SIMULATED: tuple[Row, ...] = (
         minutes=15,
     ),
     Row(
+        name="rtk-placed",
+        group="simulated",
+        form="full",
+        claim="18 photos with positions good to 2 cm, said by XMP of DJI, of Autel and of Pix4D (senseFly, "
+        "Parrot), by EXIF, by a table and by geo.txt; then heights 20 m off, against control points",
+        commands=(("tools.rtk_placed", "--work", "{work}/rtk", "--inputs", "{cache}", *OUT),),
+        figures=same("active", "worst_m", "worst_sigma_m", "told_m", "told_wrongly"),
+        text="{active} of 6 maps answer, worst median {worst_m:.3f} m, place known to {worst_sigma_m:.3f} m; "
+        "heights said to be {told_m:.2f} m off, {told_wrongly} times wrongly",
+        limits=(
+            Limit(figure="active", least=6),
+            Limit(figure="worst_m", most=0.03),
+            Limit(figure="worst_sigma_m", most=0.04),
+            Limit(figure="told_m", least=19.0, most=21.0),
+            Limit(figure="told_wrongly", most=0),
+        ),
+        minutes=6,
+    ),
+    Row(
+        name="rolling-shutter",
+        group="simulated",
+        form="full",
+        claim="photos of four simulated flights, smooth and jerky, with rows read out over 30 ms, placed by "
+        "a drone's receiver and by RTK: what answers is inside 99.9 %, what does not names the rolling "
+        "shutter",
+        commands=(("tools.rolling_shutter", "--work", "{work}/rolling", "--inputs", "{cache}", *OUT),),
+        figures=same("flights", "active", "outside", "held_back", "unnamed", "worst_squared"),
+        text="{active} of {flights} answer, {outside} of them outside (worst squared error "
+        "{worst_squared:.1f}; 16.3 is 99.9 %); {held_back} do not, {unnamed} without naming it",
+        limits=(Limit(figure="outside", most=0), Limit(figure="unnamed", most=0)),
+        minutes=8,
+    ),
+    Row(
         name="town-held-out",
         group="simulated",
         form="full",

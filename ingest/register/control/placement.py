@@ -27,6 +27,7 @@ from ingest.register.control.fit import (
     fit_similarity,
     hypotheses,
 )
+from ingest.register.control.gps_offset import gps_offset
 from ingest.register.control.level import LevelOptions, level_ground
 from ingest.register.control.marks import Control
 from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
@@ -118,7 +119,7 @@ def place_by_gcp(
     *,
     vertical: Vertical | None = None,
     gps_local: FloatArray | None = None,
-    gps_sigma_m: float = 0.0,
+    gps_sigma_m: tuple[float, float] = (0.0, 0.0),
 ) -> GcpPlacement:
     """Place and adjust a block by control points.
 
@@ -127,7 +128,8 @@ def place_by_gcp(
         control: its marks, and the surveyed positions in the local frame.
         vertical: what is known of tilt and height from elsewhere, used where the points do not tell.
         gps_local: (k, 3) the photos' own positions in the local frame, NaN where there are none; they
-            only guard against gross errors of the file.
+            guard against gross errors of the file, and what they are off by is told.
+        gps_sigma_m: that they state, horizontal and vertical.
     """
     found = hypotheses(block, control, options.fit)
     usable = sorted({h.point for h in found})
@@ -213,7 +215,7 @@ def _adjusted_placement(
     options: GcpOptions,
     notes: list[str],
     gps_local: FloatArray | None,
-    gps_sigma_m: float,
+    gps_sigma_m: tuple[float, float],
 ) -> GcpPlacement:
     placed = block.moved(fit.local_from_block)
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
@@ -296,7 +298,10 @@ def _figures(
 
 
 def _gate(
-    placement: GcpPlacement, gps_local: FloatArray | None, gps_sigma_m: float, options: GcpOptions
+    placement: GcpPlacement,
+    gps_local: FloatArray | None,
+    gps_sigma_m: tuple[float, float],
+    options: GcpOptions,
 ) -> GcpPlacement:
     """The gates that look at the finished placement."""
     figures = dict(placement.figures)
@@ -323,18 +328,22 @@ def _gate(
             message="the control points put the cameras under the ground, looking up; x and y of the survey "
             "are probably exchanged, or heights have the wrong sign",
         )
+    notes: list[str] = []
     if gps_local is not None and np.isfinite(gps_local[:, 0]).any():
-        offset = np.nanmedian(gps_local[:, :2] - placement.block.centers()[:, :2], axis=0)
-        figures["gps_offset_m"] = offset.tolist()
-        if np.linalg.norm(offset) > options.max_gps_offset_m + 3.0 * gps_sigma_m:
+        assert placement.covariance is not None
+        centers = placement.block.centers()
+        found, notes = gps_offset(gps_local, gps_sigma_m, centers, placement.covariance)
+        figures |= found
+        away = float(np.linalg.norm(figures["gps_offset_m"][:2]))
+        if away > options.max_gps_offset_m + 3.0 * gps_sigma_m[0]:
             return replace(
                 placement,
                 reason="CONTRADICTS_GPS",
-                message=f"the control points put the photos {np.linalg.norm(offset):,.0f} m from their GPS; "
+                message=f"the control points put the photos {away:,.0f} m from their GPS; "
                 "check the file's reference system, its zone and its units",
                 figures=figures,
             )
-    return replace(placement, figures=figures)
+    return replace(placement, figures=figures, notes=(*placement.notes, *notes))
 
 
 def _refused(reason: GcpReason, message: str, figures: dict[str, Any]) -> GcpPlacement:

@@ -139,15 +139,18 @@ def vertical_of(
     )
 
 
-def gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, float]:
-    """The photos' own positions (k, 3) in a frame, NaN where there is none, and their median sigma."""
+def gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, tuple[float, float]]:
+    """The photos' own positions (k, 3) in a frame, NaN where not known, and the medians of their sigmas."""
     gps = np.full((len(priors), 3), np.nan)
     for row, prior in enumerate(priors):
         if prior is not None:
             height = frame.height_m if prior.height_m is None else prior.height_m
             gps[row] = frame.enu_from_geodetic((prior.latitude_deg, prior.longitude_deg, height))
-    sigmas = [prior.sigma_horizontal_m for prior in priors if prior is not None]
-    return gps, float(np.median(sigmas)) if sigmas else 0.0
+            if prior.height_m is None:
+                gps[row, 2] = np.nan
+    sigmas = [(prior.sigma_horizontal_m, prior.sigma_vertical_m) for prior in priors if prior is not None]
+    horizontal, vertical = np.median(sigmas, axis=0).tolist() if sigmas else (0.0, 0.0)
+    return gps, (horizontal, vertical)
 
 
 def _frame(feature_map: FeatureMap, file: ControlFile) -> LocalFrame:

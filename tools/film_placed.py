@@ -1,0 +1,105 @@
+"""A film with telemetry becomes a map with a place; its track is compared with the telemetry itself.
+
+    python -m tools.film_placed FILM.mp4 [--work FOLDER]
+
+`featuredb ingest video`, then `featuredb track` by the map. The receiver's own noise is part of the
+distances between track and telemetry, the radius is that of the track: of the horizontal ellipse that holds
+95 %, at the median frame. Exit code 0 if the track lies within it at 95 % of the frames that have a position.
+"""
+
+import argparse
+import csv
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.geo.utm import utm_from_geodetic
+from featuredb.geometry.arrays import FloatArray
+from featuredb.store import Database
+from featuredb.video.telemetry import telemetry_of_video
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+
+_WITHIN = float(chi2.ppf(0.95, 2))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilmPlaced:
+    """What came of a film.
+
+    Attributes:
+        keyframes: of the film; mapped: of them, in the placed map. active: whether the map answers.
+        tracked: frames with a pose; compared: of them, with a position by the telemetry.
+        radius_m: horizontal, 95 %. rms_m, largest_m: horizontal distance from track to telemetry.
+        inside: share of `compared` within 95 % of the track's covariance.
+    """
+
+    keyframes: int
+    mapped: int
+    active: int
+    tracked: int
+    compared: int
+    radius_m: float
+    rms_m: float
+    largest_m: float
+    inside: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("film", type=Path)
+    parser.add_argument("--work", type=Path, default=None, help="keep database and track there")
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        made = film_placed(args.film, args.work or Path(scratch))
+    sys.stdout.write(f"{made}\n")
+    write_figures(args.json, asdict(made))
+    return 0 if made.inside >= 0.95 else 1
+
+
+def film_placed(film: Path, work: Path) -> FilmPlaced:
+    """Ingest and track a film in a folder."""
+    database, track = work / "db", work / "track.csv"
+    featuredb("ingest", "video", str(database), str(film), "--quiet")
+    (placed,) = Database.open(database).snapshot().maps()
+    featuredb("track", str(database), str(film), "--map", placed.map_id, "--out", str(track))
+    with track.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["easting"]]
+    off, covariances = _off_telemetry(film, rows)
+    squares = np.einsum("ni,nij,nj->n", off, np.linalg.inv(covariances), off)
+    metres = np.linalg.norm(off, axis=1)
+    radii = np.sqrt(_WITHIN * np.linalg.eigvalsh(covariances)[:, -1])
+    return FilmPlaced(
+        keyframes=len(list((database / "_work" / "films").rglob("*.jpg"))),
+        mapped=placed.images,
+        active=int(placed.status == "active"),
+        tracked=len(rows),
+        compared=len(off),
+        radius_m=float(np.median(radii)),
+        rms_m=float(np.sqrt((metres**2).mean())),
+        largest_m=float(metres.max()),
+        inside=float((squares <= _WITHIN).mean()),
+    )
+
+
+def _off_telemetry(film: Path, rows: Sequence[dict[str, str]]) -> tuple[FloatArray, FloatArray]:
+    """East and north from telemetry to track (n, 2) where it has a position, and the track's covariances."""
+    telemetry = telemetry_of_video(film)
+    assert telemetry is not None
+    at = telemetry.at([float(row["time_s"]) for row in rows])
+    known = at.has_position
+    there = np.column_stack([at.latitude_deg, at.longitude_deg, np.zeros(len(rows))])[known]
+    told = utm_from_geodetic(there, int(rows[0]["epsg"]))[:, :2]
+    found = np.array([[float(row[axis]) for axis in ("easting", "northing")] for row in rows])[known]
+    spread = np.array([[[row["cov_e_e"], row["cov_e_n"]], [row["cov_e_n"], row["cov_n_n"]]] for row in rows])
+    return found - told, spread.astype(np.float64)[known]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,209 @@
+"""Positions good to 2 cm, said in each way that makers and tables have: believed, and how right is the map?
+
+    python -m tools.rtk_placed --work FOLDER [--inputs FOLDER]
+
+1. A flight over the simulated town; its photos get positions with 2 cm of noise per axis, the same for all.
+2. Each way of saying so is ingested by itself: XMP of DJI, of Autel, of Pix4D (which senseFly and Parrot
+   write), EXIF's error of positioning, a table's columns, geo.txt. Beside XMP, EXIF says 5 m.
+3. Control points, of 2 cm and marked to half a pixel, place the right flight, and one whose GPS heights
+   are all 20 m too high: that and nothing else has to be told.
+
+Believed is what gives a map whose place is known to 4 cm (a standard deviation per axis). Exit code 0 if all
+maps answer and are believed, no median is more than 3 cm off, and the offset is told rightly.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.features.exif_gps_write import GpsFields, with_gps
+from featuredb.features.image_header import read_header
+from featuredb.features.jpeg_segments import with_app1
+from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.flight import FlightOptions
+from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.truth import TrueImage, Truth
+from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
+from featuredb.store import Database
+from tools.anchor_simworld import camera_errors, featuredb
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import copied
+
+_SIGMA_M, _OTHERWISE_M, _DATUM_M = 0.02, 5.0, 20.0
+_LIMIT_M, _BELIEVED_M = 0.03, 0.04
+_RADIUS_68 = float(np.sqrt(-2.0 * np.log(1.0 - 0.68)))
+_XMP = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF><rdf:Description {words}/></rdf:RDF></x:xmpmeta>'
+_RTK = '{0}:RtkFlag="50" {0}:RtkStdLat="0.02" {0}:RtkStdLon="0.02" {0}:RtkStdHgt="0.02"'
+_TAGS = {
+    "dji": _RTK.format("drone-dji"),
+    "autel": _RTK.format("drone"),
+    "pix4d": 'Camera:GPSXYAccuracy="0.02" Camera:GPSZAccuracy="0.02"',
+    "exif": "",
+}
+_WAYS = (*_TAGS, "table", "geo_txt")
+_MOST = ("--max-features", "4000", "--quiet")
+_POINTS, _MARK_PX = 9, 0.5
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--inputs", type=Path, default=None, help="keep the photos there, not in --work")
+    parser.add_argument("--seed", type=int, default=1)
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    flight = FlightOptions(lines=3, per_line=5, oblique=3, width=1024)
+    options = replace(WorldOptions.short(args.seed), flight=flight, queries=0, street=0, negatives_per_kind=0)
+    inputs = (args.inputs or args.work) / f"rtk-flight-{args.seed}"
+    whole = (inputs / "truth.json").is_file()
+    world = open_world(inputs) if whole else write_world(inputs, options)
+    rng = np.random.default_rng((args.seed, 11))
+    images = world.truth.group("drone")
+    places = np.array([image.cam_from_local.center for image in images])
+    places = places + rng.normal(0.0, _SIGMA_M, places.shape)
+    figures: dict[str, float] = {}
+    for way in _WAYS:
+        source = said(world, places, way, args.work / way)
+        figures |= ingested(args.work / f"{way}.db", source, world.truth, way)
+    figures |= with_control(world, options, places, args.work, rng)
+    figures["worst_m"] = max(figures[f"{way}_m"] for way in _WAYS)
+    figures["worst_sigma_m"] = max(figures[f"{way}_sigma_m"] for way in _WAYS)
+    figures["active"] = sum(figures[f"{way}_active"] for way in _WAYS)
+    write_figures(args.json, figures)
+    right = all(
+        figures[f"{way}_active"]
+        and figures[f"{way}_m"] <= _LIMIT_M
+        and figures[f"{way}_sigma_m"] <= _BELIEVED_M
+        for way in _WAYS
+    )
+    told = abs(figures["told_m"] - _DATUM_M) < 1.0 and not figures["told_wrongly"]
+    return 0 if right and told else 1
+
+
+def said(world: World, places: FloatArray, way: str, folder: Path) -> Path:
+    """The flight's photos with these positions (n, 3), said in a way; what to ingest."""
+    images = world.truth.group("drone")
+    names = [Path(image.name).name for image in images]
+    if way in _TAGS:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, place in zip(names, places, strict=True):
+            error_m = _SIGMA_M * _RADIUS_68 if way == "exif" else _OTHERWISE_M
+            data = (world.folder / "drone" / name).read_bytes()
+            (folder / name).write_bytes(tagged(data, world.truth, place, error_m, _TAGS[way]))
+        return folder
+    copied(world.folder / "drone", names, folder, strip=True)
+    geodetic = np.array([world.truth.frame.geodetic_from_enu(place) for place in places])
+    table = folder / ("geo.txt" if way == "geo_txt" else "table.csv")
+    lines = ["EPSG:4326" if way == "geo_txt" else "path,lat,lon,height,accuracy,accuracy_height"]
+    for name, (lat, lon, up) in zip(names, geodetic.tolist(), strict=True):
+        if way == "geo_txt":
+            lines.append(f"{name} {lon:.10f} {lat:.10f} {up:.4f} 0 0 0 {_SIGMA_M} {_SIGMA_M}")
+        else:
+            lines.append(f"{name},{lat:.10f},{lon:.10f},{up:.4f},{_SIGMA_M},{_SIGMA_M}")
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return table
+
+
+def tagged(data: bytes, truth: Truth, place: FloatArray, error_m: float, words: str) -> bytes:
+    """A photo with another position (3,) and XMP; the picture stays bit for bit."""
+    header = read_header(data)
+    assert header.exif is not None
+    latitude, longitude, height = (float(v) for v in truth.frame.geodetic_from_enu(place))
+    fields = GpsFields(
+        latitude_deg=latitude,
+        longitude_deg=longitude,
+        altitude_m=height,
+        reference="ellipsoid",
+        heading_deg=0.0,
+        error_m=error_m,
+    )
+    return with_app1(data, with_gps(data[slice(*header.exif)], fields), _XMP.format(words=words).encode())
+
+
+def ingested(database: Path, source: Path, truth: Truth, way: str) -> dict[str, float]:
+    """Whether a map answers, how many photos it has, and how far off their cameras are (median, m)."""
+    trust = ("--trust-geotags",) if source.is_file() else ()
+    featuredb("ingest", "photos", str(database), str(source), *trust, *_MOST)
+    snapshot = Database.open(database).snapshot()
+    placed = max(snapshot.maps(), key=lambda one: one.images)
+    feature_map = snapshot.load_map(placed.map_id)
+    metres, _ = camera_errors(feature_map, truth)
+    evidence = feature_map.placement.evidence
+    sigma_m = float(np.hypot(evidence["bias_sigma_m"][0], evidence["noise_m"][0]))
+    sys.stdout.write(
+        f"{way}: {placed.status}, {len(metres)} photos, {np.median(metres):.4f} m, sigma {sigma_m:.4f} m\n"
+    )
+    return {
+        f"{way}_m": float(np.median(metres)),
+        f"{way}_active": int(placed.status == "active"),
+        f"{way}_photos": len(metres),
+        f"{way}_sigma_m": sigma_m,
+    }
+
+
+def with_control(
+    world: World, options: WorldOptions, places: FloatArray, work: Path, rng: np.random.Generator
+) -> dict[str, float]:
+    """What is told of the heights' offset: with a datum that is 20 m off, and of right positions."""
+    gcp = work / "gcp_list.txt"
+    gcp.write_text(control_text(world, options, rng), encoding="utf-8")
+    right = Database.open(work / "dji.db")
+    featuredb("register", str(work / "dji.db"), right.snapshot().maps()[0].map_id, "--gcp", str(gcp))
+    high = said(world, places + np.array([0.0, 0.0, _DATUM_M]), "dji", work / "high")
+    featuredb("ingest", "photos", str(work / "high.db"), str(high), "--gcp", str(gcp), *_MOST)
+    notes = {}
+    for name in ("dji", "high"):
+        snapshot = Database.open(work / f"{name}.db").snapshot()
+        evidence = snapshot.load_map(snapshot.maps()[0].map_id).placement.evidence
+        notes[name] = [note for note in evidence["notes"] if "GPS" in note]
+    told = [re.search(r"heights are ([0-9.]+) m above", note) for note in notes["high"]]
+    metres = [float(one[1]) for one in told if one is not None]
+    return {
+        "told_m": metres[0] if metres else float("nan"),
+        "told_wrongly": len(notes["dji"]) + len(notes["high"]) - len(metres),
+    }
+
+
+def control_text(world: World, options: WorldOptions, rng: np.random.Generator) -> str:
+    """OpenDroneMap's list: spots of the ground around the middles of photos, marked where they are seen."""
+    scene, images = town_of(options), world.truth.group("drone")
+    depths = [render_depth(scene, image.camera, image.cam_from_local).depth for image in images]
+    lines = [f"EPSG:{world.truth.epsg}"]
+    for k, own in enumerate(np.linspace(0, len(images) - 5, _POINTS).astype(int)):
+        spot = seen_at(images[own], depths[own])
+        utm = world.truth.frame.utm_from_enu(spot + rng.normal(0.0, _SIGMA_M, 3), world.truth.epsg)
+        for image, depth in zip(images, depths, strict=True):
+            xy = marked(image, depth, spot)
+            if xy is not None:
+                x, y = xy + rng.normal(0.0, _MARK_PX, 2)
+                words = " ".join(f"{v:.4f}" for v in (*utm, x, y))
+                lines.append(f"{words} {Path(image.name).name} point{k}")
+    return "\n".join(lines) + "\n"
+
+
+def seen_at(image: TrueImage, depth: np.ndarray) -> FloatArray:
+    """The spot (3,) in the middle of a photo."""
+    row, column = depth.shape[0] // 2, depth.shape[1] // 2
+    ray = np.append(image.camera.unproject(np.array([[column + 0.5, row + 0.5]]))[0], 1.0)
+    return image.cam_from_local.inverse().act(ray * float(depth[row, column]))
+
+
+def marked(image: TrueImage, depth: np.ndarray, spot: FloatArray) -> FloatArray | None:
+    """Where a photo shows a spot (2,), None where it does not."""
+    inside = image.cam_from_local.act(spot)
+    if inside[2] <= 0:
+        return None
+    (xy,) = image.camera.project(inside[None])
+    column, row = int(xy[0]), int(xy[1])
+    if not (10 <= column < image.camera.width - 10 and 10 <= row < image.camera.height - 10):
+        return None
+    return xy if abs(float(depth[row, column]) - inside[2]) < 0.1 else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())

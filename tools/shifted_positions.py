@@ -1,0 +1,122 @@
+"""All positions of a flight shifted by 50 km together: placed, and told where a scan or a map contradicts.
+
+    python -m tools.shifted_positions --photos FOLDER --scan FILE --work FOLDER
+
+1. Every second photo becomes a map by its own positions; the others become one by a table of theirs that are
+   50 km too far east.
+2. `featuredb anchor` of the second map on the scan of the place, which has to say how far away that is.
+3. `featuredb adjust` of both maps, and `featuredb grow` with the second half contributed to a database of the
+   first: both have to say by how far the positions and the other map differ.
+
+Exit code 0 if the shifted map has a place and all three say the distance.
+"""
+
+import argparse
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.geo.utm import geodetic_from_utm, utm_epsg, utm_from_geodetic
+from featuredb.store import Database
+from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidates import contribute
+from tools.anchor_simworld import featuredb
+from tools.figures import add_json_option, write_figures
+from tools.made_maps import copied, photo_names
+
+_SHIFT_M = 50_000.0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--photos", type=Path, metavar="FOLDER", required=True)
+    parser.add_argument("--scan", type=Path, metavar="FILE", required=True)
+    parser.add_argument("--work", type=Path, required=True)
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    names = photo_names(args.photos)
+    right = copied(args.photos, names[::2], args.work / "right", strip=False)
+    shifted = copied(args.photos, names[1::2], args.work / "shifted", strip=False)
+    database, grown = args.work / "db", args.work / "grown.db"
+    for one in (database, grown):
+        featuredb("ingest", "photos", str(one), str(right), "--quiet")
+    table = write_table(shifted, names[1::2])
+    featuredb("ingest", "photos", str(database), str(table), "--trust-geotags", "--quiet")
+    first, second = sorted(Database.open(database).snapshot().maps(), key=lambda m: m.created_at)
+    featuredb("lidar", "add", str(database), str(args.scan))
+    away = args.work / "anchor"
+    words = ("anchor", str(database), second.map_id, "--photos", str(shifted), "--out", str(away), "--auto")
+    figures: dict[str, float | None] = {
+        "active": int(second.status == "active"),
+        "photos": second.images,
+        "anchor_km": told_km(*words, "--quiet"),
+        "adjust_km": told_km("adjust", str(database), first.map_id, second.map_id),
+    }
+    contribute(Database.open(grown), [contribution(shifted / name) for name in names[1::2]])
+    figures["grow_km"] = told_km("grow", str(grown))
+    write_figures(args.json, figures)
+    told = [figures[f"{who}_km"] for who in ("anchor", "adjust", "grow")]
+    return 0 if all(km is not None and abs(km - _SHIFT_M / 1000.0) < 1.0 for km in told) else 1
+
+
+def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:
+    """What a photo says of itself, and its latitude and longitude 50 km further east."""
+    said = read_exif(photo.read_bytes())
+    assert said.latitude_deg is not None
+    assert said.longitude_deg is not None
+    epsg = utm_epsg(said.latitude_deg, said.longitude_deg)
+    utm = utm_from_geodetic((said.latitude_deg, said.longitude_deg, 0.0), epsg)
+    latitude, longitude, _ = geodetic_from_utm(utm + np.array([_SHIFT_M, 0.0, 0.0]), epsg)
+    return said, float(latitude), float(longitude)
+
+
+def write_table(folder: Path, names: Sequence[str]) -> Path:
+    """A table of the shifted positions beside the photos."""
+    lines = ["path,lat,lon,height,accuracy,accuracy_height"]
+    for name in names:
+        said, latitude, longitude = shifted_position(folder / name)
+        sigmas = f"{said.sigma_horizontal_m},{said.sigma_vertical_m}"
+        lines.append(f"{name},{latitude:.8f},{longitude:.8f},{said.altitude_m},{sigmas}")
+    table = folder / "table.csv"
+    table.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return table
+
+
+def contribution(photo: Path) -> Contribution:
+    """The photo as a query contributed it, from its shifted position."""
+    said, latitude, longitude = shifted_position(photo)
+    prior = {"lat": latitude, "lon": longitude, "h": said.altitude_m, "sigma_m": said.sigma_horizontal_m}
+    return Contribution(
+        image=photo.read_bytes(),
+        width=said.width,
+        height=said.height,
+        owner="somebody",
+        licence="CC-BY-4.0",
+        client_id="shifted",
+        received_at=datetime.now(UTC),
+        request={"prior": prior},
+        answer={"status": "not_localised"},
+        snapshot=1,
+    )
+
+
+def told_km(*words: str) -> float | None:
+    """The distance that a command of featuredb names, None where it names none."""
+    command = [sys.executable, "-m", "featuredb.cli", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    sys.stdout.write(f"$ featuredb {' '.join(words)}\n{done.stdout}{done.stderr}")
+    sys.stdout.flush()
+    text = done.stdout + done.stderr
+    found = [float(km) for km in re.findall(r"([0-9.]+) km to the", text)]
+    found += [float(m.replace(",", "")) / 1000.0 for m in re.findall(r"([0-9,]+) m from where", text)]
+    return found[0] if found else None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
