@@ -22,6 +22,10 @@ from ingest.growth.gates import Gate
 
 Independence = Literal["owner", "any"]
 
+# A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
+# photo in common count as one, three photos that confirm each other as one and a half.
+_ONE_PAIR = 1.0
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
@@ -56,10 +60,6 @@ class ConfirmationOptions:
             accepted pose has at least so many inliers (reloc.options), and chance gives a few.
         min_confirmed_share: of the map's photos. Photos at the rim of a map often share less with others;
             a map of which most photos hang on one source alone is that source's claim.
-        min_confirmed_photos: fewer are no map.
-        min_pairs_share: pairs of photos that confirm each other, no photo in two of them, over the confirmed
-            photos. One forged photo was the second source of nineteen of a look-alike block, 0.05; the map
-            of a town's visitors with the fewest has one for eight, 0.12.
         min_parallax: distance of two cameras over their distance from what both see. The same picture given
             by two people, cut or compressed anew, shows no parallax; poses of one place are good to some
             thousandths.
@@ -69,8 +69,6 @@ class ConfirmationOptions:
     trusted_owners: tuple[str, ...] = ()
     min_shared_points: int = 15
     min_confirmed_share: float = 0.5
-    min_confirmed_photos: int = 2
-    min_pairs_share: float = 0.1
     min_parallax: float = 0.01
 
 
@@ -95,7 +93,7 @@ class Confirmation:
     """How far a map is confirmed.
 
     Attributes:
-        gates: "sources", "confirmed_photos", "confirmed_share", "confirming_pairs"; the map is confirmed when
+        gates: "sources", "confirmed_share", "confirming_pairs"; the map is confirmed when
             all pass.
         sources: those among the photos that confirm each other, or are trusted.
         confirmed, unconfirmed: image ids of the map.
@@ -191,7 +189,6 @@ def _gates(
 ) -> tuple[Gate, ...]:
     count, share = int(confirmed.sum()), float(confirmed.mean()) if len(confirmed) else 0.0
     needed = 1 if trusted else 2
-    pairs_share = 1.0 if trusted else pairs / max(count, 1)
     return (
         Gate(
             name="sources",
@@ -200,15 +197,6 @@ def _gates(
             limit=needed,
             passes=len(sources) >= needed,
             message=f"{len(sources)} independent sources see the same of it, {needed} are needed",
-        ),
-        Gate(
-            name="confirmed_photos",
-            reason="FEW_CONFIRMED",
-            figure=count,
-            limit=options.min_confirmed_photos,
-            passes=count >= options.min_confirmed_photos,
-            message=f"{count} of its photos are confirmed by another source, "
-            f"{options.min_confirmed_photos} are needed",
         ),
         Gate(
             name="confirmed_share",
@@ -222,11 +210,11 @@ def _gates(
         Gate(
             name="confirming_pairs",
             reason="FEW_PAIRS",
-            figure=pairs_share,
-            limit=options.min_pairs_share,
-            passes=pairs_share >= options.min_pairs_share,
-            message=f"{count} photos are confirmed by {pairs:g} separate pairs of independent photos, "
-            f"{options.min_pairs_share * count:.1f} are needed",
+            figure=pairs,
+            limit=_ONE_PAIR,
+            passes=trusted or pairs > _ONE_PAIR,
+            message=f"{count} photos are confirmed by one photo alone; another pair of independent photos is "
+            "needed",
         ),
     )
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from ingest.colmap_bridge import Model
@@ -33,7 +34,8 @@ class ContradictionOptions:
 
     Attributes:
         sigmas: between its localised and its refined pose. They are those of the localisation, times the
-            spread and the neighbours factor of the similarity, and those of the refined pose. Spread and
+            spread and the neighbours factor of the similarity, those of the refined pose, and what the lens
+            that it was localised with makes where the refined one is another. Spread and
             factor are the larger ones of before and after the refinement: poses from the same existing points
             share their errors, which the refined model has taken over.
     """
@@ -70,7 +72,9 @@ def contradicting_photos(
         offset = pose_offset(pose, photo)
         into_local = block_diag(pose.rotation.T, pose.rotation.T)
         by_focal = pose_by_focal(photo) * FOCAL_REL
-        own = into_local @ (np.nan_to_num(spread[k]) + np.outer(by_focal, by_focal)) @ into_local.T
+        by_lens = pose_by_lens(photo, model.cameras[int(model.camera_of[k])])
+        lenses = np.outer(by_focal, by_focal) + np.outer(by_lens, by_lens)
+        own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
         square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
         if square > limit:
             found[k] = (
@@ -89,12 +93,23 @@ def center_variance_m2(photo: LocalisedPhoto) -> float:
 
 def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
     """(6,) how a localised pose moves (left perturbation) as its focal length grows by its own size."""
+    middle = photo.camera.project(np.array([[0.0, 0.0, 1.0]]))
+    return _pose_by_pixels(photo, photo.pixels - middle)
+
+
+def pose_by_lens(photo: LocalisedPhoto, refined: Camera) -> FloatArray:
+    """(6,) how far a localised pose is off, if the lens that it was localised with is not the refined one."""
+    seen = photo.cam_from_local.act(photo.points)
+    return _pose_by_pixels(photo, refined.project(seen) - photo.camera.project(seen))
+
+
+def _pose_by_pixels(photo: LocalisedPhoto, moved_px: FloatArray) -> FloatArray:
+    """(6,) the change of pose (left perturbation) that moves the pixels (k, 2) of its points most alike."""
     count = len(photo.pixels)
     if count < 4:
         return np.zeros(6)
-    camera = photo.camera
     linear = linearise(
-        [camera],
+        [photo.camera],
         np.zeros(1, dtype=np.int64),
         [photo.cam_from_local],
         photo.points,
@@ -102,8 +117,6 @@ def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
         np.zeros(count, dtype=np.int64),
         photo.pixels,
     )
-    good = np.isfinite(linear.by_pose).all(axis=(1, 2))
+    good = np.isfinite(linear.by_pose).all(axis=(1, 2)) & np.isfinite(moved_px).all(axis=1)
     by_pose = linear.by_pose[good].reshape(-1, 6)
-    middle = camera.project(np.array([[0.0, 0.0, 1.0]]))
-    by_focal = (photo.pixels[good] - middle).reshape(-1)
-    return np.asarray(np.linalg.lstsq(by_pose, by_focal, rcond=None)[0])
+    return np.asarray(np.linalg.lstsq(by_pose, moved_px[good].reshape(-1), rcond=None)[0])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from featuredb.adjust.block import Block
+from featuredb.adjust.marginals import Marginals
 from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import Marks, Terms
 from featuredb.geometry.arrays import FloatArray
@@ -58,10 +59,10 @@ def photo_covariances(
 ) -> PhotoSpread:
     """Of all photos, relative to the existing points.
 
-    What a lens model leaves over is common to whole photos: so many observations count as one for lenses as
-    they do where lenses are estimated, and for poses as their neighbours share. By how much a lens
-    differs from the one that a map has lent is this reconstruction's alone: it may have changed since. All
-    else that the lenses bring other maps of the same cameras have as well.
+    Observations count as their neighbours share, and for lenses as photos disagree about them
+    (`featuredb.adjust.lens_agreement`). By how much a lens differs from the one that a map has lent is this
+    reconstruction's alone: it may have changed since. All else that the lenses bring other maps of the same
+    cameras have as well.
 
     Args:
         model: refined, in metres. keypoints: of its photos.
@@ -79,29 +80,49 @@ def photo_covariances(
     model = _thinned(model, options)
     everything = np.ones(len(model.point_of), dtype=np.bool_)
     block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
-    # All observations as for lenses; those of a pose with its lens given count `dilution` times as much.
     dilution = adjust.mapping.dilution
-    sigma_px = float(np.sqrt(dilution * _variance_px2(block, marks, options)))
+    sigma_px = float(np.sqrt(_variance_px2(block, marks, options)))
     terms = Terms(
         keypoint_px=sigma_px,
+        dilution=dilution,
         lenses=lenses.priors(model.cameras, adjust),
         marks=replace(marks, sigma_px=sigma_px),
     )
     problem = Problem(block, terms)
-    found = problem.marginals()
-    by_lenses = found.by_lenses()
-    size = len(by_lenses)
-    covariance = (found.shared[:size, :size] - by_lenses) / dilution + by_lenses
-    common = by_lenses - problem.by_lens_priors(found, lenses.lent)
+    found, weighted = problem.honest_marginals()
+    common = found.by_lenses() - dilution**2 * problem.by_lens_priors(weighted, lenses.lent)
     seen = np.flatnonzero(found.pose_start >= 0)
     for k in seen.tolist():
         at = found.pose_start[k] + np.arange(6)
-        spread.poses[k] = covariance[np.ix_(at, at)]
+        spread.poses[k] = found.shared[np.ix_(at, at)]
+    turn_of = _view_turns(block, found)
     for k, piece in _pieces(model, fixed, kept, seen).items():
-        at = found.pose_start[piece]
-        spread.turns[k] = _turn(model, covariance, piece, at)
-        spread.lens_turns[k] = _turn(model, common, piece, at)
+        turn = turn_of[piece].mean(axis=0)
+        spread.turns[k] = turn @ found.shared @ turn.T
+        spread.lens_turns[k] = turn @ common @ turn.T
     return spread
+
+
+def _view_turns(block: Block, found: Marginals) -> FloatArray:
+    """(k, 3, q) how what each photo sees turns about the block's axes with poses and lenses.
+
+    A principal point that is off turns the photo, and its points stay where they are: only what is left of
+    both turns what comes next.
+    """
+    result = np.zeros((len(block.names), 3, len(found.shared)))
+    for k, pose in enumerate(block.cam_from_block):
+        if found.pose_start[k] < 0:
+            continue
+        by_pose = slice(int(found.pose_start[k]), int(found.pose_start[k]) + 3)
+        result[k, :, by_pose] = pose.rotation.T
+        camera, first = block.camera(k), int(found.lens_start[block.camera_of[k]])
+        if first >= 0:
+            lens = camera.to_pycolmap()
+            focal, (cx, cy) = lens.focal_length_idxs(), lens.principal_point_idxs()
+            fx, fy = camera.params[focal[0]], camera.params[focal[-1]]
+            result[k, :, first + cx] = pose.rotation.T @ [0.0, 1.0 / fx, 0.0]
+            result[k, :, first + cy] = pose.rotation.T @ [-1.0 / fy, 0.0, 0.0]
+    return result
 
 
 def _variance_px2(block: Block, marks: Marks, options: DriftOptions) -> float:
@@ -135,16 +156,3 @@ def _pieces(
     np.fill_diagonal(shared, np.inf)
     order = {k: np.argsort(-shared[k], kind="stable")[:_PIECE] for k in seen.tolist()}
     return {k: rows[shared[k, rows] > 0.0] for k, rows in order.items()}
-
-
-def _turn(
-    model: Model, covariance: FloatArray, piece: NDArray[np.int64], start: NDArray[np.int64]
-) -> FloatArray:
-    """(3, 3) of the mean rotation of a piece's photos, about the local axes.
-
-    Args:
-        covariance: (6 k, 6 k) of all poses. start: first columns of the piece's.
-    """
-    mean = np.hstack([model.cam_from_sfm[k].rotation.T for k in piece.tolist()]) / len(piece)
-    at = (start[:, None] + np.arange(3)).reshape(-1)
-    return np.asarray(mean @ covariance[np.ix_(at, at)] @ mean.T)

@@ -18,7 +18,7 @@ from ingest.growth.confirmation import (
 from tests.support.scene_strip import strip_map
 
 _OPTIONS = ConfirmationOptions()
-_NOBODY = ["ONE_SOURCE", "FEW_CONFIRMED", "MOSTLY_ONE_SOURCE", "FEW_PAIRS"]
+_NOBODY = ["ONE_SOURCE", "MOSTLY_ONE_SOURCE", "FEW_PAIRS"]
 
 
 def _reasons(found: Confirmation) -> list[str]:
@@ -87,7 +87,7 @@ def test_the_same_picture_given_by_two_is_one_source() -> None:
             }
         ),
     )
-    assert confirm(pair_only, alone).confirmed_by_others
+    assert _reasons(confirm(pair_only, alone)) == ["FEW_PAIRS"]
     assert _reasons(confirm(pair_only, _OPTIONS))[0] == "ONE_SOURCE"
 
 
@@ -104,18 +104,19 @@ def test_a_map_that_mostly_hangs_on_one_source_is_not_confirmed() -> None:
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     found = confirm(replace(feature_map, images=tuple(images), observations=type(seen)(**parts)), _OPTIONS)
     assert found.confirmed == (0, 7)
-    assert _reasons(found) == ["MOSTLY_ONE_SOURCE"]
+    assert _reasons(found) == ["MOSTLY_ONE_SOURCE", "FEW_PAIRS"]
 
 
-def test_one_photo_is_not_the_second_source_of_many() -> None:
+def test_one_photo_confirms_nothing_alone() -> None:
     """Eve's photo shows what all nineteen of Anna's do."""
     one = _owned(["eve"] + 19 * ["anna"], cameras=20)
     found = confirm(one, _OPTIONS)
     assert len(found.confirmed) == 20
     assert _reasons(found) == ["FEW_PAIRS"]
-    assert "1 separate pairs of independent photos, 2.0 are needed" in found.message
+    assert "confirmed by one photo alone" in found.message
+    assert _reasons(confirm(_owned(["eve", "anna"], cameras=2), _OPTIONS)) == ["FEW_PAIRS"]
     assert confirm(_owned(["eve", "eve"] + 18 * ["anna"], cameras=20), _OPTIONS).confirmed_by_others
-    assert confirm(_owned(["eve"] + 7 * ["anna"]), _OPTIONS).confirmed_by_others
+    assert confirm(_owned(["eve", "anna", "ben"], cameras=3), _OPTIONS).confirmed_by_others
     assert confirm(one, replace(_OPTIONS, trusted_owners=("anna",))).confirmed_by_others
 
 
@@ -128,24 +129,16 @@ def _witness(feature_map: FeatureMap, owner: str, points: int = 200) -> Witness:
     )
 
 
-def test_a_witness_of_another_owner_confirms() -> None:
+def test_two_witnesses_of_other_owners_confirm_and_one_does_not() -> None:
     feature_map = _owned(["anna"])
-    assert confirm(feature_map, _OPTIONS, [_witness(feature_map, "ben")]).confirmed_by_others
+    assert _reasons(confirm(feature_map, _OPTIONS, [_witness(feature_map, "ben")])) == ["FEW_PAIRS"]
+    two = [_witness(feature_map, "ben"), _witness(feature_map, "carl")]
+    assert confirm(feature_map, _OPTIONS, two).confirmed_by_others
     found = confirm(feature_map, _OPTIONS, [_witness(feature_map, "anna")])
     assert _reasons(found)[0] == "ONE_SOURCE"
     assert found.witnesses == ()
     few = confirm(feature_map, _OPTIONS, [_witness(feature_map, "ben", points=5)])
     assert not few.confirmed_by_others
-
-
-def test_one_confirmed_photo_is_too_few() -> None:
-    feature_map = _owned(["anna"])
-    seen = feature_map.observations
-    keep = seen.image_id == 0
-    parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
-    single = replace(feature_map, images=feature_map.images[:1], observations=type(seen)(**parts))
-    witness = replace(_witness(single, "ben"), points=seen.point_index[keep][:100])
-    assert _reasons(confirm(single, _OPTIONS, [witness])) == ["FEW_CONFIRMED"]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from featuredb.adjust.block import whole_camera
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, with_observations
@@ -76,9 +77,11 @@ def spread_of(
     )
 
 
-def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3]) -> FloatArray:
-    """(3,) mean rotation about the local axes by which poses are off."""
-    turns = [t.rotation.T @ (f @ t.inverse()).log()[:3] for f, t in zip(found, true, strict=True)]
+def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3], lens: Camera = CAMERA) -> FloatArray:
+    """(3,) mean rotation about the local axes by which what the photos see is off, of poses and lens."""
+    (fx, fy, cx, cy), (_, _, *middle) = whole_camera(lens).params[:4], whole_camera(CAMERA).params[:4]
+    by_lens = np.array([-(cy - middle[1]) / fy, (cx - middle[0]) / fx, 0.0])
+    turns = [t.rotation.T @ ((f @ t.inverse()).log()[:3] + by_lens) for f, t in zip(found, true, strict=True)]
     return np.asarray(np.mean(turns, axis=0))
 
 
@@ -202,7 +205,7 @@ def test_what_a_lens_has_changed_by_since_it_was_lent_is_not_shared() -> None:
         said = spread_of(done.model, keypoints, fixed, done.fixed_kept, lent)
         alone = said.turns[-1] - said.lens_turns[-1]
         assert np.trace(said.lens_turns[-1]) > 0.0
-        turn = mean_turn(done.model.cam_from_sfm[1:], new.poses[1:])
+        turn = mean_turn(done.model.cam_from_sfm[1:], new.poses[1:], done.model.cameras[0])
         turned.append(float(turn @ np.linalg.solve(alone, turn)))
     assert 1.5 < np.mean(turned) < 6.0, turned
 
