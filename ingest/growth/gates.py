@@ -159,7 +159,8 @@ def geotags(
         against = int(contradict.sum())
         if against:
             where = (
-                f" by {by}" * bool(by) + f", which is {way_words(*np.median(offsets_m[contradict], axis=0))}"
+                f" by {by}" * bool(by)
+                + f", which is {way_words(*np.median(offsets_m[contradict], axis=0))} of them"
             )
     share = against / len(offsets_m) if len(offsets_m) else 0.0
     by_accident = float(binom.sf(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
