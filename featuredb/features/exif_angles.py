@@ -44,9 +44,7 @@ def camera_angles(
     yaw, pitch, roll = (xmp.get(name) for name in XMP_ANGLES["Camera"])
     if yaw is not None and pitch is not None and roll is not None and (yaw or pitch or roll):
         tilt = [xmp.get(f"IMU{name}Accuracy", 0.0) for name in ("Pitch", "Roll")]
-        sense_fly = (
-            make.strip().lower() == "sensefly"
-        )  # counts roll the other way (OpenDroneMap knows it too)
+        sense_fly = make.strip().lower() == "sensefly"  # counts roll the other way, as OpenDroneMap knows
         return CameraAngles.of_body(
             yaw,
             pitch,
