@@ -8,7 +8,7 @@
 3. Each map that answers is compared with the truth: the squared errors of position and of orientation of its
    cameras by their covariance, at the median camera, against 99.9 %.
 
-Exit code 0 if no map that answers is outside, and what is held back or refused names the rolling shutter.
+Exit code 0 if no map that answers is outside, and each ingest names the rolling shutter.
 """
 
 import argparse
@@ -70,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 figures["active"] += bool(active)
                 figures["outside"] += sum(max(one) > _OUTSIDE for one in squares)
                 figures["held_back"] += not active
-                figures["unnamed"] += not active and "rolling shutter" not in said
+                figures["unnamed"] += "rolling shutter" not in said
                 worst = max([worst, *(max(one) for one in squares)])
                 words = ", ".join(f"position {a:.1f} and orientation {b:.1f}" for a, b in squares)
                 sys.stdout.write(f"{name}: squared errors ({_OUTSIDE:.1f} is 99.9 %): {words or 'no map'}\n")

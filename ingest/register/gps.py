@@ -226,15 +226,11 @@ def _judged(
 def _words(placed: str, figures: dict[str, Any]) -> str:
     """With what angles contradict positions by."""
     angles = figures.get("angles", {})
-    against = (
-        [
-            f"{name} by {angles[f'{name}_off_deg']:.0f} degrees"
-            for name in ("tilt", "yaw")
-            if angles["told"] and angles.get(f"{name}_contradicts")
-        ]
-        if angles
-        else []
-    )
+    against = [
+        f"{name} by {angles[f'{name}_off_deg']:.0f} degrees"
+        for name in ("tilt", "yaw")
+        if angles.get(f"{name}_contradicts") and (name == "yaw" or angles["told"])  # level is only assumed
+    ]
     if not against:
         return placed
     return f"{placed}; the cameras' angles contradict it and hardly count: {', '.join(against)} (median)"

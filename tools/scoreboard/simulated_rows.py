@@ -177,12 +177,11 @@ SIMULATED: tuple[Row, ...] = (
         group="simulated",
         form="full",
         claim="photos of four simulated flights, smooth and jerky, with rows read out over 30 ms, placed by "
-        "a drone's receiver and by RTK: what answers is inside 99.9 %, what does not names the rolling "
-        "shutter",
+        "a drone's receiver and by RTK: what answers is inside 99.9 %, and the rolling shutter is named",
         commands=(("tools.rolling_shutter", "--work", "{work}/rolling", "--inputs", "{cache}", *OUT),),
         figures=same("flights", "active", "outside", "held_back", "unnamed", "worst_squared"),
         text="{active} of {flights} answer, {outside} of them outside (worst squared error "
-        "{worst_squared:.1f}; 16.3 is 99.9 %); {held_back} do not, {unnamed} without naming it",
+        "{worst_squared:.1f}; 16.3 is 99.9 %); {held_back} do not; {unnamed} of all do not name it",
         limits=(Limit(figure="outside", most=0), Limit(figure="unnamed", most=0)),
         minutes=8,
     ),
