@@ -191,8 +191,13 @@ def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
     Raises:
         IngestError: names the workers that do not.
     """
-    if not client.ncores():
-        raise IngestError(f"--dask {address}: expected a cluster with workers, found none; start some first")
+    try:  # a worker that died a moment ago is on its way back
+        client.wait_for_workers(1, timeout=_CONNECT_S)
+    except TimeoutError as error:
+        raise IngestError(
+            f"--dask {address}: expected a cluster with workers, found none within {_CONNECT_S:g} s; start some "
+            "first"
+        ) from error
     token = f".tmp-shared-{uuid.uuid4().hex}"
     if folders:
         folders[0].mkdir(parents=True, exist_ok=True)
