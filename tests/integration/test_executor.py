@@ -190,7 +190,7 @@ def test_dask_workers_that_cannot_take_part_are_named(
     cluster.scale(0)
     while cluster.scheduler_info["workers"]:
         time.sleep(0.05)
-    with pytest.raises(IngestError, match="found none within 0.5 s"):
+    with pytest.raises(IngestError, match=r"found none within 0\.5 s"):
         DaskExecutor(address, shared=[tmp_path])
 
 
