@@ -195,8 +195,8 @@ def _require_shared(client: Any, address: str, folders: list[Path]) -> None:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError as error:
         raise IngestError(
-            f"--dask {address}: expected a cluster with workers, found none within {_CONNECT_S:g} s; start some "
-            "first"
+            f"--dask {address}: expected a cluster with workers, found none within {_CONNECT_S:g} s; start "
+            "some first"
         ) from error
     token = f".tmp-shared-{uuid.uuid4().hex}"
     if folders:
