@@ -6,6 +6,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import lru_cache
@@ -32,11 +33,11 @@ from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from tools.figures import write_figures
+from tools.growth_gates import WRONG_M, recorded
 from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
 
 mpl.use("Agg")  # no display is needed
 
-WRONG_M = 2.0  # a photo registered further off than this is wrong
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
@@ -239,13 +240,27 @@ def registered(database: Database, album: Album, version: int | None = None) -> 
 
 
 def _fact_of(album: Album, feature_map: FeatureMap, name: str) -> AlbumFact:
-    """A map's image as a photo of the album: contributed ones are named by their ids."""
+    """A map's image as a photo of the album."""
+    return album.facts[_album_name(album, name, feature_map.name)]
+
+
+def _album_name(album: Album, name: str, folder: str = "") -> str:
+    """A photo's name in the album: contributed ones are named by their ids."""
     stem = name.rsplit("/", 1)[-1].split(".")[0]
-    known = _candidate_names(album.folder)
-    for tried in (name, f"{feature_map.name}/{name}", known.get(stem, "")):
+    for tried in (name, f"{folder}/{name}", _candidate_names(album.folder).get(stem, "")):
         if tried in album.facts:
-            return album.facts[tried]
-    raise SystemExit(f"map {feature_map.map_id}: image {name} is not one of {album.folder}")
+            return tried
+    raise SystemExit(f"photo {name} is not one of {album.folder}")
+
+
+def recording(out: Path, album: Album, name: str = "gates") -> AbstractContextManager[None]:
+    """What the gates of growth say of photos of the album goes to `<name>.jsonl` (`tools.growth_gates`)."""
+
+    def true_place(name: str) -> FloatArray | None:
+        image = album.truth.images.get(_album_name(album, name))
+        return None if image is None else image.cam_from_local.center
+
+    return recorded(out / f"{name}.jsonl", album.truth.frame, true_place)
 
 
 def newest_copy(source: Path, target: Path) -> Database:

@@ -48,6 +48,7 @@ from tools.growth_common import (
     made,
     none_failed,
     plan_view,
+    recording,
     registered,
     say,
     table,
@@ -98,7 +99,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         growth = growing.growth
         grow = replace(growth.grow.grow, settle=replace(growth.grow.grow.settle, min_link=args.min_link))
         growing = replace(growing, growth=replace(growth, grow=replace(growth.grow, grow=grow)))
-    report = grow_candidates(database, growing)
+    with recording(args.out, album):
+        report = grow_candidates(database, growing)
     tell(report)
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)

@@ -55,6 +55,7 @@ from tools.growth_common import (
     newest_copy,
     none_failed,
     plan_view,
+    recording,
     registered,
     say,
     table,
@@ -141,7 +142,8 @@ def honest_base(path: Path, album: Album, max_features: int, options: GrowingOpt
         )
         add_canary(database, fact.photo_id, (album.folder / fact.name).read_bytes(), pose, origin="person")
     give(database, album, album.of("honest"))
-    tell(grow_candidates(database, options))
+    with recording(path.parent, album):
+        tell(grow_candidates(database, options))
     return database
 
 
@@ -161,7 +163,8 @@ def try_poison(
     failed = 0
     for arrived in (sent, album.of("late")):
         give(database, album, arrived)
-        report = grow_candidates(database, options)
+        with recording(out, album, f"gates-{name}"):
+            report = grow_candidates(database, options)
         tell(report)
         failed += failures(report)
     found = registered(database, album)

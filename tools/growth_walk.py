@@ -52,6 +52,7 @@ from tools.growth_common import (
     made,
     none_failed,
     plan_view,
+    recording,
     registered,
     say,
     table,
@@ -132,7 +133,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def take_step(database: Database, album: Album, batch: int, options: GrowingOptions) -> Step:
     """Contribute one step's photos, grow once, measure."""
     give(database, album, album.of("walk", batch=batch))
-    report = grow_candidates(database, options)
+    with recording(Path(database.url).parent, album):
+        report = grow_candidates(database, options)
     tell(report)
     stopped = sum(p.reason_code == "DRIFT_BUDGET" for p in report.photos)
     step = replace(measure(database, album, batch, stopped), failed=failures(report))
@@ -215,7 +217,8 @@ def second_anchor(
     version = database.poll_version()
     path = Path(database.url)
     anchored(path, album, "survey_far", **common)
-    report = grow_candidates(database, options)
+    with recording(Path(database.url).parent, album):
+        report = grow_candidates(database, options)
     tell(report)
     history = [database.snapshot(v) for v in range(version, database.poll_version() + 1)]
     commits, known = 0, placed

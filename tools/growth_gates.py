@@ -1,0 +1,218 @@
+"""What each gate of growth refuses, and what it alone refuses, beside the truth.
+
+    python -m tools.growth_gates gates.jsonl ...
+
+The programs that measure growth record every judgement into gates.jsonl of their folder: of each placement
+that was tried, of each refined one, of each map's drift, and of each map in quarantine. All gates of a
+judgement are asked, so it can be told afterwards what would have passed without one of them. The photos of a
+judgement are compared with their true places as it would have them.
+
+Prints for each gate the judgements it was asked in, those it refused, and those that nothing but it refused:
+their right photos, and those that are wrong by more than 2 m or have no place there at all. A gate that alone
+refuses right photos and no wrong ones costs photos and prevents nothing. The same photos are judged once a
+round; only the last counts.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.maps.feature_map import FeatureMap
+from ingest.growth import grow, grown_map
+from ingest.growth.gates import Gate
+from ingest.growth.values import Refused
+from ingest.photo import Photo
+
+WRONG_M = 2.0  # a photo registered further off than this is wrong
+
+TruePlace = Callable[[str], FloatArray | None]
+"""A photo's true centre in the truth's frame, by name; None for one that has no place there."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judgement:
+    """One question to all gates of a step.
+
+    Attributes:
+        step: "place", "refine", "budget" or "trust".
+        key: of the photos, sorted.
+        right, wrong: photos as they would lie.
+        gates: by name, whether it passes.
+    """
+
+    step: str
+    key: str
+    right: int
+    wrong: int
+    gates: dict[str, bool]
+
+    @property
+    def refused_by(self) -> list[str]:
+        return [name for name, passes in self.gates.items() if not passes]
+
+
+@contextmanager
+def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[None]:
+    """Append every judgement of growth to a file as long as it lasts.
+
+    Args:
+        frame: of the true places.
+    """
+    with ExitStack() as stack, path.open("a", encoding="utf-8") as file:
+        note = _Note(file=file, frame=frame, true_place=true_place)
+        for module, name, wrapped in (
+            (grown_map, "place_by_maps", note.placing),
+            (grown_map, "settle", note.refining),
+            (grow, "drift_gate", note.budget),
+            (grow, "with_drift", note.drifting),
+            (grow, "promote_confirmed", note.promoting),
+        ):
+            stack.enter_context(patch.object(module, name, wrapped(getattr(module, name))))
+        yield
+
+
+class _Note:
+    """The steps of growth, each with its judgement written down."""
+
+    def __init__(self, *, file: Any, frame: LocalFrame, true_place: TruePlace) -> None:
+        self._file, self._frame, self._true_place = file, frame, true_place
+        self._photos: Sequence[Photo] = ()
+        self._last: FeatureMap | None = None
+
+    def placing(self, step: Any) -> Any:
+        def place_by_maps(model: Any, localised: Any, anchors: Any, photos: Any, *more: Any) -> Any:
+            held = step(model, localised, anchors, photos, *more)
+            self._photos = photos
+            self._model("place", model, held.placement, held.placement.gates)
+            return held
+
+        return place_by_maps
+
+    def refining(self, step: Any) -> Any:
+        def settle(model: Any, held: Any, *more: Any) -> Any:
+            settled = step(model, held, *more)
+            refused = isinstance(settled, Refused)
+            gates = settled.gates if refused else settled.placement.gates
+            own = [gate for gate in gates if gate.name not in {g.name for g in held.placement.gates}]
+            if refused and all(gate.passes for gate in own):  # by photos that are left out
+                own.append(_said_no(settled.reason))
+            self._model("refine", model, held.placement, own)
+            return settled
+
+        return settle
+
+    def drifting(self, step: Any) -> Any:
+        def with_drift(*args: Any) -> Any:
+            found = step(*args)
+            self._last = found[0]
+            return found
+
+        return with_drift
+
+    def budget(self, step: Any) -> Any:
+        def drift_gate(*args: Any) -> Gate:
+            gate: Gate = step(*args)
+            assert self._last is not None
+            self._map("budget", self._last, [gate])
+            return gate
+
+        return drift_gate
+
+    def promoting(self, step: Any) -> Any:
+        def promote_confirmed(database: Any, *args: Any, **more: Any) -> Any:
+            outcomes = step(database, *args, **more)
+            for outcome in outcomes:
+                if outcome.gates:
+                    self._map("trust", database.snapshot().load_map(outcome.map_id), outcome.gates)
+            return outcomes
+
+        return promote_confirmed
+
+    def _model(self, step: str, model: Any, placement: Any, gates: Iterable[Gate]) -> None:
+        if placement.local_from_sfm is None:
+            return
+        names = [self._photos[int(row)].name for row in model.rows]
+        centers = placement.local_from_sfm.act(model.centers())
+        self._write(step, names, self._frame.enu_from(placement.frame).act(centers), gates)
+
+    def _map(self, step: str, feature_map: FeatureMap, gates: Iterable[Gate]) -> None:
+        centers = np.array([image.cam_from_local.center for image in feature_map.images])
+        names = [image.name for image in feature_map.images]
+        self._write(step, names, self._frame.enu_from(feature_map.frame).act(centers), gates)
+
+    def _write(self, step: str, names: Sequence[str], centers: FloatArray, gates: Iterable[Gate]) -> None:
+        wrong = 0
+        for name, center in zip(names, centers, strict=True):
+            true = self._true_place(name)
+            wrong += true is None or float(np.linalg.norm(center - true)) > WRONG_M
+        line = {
+            "step": step,
+            "key": " ".join(sorted(names)),
+            "right": len(names) - wrong,
+            "wrong": wrong,
+            "gates": {gate.name: gate.passes for gate in gates},
+        }
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
+
+
+def _said_no(reason: str) -> Gate:
+    return Gate(
+        name=f"photos: {reason}",
+        reason=reason,
+        figure=1.0,
+        limit=0.0,
+        passes=False,
+        message="too few are left",
+    )
+
+
+def read_judgements(paths: Sequence[Path]) -> list[Judgement]:
+    """The last judgement of the same photos by the same step, of each file."""
+    found: dict[tuple[Path, str, str], Judgement] = {}
+    for path in paths:
+        for line in path.read_text(encoding="utf-8").splitlines():
+            one = Judgement(**json.loads(line))
+            found[path, one.step, one.key] = one
+    return list(found.values())
+
+
+def gate_rows(judgements: Iterable[Judgement]) -> list[tuple[str, str, int, int, int, int, int]]:
+    """Step, gate, judgements asked, refused, refused by it alone, right and wrong photos of these."""
+    judgements = list(judgements)
+    rows = []
+    for step, gate in dict.fromkeys((j.step, gate) for j in judgements for gate in j.gates):
+        asked = [j for j in judgements if j.step == step and gate in j.gates]
+        refused = [j for j in asked if not j.gates[gate]]
+        alone = [j for j in refused if j.refused_by == [gate]]
+        right, wrong = sum(j.right for j in alone), sum(j.wrong for j in alone)
+        rows.append((step, gate, len(asked), len(refused), len(alone), right, wrong))
+    return rows
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("files", type=Path, nargs="+", metavar="gates.jsonl")
+    judgements = read_judgements(parser.parse_args(argv).files)
+    sys.stdout.write("step    gate                      asked refused  alone  right  wrong\n")
+    for step, gate, *figures in gate_rows(judgements):
+        sys.stdout.write(f"{step:7} {gate:24}" + "".join(f"{figure:7d}" for figure in figures) + "\n")
+    for step in dict.fromkeys(j.step for j in judgements):
+        passed = [j for j in judgements if j.step == step and not j.refused_by]
+        right, wrong = sum(j.right for j in passed), sum(j.wrong for j in passed)
+        sys.stdout.write(f"{step}: {len(passed)} pass, with {right} right and {wrong} wrong photos\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
