@@ -146,7 +146,7 @@ def _parts(
         pose_spread = pose_covariances(linear, len(poses), covariances, variance)
     else:
         pose_spread = errors.poses
-        provenance |= errors.modes.as_provenance()
+        provenance |= errors.modes.as_provenance() | {"picture_shear": errors.shear.size}
         provenance |= {} if errors.lenses is None else errors.lenses.as_provenance()
     kept = _well_placed(xyz, poses, covariances, model, options)
     if not kept.any():

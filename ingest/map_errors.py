@@ -15,6 +15,7 @@ from featuredb.geometry.rotation import skew
 from featuredb.maps.error_modes import LENS_SIZE, ErrorModes
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from ingest.colmap_adjust import AdjustOptions, block_variance_px2, lens_prior_of
+from ingest.picture_shear import PictureShear, picture_shear
 
 _NEAR = 10.0  # sizes of the block, and radians: nothing is known
 _KEPT = 0.999  # share of the poses' variance that the modes hold together
@@ -30,11 +31,13 @@ class MapErrors:
         lenses: None where no lens is of OPENCV's parameters.
         poses: (k, 6, 6) covariances of the photos' left perturbations, rad and units of the block.
         modes: what of them is common to all.
+        shear: of the pictures; what poses hide of it is in `poses`.
     """
 
     lenses: LensUncertainty | None
     poses: FloatArray
     modes: ErrorModes
+    shear: PictureShear
 
 
 def map_errors(
@@ -61,13 +64,15 @@ def map_errors(
     noise -= moved @ (fit @ noise)
     noise -= (noise @ fit.T) @ moved.T
     poses = noise + factor[:size] @ factor[:size].T
+    shear, depths = picture_shear(block), _depths(block)
     # Photos agree on a wrong lens: parameters are off by more than poses made with them.
     lenses = [options.dilution * weighted.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
     return MapErrors(
         lenses=uncertainty_of_lenses(block.cameras, lenses, photos, options.dilution),
-        poses=np.array([poses[k : k + 6, k : k + 6] for k in range(0, size, 6)]),
-        modes=_modes(block, noise, factor),
+        poses=np.array([poses[k : k + 6, k : k + 6] for k in range(0, size, 6)]) + shear.hidden(depths),
+        modes=_modes(block, noise, factor, depths),
+        shear=shear,
     )
 
 
@@ -129,12 +134,12 @@ def _similarity_of(block: Block) -> tuple[FloatArray, FloatArray]:
     return moved, fit
 
 
-def _modes(block: Block, noise: FloatArray, factor: FloatArray) -> ErrorModes:
+def _modes(block: Block, noise: FloatArray, factor: FloatArray, depths: FloatArray) -> ErrorModes:
     """The largest principal components of the poses' displacements, lenses as they go with them."""
     count = len(block.names)
     size = 6 * count
     unit = np.ones((count, 6))
-    unit[:, 3:] = 1.0 / _depths(block)[:, None]
+    unit[:, 3:] = 1.0 / depths[:, None]
     scaled = unit.ravel()[:, None] * factor[:size]
     whole = unit.ravel()[:, None] * noise * unit.ravel() + scaled @ scaled.T
     values, vectors = eigh(whole, subset_by_index=(max(0, size - _MOST_MODES), size - 1))

@@ -9,7 +9,8 @@ likely (type II maximum likelihood): a lens of which the photos say little says 
 
 For each width: what `AdjustOptions` has, what is measured, and between which limits it lies with 95 %
 probability (likelihood ratio, the other widths where they are most likely). Also how far photos of a camera
-disagree about its lens (`featuredb.adjust.lens_agreement`). Exit code 0 if all that
+disagree about its lens (`featuredb.adjust.lens_agreement`), and by how much single pictures are sheared
+(`ingest.picture_shear`). Exit code 0 if all that
 `AdjustOptions` has lie within.
 """
 
@@ -33,6 +34,7 @@ from featuredb.geometry.camera import Camera
 from ingest.colmap_adjust import AdjustOptions
 from ingest.map_errors import terms_of_map
 from ingest.photo import Photo
+from ingest.picture_shear import picture_shear
 from ingest.register.block import block_of_map
 from ingest.scan import scan_folder
 from tools.figures import add_json_option, write_figures
@@ -113,6 +115,7 @@ def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[lis
             if np.isfinite(one):
                 sys.stdout.write(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)\n")
                 disagreement.append(one / free)
+        sys.stdout.write(f"{folder}: pictures sheared by {picture_shear(block).size:.1e}\n")
         told += _told(problem, terms, focal_px, options)
     return told, disagreement
 
