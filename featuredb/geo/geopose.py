@@ -140,13 +140,6 @@ def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
     )
 
 
-def camera_from_geopose(geopose: GeoPose, frame: LocalFrame) -> Rigid3:
-    """The pose cam_from_local, in a local frame, of a GeoPose; the inverse of `geopose_from_camera`."""
-    center = frame.enu_from_geodetic((geopose.latitude_deg, geopose.longitude_deg, geopose.height_m))
-    rotation = BODY_FROM_CAM.T @ geopose.true_enu_from_body.T @ frame.true_enu_from_enu(center)
-    return Rigid3(rotation=rotation, translation=-rotation @ center)
-
-
 def _numbers(document: Any, member: str, names: tuple[str, ...]) -> list[float]:
     """The numbers of an object within an object, in the order of `names`."""
     inner = document.get(member) if isinstance(document, Mapping) else None

@@ -205,18 +205,6 @@ def list_candidates(
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
 
-def find_candidate(database: Database, candidate_id: str) -> Candidate:
-    """One contributed photo.
-
-    Raises:
-        CandidateNotFoundError: there is none of this id.
-    """
-    events = by_candidate(read_events(database, candidate_ids=[candidate_id]))
-    if candidate_id not in events:
-        raise not_found([candidate_id])
-    return candidate_of(events[candidate_id], live_maps(database, None))
-
-
 def count_candidates(database: Database) -> InboxCounts:
     """How many there are in each state, how many wait of each owner, and how many bytes they take."""
     live = live_maps(database, None)
@@ -234,18 +222,13 @@ def count_candidates(database: Database) -> InboxCounts:
     return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
 
 
-def load_image(database: Database, candidate_id: str) -> bytes:
-    """The bytes of a photo.
+def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    """Id and bytes of photos, one in memory at a time.
 
     Raises:
         CandidateNotFoundError: no such photo, or it was withdrawn.
         StoreError: they cannot be read, or are not those that were contributed.
     """
-    return next(load_images(database, [candidate_id]))[1]
-
-
-def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-    """Id and bytes of photos, one in memory at a time; raises as `load_image`."""
     table = database.table(CANDIDATE_IMAGES) if has_candidates(database) else None
     for candidate_id in candidate_ids:
         if table is None:
