@@ -4,7 +4,6 @@ The commit is the last step and one atomic change: whatever interrupts the work 
 as it was.
 """
 
-import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,7 +40,6 @@ from ingest.register.anchor.start import image_named
 from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 
-_LOG = logging.getLogger(__name__)
 _CONFIRM = "--confirm"
 
 

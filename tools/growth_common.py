@@ -18,7 +18,7 @@ import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_angle, so3_log
+from featuredb.geometry.rotation import rotation_angle
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import Truth, read_truth
 from featuredb.store import Database
@@ -72,7 +72,7 @@ class Registered:
     Attributes:
         fact: what it is. map_id, status, generation: of its map.
         offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
-        angle_deg: between the orientations. turn_rad: (3,) the rotation between them, about east, north, up.
+        angle_deg: between the orientations.
         drift_m: 95 % bound that its map claims against its anchors; None for anchors.
         bound_m: 95 % bound that its map claims on Earth, the anchors' own uncertainty included.
     """
@@ -85,7 +85,6 @@ class Registered:
     angle_deg: float
     drift_m: float | None
     bound_m: float
-    turn_rad: FloatArray | None = None
 
     @property
     def error_m(self) -> float:
@@ -215,13 +214,12 @@ def registered(database: Database, album: Album, version: int | None = None) -> 
         for image in feature_map.images:
             fact = _fact_of(album, feature_map, image.name)
             true = album.truth.images.get(fact.name)
-            offset, angle, turn = None, float("nan"), None
+            offset, angle = None, float("nan")
             if true is not None:
                 center = here.act(image.cam_from_local.center[None])[0]
                 offset = center - true.cam_from_local.center
                 turned = image.cam_from_local.rotation @ here.rotation.T
                 angle = float(np.degrees(rotation_angle(turned @ true.cam_from_local.rotation.T)))
-                turn = so3_log(turned.T @ true.cam_from_local.rotation)
             found.append(
                 Registered(
                     fact=fact,
@@ -232,7 +230,6 @@ def registered(database: Database, album: Album, version: int | None = None) -> 
                     angle_deg=angle,
                     drift_m=summary.drift_m,
                     bound_m=bound_m,
-                    turn_rad=turn,
                 )
             )
     return found

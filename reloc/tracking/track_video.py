@@ -1,6 +1,5 @@
 """A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
 
-import logging
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -25,7 +24,6 @@ from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
 
-_LOG = logging.getLogger(__name__)
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
 
