@@ -7,7 +7,6 @@ correspondences) and the scan's surface under all points of the map determine po
 """
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -99,7 +98,6 @@ class LidarAdjustment:
         lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
         before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
-        seconds: of the whole.
     """
 
     reason: AdjustReason | None
@@ -111,7 +109,6 @@ class LidarAdjustment:
     before_m: FloatArray
     after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
 
     @property
     def accepted(self) -> bool:
@@ -136,7 +133,6 @@ def adjust_to_scan(
         begin: the map as an earlier adjustment left it, from which the solver starts.
     """
     options = options or AdjustLidarOptions()
-    started = time.perf_counter()
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
@@ -144,11 +140,11 @@ def adjust_to_scan(
     nothing = np.full(len(start.xyz), np.nan)
     if len(control.xyz) < options.min_control:
         words = f"{len(control.xyz)} correspondences with the scan, at least {options.min_control} are needed"
-        return _refused("NO_CONTROL", words, nothing, nothing, {}, started)
+        return _refused("NO_CONTROL", words, nothing, nothing, {})
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
     if surface is None:
-        return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {}, started)
+        return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {})
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
@@ -164,7 +160,7 @@ def adjust_to_scan(
     }
     reason, message = _gate(block, figures, options)
     if reason is not None:
-        return _refused(reason, message, before, after, figures, started)
+        return _refused(reason, message, before, after, figures)
     poses, lenses = _left_open(block, control, surface, structure, start, options)
     return LidarAdjustment(
         reason=None,
@@ -176,7 +172,6 @@ def adjust_to_scan(
         before_m=before,
         after_m=after,
         figures=figures,
-        seconds=time.perf_counter() - started,
     )
 
 
@@ -440,7 +435,6 @@ def _refused(
     before: FloatArray,
     after: FloatArray,
     figures: dict[str, Any],
-    started: float,
 ) -> LidarAdjustment:
     return LidarAdjustment(
         reason=reason,
@@ -452,5 +446,4 @@ def _refused(
         before_m=before,
         after_m=after,
         figures=figures,
-        seconds=time.perf_counter() - started,
     )
