@@ -322,7 +322,7 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
     assert [m["map_id"] for m in said["maps"]] == ["anchor", "child"]
     code, _, err = run("nobody")
     assert code != 0
-    assert "'nobody', which fits none" in err
+    assert "has no live map nobody" in err
     database.commit_maps([strip_map("away", 180.0)])
     code, out, _ = run("anchor", "away")
     assert code == 1
