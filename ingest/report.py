@@ -1,6 +1,5 @@
 """What an ingest did: one value, written as JSON for programs and as a page for people."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.plain_json import plain
 from ingest.register.control.model import ControlledPlacement
 from ingest.report_films import FilmOutcome, films_json
 from ingest.workspace import atomic_file, write_json
@@ -339,20 +339,3 @@ def _map_json(outcome: MapOutcome) -> dict[str, Any]:
 
 def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
     return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}
-
-
-def plain(value: Any) -> Any:
-    """`value` with only what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, int, float, bool)):
-        return value
-    return str(value)
