@@ -1,9 +1,8 @@
-"""What an ingest did: one value, written as JSON for programs and as a page for people."""
+"""What an ingest did: one value, and its JSON for programs; `ingest.report_html` writes it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -14,12 +13,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.plain_json import plain
 from ingest.register.control.model import ControlledPlacement
 from ingest.report_films import FilmOutcome, films_json
-from ingest.workspace import atomic_file, write_json
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
 MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
 SCHEMA_ID = "featuredb/ingest/report/1"
-REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 
 # EXIF rounds to whole millimetres of 35 mm equivalent (2.5 % at 20 mm) and makers count the frame differently
 # (4 %); beyond their sum something else is at work.
@@ -231,17 +228,6 @@ class IngestReport:
     def seconds(self) -> float:
         """Wall time of all stages."""
         return sum(stage.seconds for stage in self.stages)
-
-
-def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
-    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
-    from ingest.report_html import report_page  # matplotlib loads when a report is written, not before
-
-    json_path, html_path = folder / REPORT_JSON, folder / REPORT_HTML
-    write_json(json_path, report_json(report))
-    with atomic_file(html_path) as temporary:
-        temporary.write_text(report_page(report), encoding="utf-8")
-    return json_path, html_path
 
 
 def report_json(report: IngestReport) -> dict[str, Any]:
