@@ -331,7 +331,7 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_focal_lengths_that_exif_told_are_known_beforehand(anchor: FeatureMap, child: FeatureMap) -> None:
     none = Links(
-        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b", "votes")},
+        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b")},
         heard=0,
         elsewhere=(),
     )

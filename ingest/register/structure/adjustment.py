@@ -96,7 +96,6 @@ class LidarAdjustment:
         covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
         lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
-        before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
     """
 
@@ -106,8 +105,6 @@ class LidarAdjustment:
     covariance: FloatArray | None
     poses: tuple[FloatArray, ...]
     lenses: LensUncertainty | None
-    before_m: FloatArray
-    after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -137,30 +134,27 @@ def adjust_to_scan(
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
     control = control_of(feature_map, structure, registered)
-    nothing = np.full(len(start.xyz), np.nan)
     if len(control.xyz) < options.min_control:
         words = f"{len(control.xyz)} correspondences with the scan, at least {options.min_control} are needed"
-        return _refused("NO_CONTROL", words, nothing, nothing, {})
+        return _refused("NO_CONTROL", words, {})
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
     if surface is None:
-        return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {})
+        return _refused("NO_SCAN", "the scan has no points under the map", {})
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
     block = _iterate(first, start.cameras, control, surface, options)
-    before = plane_distances(surface, start.xyz, options.reach_m)
-    after = plane_distances(surface, block.xyz, options.reach_m)
     figures = {
         "control": len(control.xyz),
         "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, before),
-        "after": _state(block, control, after),
+        "before": _state(start, control, plane_distances(surface, start.xyz, options.reach_m)),
+        "after": _state(block, control, plane_distances(surface, block.xyz, options.reach_m)),
         "options": asdict(options),
     }
     reason, message = _gate(block, figures, options)
     if reason is not None:
-        return _refused(reason, message, before, after, figures)
+        return _refused(reason, message, figures)
     poses, lenses = _left_open(block, control, surface, structure, start, options)
     return LidarAdjustment(
         reason=None,
@@ -169,8 +163,6 @@ def adjust_to_scan(
         covariance=structure.covariance,
         poses=poses,
         lenses=lenses,
-        before_m=before,
-        after_m=after,
         figures=figures,
     )
 
@@ -432,8 +424,6 @@ def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
 def _refused(
     reason: AdjustReason,
     message: str,
-    before: FloatArray,
-    after: FloatArray,
     figures: dict[str, Any],
 ) -> LidarAdjustment:
     return LidarAdjustment(
@@ -443,7 +433,5 @@ def _refused(
         covariance=None,
         poses=(),
         lenses=None,
-        before_m=before,
-        after_m=after,
         figures=figures,
     )
