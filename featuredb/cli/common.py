@@ -31,6 +31,16 @@ def add_database_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_command(
+    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    """Add a subcommand on a database."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text, epilog=epilog)
+    add_database_argument(parser)
+    parser.set_defaults(run=run)
+    return parser
+
+
 def storage_options(args: argparse.Namespace) -> dict[str, str]:
     """The --storage-option values.
 
