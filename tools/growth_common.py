@@ -203,10 +203,10 @@ def _candidate_names(folder: Path) -> dict[str, str]:
     }
 
 
-def registered(database: Database, album: Album, version: int | None = None) -> list[Registered]:
+def registered(database: Database, album: Album) -> list[Registered]:
     """All photos of the album in living maps, anchors included, with their errors."""
     found: list[Registered] = []
-    snapshot = database.snapshot(version)
+    snapshot = database.snapshot()
     for summary in snapshot.maps():
         feature_map = snapshot.load_map(summary.map_id)
         here = album.truth.frame.enu_from(feature_map.frame)

@@ -158,9 +158,7 @@ def reopen(database: Database, candidate_ids: Iterable[str], reason: str) -> Non
     note_events(database, {c: {"event": REOPENED, "reason": reason} for c in wanted})
 
 
-def withdraw(
-    database: Database, candidate_ids: Iterable[str], reason: str, *, reason_code: str = "OWNER"
-) -> WithdrawReport:
+def withdraw(database: Database, candidate_ids: Iterable[str], reason: str) -> WithdrawReport:
     """Delete the bytes of photos, as their owner asks: from the table and from the disk or bucket, at once.
 
     Hash, owner, licence and events stay, so that it is known what was withdrawn. Running it again finishes
@@ -173,7 +171,7 @@ def withdraw(
         raise StoreError("withdraw: expected a reason, for those who will ask later")
     wanted = list(dict.fromkeys(candidate_ids))
     found = {c.candidate_id: c for c in list_candidates(database)}
-    event: Row = {"event": WITHDRAWN, "reason_code": reason_code, "reason": reason}
+    event: Row = {"event": WITHDRAWN, "reason_code": "OWNER", "reason": reason}
     pending = [c for c in wanted if c not in found or found[c].state != "withdrawn"]
     note_events(database, dict.fromkeys(pending, event))
     files = delete_images(database, wanted) if wanted else []
