@@ -87,14 +87,13 @@ def run_anchor(args: argparse.Namespace) -> int:
 def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespace) -> int:
     """Serve the page of picks until it is stopped; 0."""
     from featuredb.extras import require
-    from ingest.anchoring import the_map
     from ingest.register.picks_page.server import create_app, new_token
     from ingest.register.picks_page.session import PickSession
     from reloc.viewer.serve import serve
 
     require("http", "The page of picks", "fastapi", "uvicorn")
     snapshot = database.snapshot()
-    loaded = snapshot.load_any(the_map(snapshot, request.map_id).map_id)
+    loaded = snapshot.load_any(snapshot.find(request.map_id).map_id)
     token = new_token()
     serve(
         create_app(PickSession(database, request, loaded), token),

@@ -4,7 +4,6 @@ The commit is the last step and one atomic change: whatever interrupts the work 
 as it was.
 """
 
-import logging
 import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError, MapNotFoundError, RegistrationError
+from featuredb.errors import RegistrationError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray, decode_rgb
 from featuredb.geo.utm import geodetic_from_utm, utm_from_geodetic
 from featuredb.geo.words import way_words
@@ -41,7 +40,6 @@ from ingest.register.anchor.start import image_named
 from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 
-_LOG = logging.getLogger(__name__)
 _CONFIRM = "--confirm"
 
 
@@ -229,7 +227,7 @@ def _confirm_command(database: Database, job: _Job) -> str:
 
 def _load(database: Database, request: AnchorRequest, options: AnchorOptions) -> _Job:
     snapshot = database.snapshot()
-    summary = the_map(snapshot, request.map_id)
+    summary = snapshot.find(request.map_id)
     loaded = snapshot.load_any(summary.map_id)
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
@@ -264,22 +262,6 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
         scan_ids=tuple(scan_ids),
         out=request.out or Path(f"anchor-{summary.map_id}"),
         options=options,
-    )
-
-
-def the_map(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
-    """The live map of that id, or of an id that begins so."""
-    maps: list[MapSummary | UnplacedSummary] = [*snapshot.maps(), *snapshot.unplaced_maps()]
-    exact = [m for m in maps if m.map_id == map_id]
-    found = exact or [m for m in maps if map_id and m.map_id.startswith(map_id)]
-    if len(found) == 1:
-        return found[0]
-    if found:
-        raise InvalidValueError(
-            f"{map_id}: {len(found)} maps begin so ({', '.join(m.map_id for m in found[:4])}); write more"
-        )
-    raise MapNotFoundError(
-        f"snapshot {snapshot.version} has no live map {map_id}; `featuredb maps` lists what there is"
     )
 
 

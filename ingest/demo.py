@@ -128,7 +128,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.map_builder import MapOptions
     from ingest.pipeline import IngestOptions, ingest_photos
     from ingest.reconstruction import MapMakingOptions
-    from ingest.report import write_report
+    from ingest.report_html import write_report
     from ingest.report_plots import plan_png
 
     options = IngestOptions(

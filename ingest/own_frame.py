@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
 from ingest.colmap_bridge import Model
@@ -43,7 +44,7 @@ def own_frame_of(model: Model) -> tuple[Sim3, OwnFrame]:
     median = float(np.median(distances))
     scale = NOMINAL_DISTANCE / median if median > 0 else 1.0
     up = vertical_of(model.cam_from_sfm)
-    rotation = np.eye(3) if up is None else _z_to(up)
+    rotation = np.eye(3) if up is None else rotation_to_up(up)
     middle = np.median(model.xyz, axis=0)
     own_from_sfm = Sim3(scale=scale, rotation=rotation, translation=-scale * rotation @ middle)
     return own_from_sfm, OwnFrame(metric=False, upright=up is not None)
@@ -186,11 +187,3 @@ def _held_level(poses: Sequence[Rigid3]) -> tuple[NDArray[np.bool_], float, Floa
 def _down(poses: Sequence[Rigid3]) -> FloatArray:
     """(k, 3) about downwards: image rows point there in photos of fronts, the view in photos from above."""
     return np.array([pose.rotation[1] + pose.rotation[2] for pose in poses])
-
-
-def _z_to(up: FloatArray) -> FloatArray:
-    """A rotation (3, 3) that takes the unit vector `up` to the z axis."""
-    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    x = np.cross(helper, up)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(up, x), up])

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HEIGHT_DATUMS
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
+from featuredb.plain_json import plain
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
@@ -223,18 +223,9 @@ def _identity(folder: Path, options: IngestOptions, job_id: str, number: int) ->
             "component": number,
             "versions": library_versions(),
             "vocabulary": (options.vocabulary or shipped_vocabulary()).digest,
-            "options": _plain(dataclasses.asdict(options.making)),
+            "options": plain(dataclasses.asdict(options.making)),
         },
     )
-
-
-def _plain(value: Any) -> Any:
-    """Dataclass fields as JSON has them: tuples as lists, everything unknown as text."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value if value is None or isinstance(value, (str, int, float, bool)) else str(value)
 
 
 def _place_and_commit(

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
 
 _RELATIVE_STEP = 1e-6  # of central differences: error about 1e-10 of the derivative in float64
 _MAX_SIGMA_M = 1e4  # points on nearly parallel rays; keeps the matrix invertible and float32
@@ -61,7 +62,7 @@ def linearise(
         projected[rows] = camera.project(in_camera[rows])
         by_camera_point[rows] = _projection_jacobian(camera, in_camera[rows])
     by_pose = np.zeros((len(xy), 2, 6))
-    by_pose[:, :, :3] = -by_camera_point @ _skew(in_camera)
+    by_pose[:, :, :3] = -by_camera_point @ skew(in_camera)
     by_pose[:, :, 3:] = by_camera_point
     return Linearised(
         residual=xy - projected,
@@ -143,10 +144,3 @@ def _projection_jacobian(camera: Camera, in_camera: FloatArray) -> FloatArray:
         for axis in np.eye(3)
     ]
     return np.stack(columns, axis=2)
-
-
-def _skew(vectors: FloatArray) -> FloatArray:
-    """(m, 3, 3) cross product matrices of (m, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

@@ -1,10 +1,8 @@
-"""What an ingest did: one value, written as JSON for programs and as a page for people."""
+"""What an ingest did: one value, and its JSON for programs; `ingest.report_html` writes it."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,14 +10,13 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.plain_json import plain
 from ingest.register.control.model import ControlledPlacement
 from ingest.report_films import FilmOutcome, films_json
-from ingest.workspace import atomic_file, write_json
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
 MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
 SCHEMA_ID = "featuredb/ingest/report/1"
-REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 
 # EXIF rounds to whole millimetres of 35 mm equivalent (2.5 % at 20 mm) and makers count the frame differently
 # (4 %); beyond their sum something else is at work.
@@ -245,17 +242,6 @@ class IngestReport:
         return sum(stage.seconds for stage in self.stages)
 
 
-def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
-    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
-    from ingest.report_html import report_page  # matplotlib loads when a report is written, not before
-
-    json_path, html_path = folder / REPORT_JSON, folder / REPORT_HTML
-    write_json(json_path, report_json(report))
-    with atomic_file(html_path) as temporary:
-        temporary.write_text(report_page(report), encoding="utf-8")
-    return json_path, html_path
-
-
 def report_json(report: IngestReport) -> dict[str, Any]:
     """The report as JSON of `schemas/ingest/report.json`; NaN and infinity become null."""
     document: dict[str, Any] = plain(
@@ -352,20 +338,3 @@ def _map_json(outcome: MapOutcome) -> dict[str, Any]:
 
 def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
     return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}
-
-
-def plain(value: Any) -> Any:
-    """`value` with only what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if value is None or isinstance(value, (str, int, float, bool)):
-        return value
-    return str(value)

@@ -2,12 +2,16 @@
 
 import math
 from html import escape
+from pathlib import Path
 
 from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
 from ingest.register.control.report import control_html
 from ingest.report import IngestReport, MapOutcome, PhotoOutcome, report_json
 from ingest.report_films import films_html
 from ingest.report_plots import histograms_png, plan_png
+from ingest.workspace import atomic_file, write_json
+
+REPORT_JSON = "report.json"
 
 _FILE_PILLS = {
     "registered": ("good", "in a map"),
@@ -21,6 +25,15 @@ _MAP_PILLS = {
     "unplaced": ("fair", "kept without a place"),
     "refused": ("bad", "refused"),
 }
+
+
+def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
+    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
+    json_path, html_path = folder / REPORT_JSON, folder / "report.html"
+    write_json(json_path, report_json(report))
+    with atomic_file(html_path) as temporary:
+        temporary.write_text(report_page(report), encoding="utf-8")
+    return json_path, html_path
 
 
 def report_page(report: IngestReport) -> str:

@@ -22,7 +22,7 @@ _DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 def register(subparsers: Any) -> None:
     """Add the subcommands to the parser of `featuredb`."""
     from featuredb.cli.common import add_database_argument
-    from reloc.tracking.live_command import register as register_live
+    from reloc.live_command import register as register_live
 
     serve = subparsers.add_parser(
         "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."

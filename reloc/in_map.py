@@ -13,7 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapPoints, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
-from reloc.result import InliersInMap, LocalisedPose, LocaliseResult, PoseInMap
+from reloc.result import LocalisedPose, LocaliseResult, PoseInMap
 
 _EPSG = 32631
 _STAND_IN = LocalFrame(latitude_deg=0.0, longitude_deg=3.0, height_m=0.0)
@@ -53,10 +53,6 @@ def in_own_frame(result: LocaliseResult, unplaced: UnplacedMap) -> LocaliseResul
 
 
 def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
-    inliers = None
-    if pose.inliers is not None:
-        xyz = pose.frame.enu_from_utm(pose.inliers.points_utm, pose.epsg)
-        inliers = InliersInMap(pixels=pose.inliers.pixels, points_xyz=xyz)
     return PoseInMap(
         map_id=unplaced.map_id,
         frame=unplaced.frame,
@@ -65,5 +61,4 @@ def _pose(pose: LocalisedPose, unplaced: UnplacedMap) -> PoseInMap:
         camera=pose.camera,
         camera_source=pose.camera_source,
         residual_rms_px=pose.residual_rms_px,
-        inliers=inliers,
     )

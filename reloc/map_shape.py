@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import skew
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import ErrorModes
 from featuredb.maps.feature_map import FeatureMap
@@ -79,7 +80,7 @@ def _moved_points(
         by_point, by_pose = joint_jacobians(camera, pose, area.points[points[sees]])
         in_camera = pose.act(area.points[points[sees]])
         by_camera = by_point @ pose.rotation.T
-        left = np.concatenate([-by_camera @ _skews(in_camera), by_camera], axis=2)
+        left = np.concatenate([-by_camera @ skew(in_camera), by_camera], axis=2)
         mode = modes.poses[place[photo.image_id]].copy()
         mode[3:] *= area.image_reach[image]
         pixels = left @ mode
@@ -106,10 +107,3 @@ def _as_lens_of(camera: Camera, modes: FloatArray, zoom: float = 1.0) -> FloatAr
     """(8, r) of OPENCV's parameters as `reloc.lens_prior.lens_of` has them, of pictures so much larger."""
     scaled = modes * np.repeat([zoom, 1.0], 4)[:, None]
     return np.asarray(np.linalg.solve(opencv_by_lens(lens_of(camera)), scaled))
-
-
-def _skews(vectors: FloatArray) -> FloatArray:
-    """(n, 3, 3) of vectors (n, 3)."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)

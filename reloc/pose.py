@@ -206,13 +206,10 @@ class PoseUncertainty:
         covariance: (6, 6), area frame's axes: rotation of the camera (rad) before displacement of its
             centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C).
         residual_rms_px: of the inliers.
-        variance_factor: chi-square per degree of freedom of the residuals against 1 px and the points'
-            own covariance, times what the robust loss costs; the covariance is scaled by it.
     """
 
     covariance: FloatArray
     residual_rms_px: float
-    variance_factor: float
 
 
 def pose_uncertainty(
@@ -235,6 +232,7 @@ def pose_uncertainty(
     noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
     weight = np.linalg.inv(noise)
     chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
+    # Chi-square per degree of freedom, times what the robust loss costs.
     factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
     factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options), jacobian.shape[2])
     # Residuals of zero are test data; the floor is a hundredth of a pixel.
@@ -248,7 +246,6 @@ def pose_uncertainty(
     return PoseUncertainty(
         covariance=covariance[:6, :6],
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
-        variance_factor=factor,
     )
 
 

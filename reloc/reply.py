@@ -4,7 +4,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from featuredb.geo.geopose import GeoPose
+from featuredb.geo.geopose import BODY_AXES, GeoPose
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import quaternion_from_matrix
@@ -55,9 +55,6 @@ def reply_from_result(
         **fields,
     )
 
-
-# The same words as featuredb.geo.geopose.BODY_AXES; a test compares them.
-BODY_AXES: Literal["x forward, y left, z up"] = "x forward, y left, z up"
 
 _NO_POSE: dict[str, Any] = {
     "position": None,

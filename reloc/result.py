@@ -124,19 +124,6 @@ class LocalisedPose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class InliersInMap:
-    """The matches that agree with a pose in a map without a place.
-
-    Attributes:
-        pixels: (k, 2) float64, keypoints of the query in full-size pixels.
-        points_xyz: (k, 3) float64, the map points in the map's own frame.
-    """
-
-    pixels: FloatArray
-    points_xyz: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PoseInMap:
     """A pose in the own frame of a map without a place; it says nothing of where on Earth that is.
 
@@ -147,7 +134,6 @@ class PoseInMap:
         covariance: (6, 6), axes of the own frame: small rotation of the camera about them (rad) before
             displacement of the camera centre (units of the frame).
         camera, camera_source, residual_rms_px: as in LocalisedPose.
-        inliers: on request.
     """
 
     map_id: str
@@ -157,7 +143,6 @@ class PoseInMap:
     camera: Camera
     camera_source: Literal["request", "map", "exif", "estimated"]
     residual_rms_px: float
-    inliers: InliersInMap | None = None
 
     def __post_init__(self) -> None:
         covariance = frozen_array("PoseInMap.covariance", self.covariance, (6, 6))
@@ -190,7 +175,6 @@ class Evidence:
         inliers: matches that agree with the pose.
         log_nfa: -log10 of the expected number of as good poses among random matches.
         coverage: share of a 10x10 grid over the image that holds inliers.
-        visible_share: guided inliers over map points that should be visible.
         agreement: of the parts of the image where the map should be seen, the share that holds inliers.
         spread: the same over the share that as many inliers would reach if they lay like the map's points.
     """
@@ -198,7 +182,6 @@ class Evidence:
     inliers: int
     log_nfa: float
     coverage: float
-    visible_share: float
     agreement: float
     spread: float
 

@@ -317,7 +317,7 @@ def _with_evidence(
     error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
     blind = _independent(features, area, pose, unguided, error < tolerance_px)
     inlier_pixels = features.xy[matches.feature[own]]
-    visible, expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
+    expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
     evidence = Evidence(
         inliers=len(own),
         log_nfa=log_nfa(
@@ -329,28 +329,25 @@ def _with_evidence(
             sample=4 if pose.focal_is_free else 3,
         ),
         coverage=coverage(inlier_pixels, width, height),
-        visible_share=len(own) / max(len(visible), 1),
         agreement=agreement(inlier_pixels, expected_pixels, width, height),
         spread=spread(inlier_pixels, expected_pixels, width, height),
     )
     return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
 
 
-def _expected(
-    area: Area, points: NDArray[np.int64], pose: PoseHypothesis
-) -> tuple[NDArray[np.int64], FloatArray]:
-    """Points that the photo should show, and their pixels: as the map has seen them, or else farther from it.
+def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> FloatArray:
+    """Pixels of points that the photo should show: as the map has seen them, or else farther from it.
 
     Where the map knows hardly anything from that side, what SIFT may still find is what there is to agree
     with.
     """
-    visible, pixels = points[:0], np.zeros((0, 2))
+    pixels = np.zeros((0, 2))
     for beyond_deg in (EXPECTED_DEG, POSSIBLE_DEG):
         visible = visible_points(area, points, pose.camera, pose.cam_from_local, beyond_deg)
         pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
         if expected_cells(pixels, pose.camera.width, pose.camera.height) >= _FEWEST_CELLS:
             break
-    return visible, pixels
+    return pixels
 
 
 def _independent(

@@ -59,13 +59,12 @@ class SharedLens:
 
     Attributes:
         camera: OPENCV. sigmas: (8,) one standard deviation of each of its parameters, in their order.
-        agree: (n,) which of the photos. excess: (n,) see `SharedLensOptions.max_excess`.
+        agree: (n,) which of the photos.
     """
 
     camera: Camera
     sigmas: FloatArray
     agree: NDArray[np.bool_]
-    excess: FloatArray
 
     def as_request(self) -> CameraRequest:
         """As a query takes it."""
@@ -168,7 +167,6 @@ def shared_lens(
                 camera=camera,
                 sigmas=options.sigma_scale * np.sqrt(np.diag(covariance)),
                 agree=agree,
-                excess=excess,
             )
         agree[worst] = False
     return None

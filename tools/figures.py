@@ -2,10 +2,11 @@
 
 import argparse
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from featuredb.plain_json import plain
 
 
 def add_json_option(parser: argparse.ArgumentParser) -> None:
@@ -18,16 +19,3 @@ def write_figures(path: Path | None, figures: Mapping[str, Any]) -> None:
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(plain(figures), indent=1) + "\n", encoding="utf-8")
-
-
-def plain(value: Any) -> Any:
-    """The value as JSON has it: mappings, lists, strings, numbers; null for what is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): plain(one) for key, one in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str):
-        return [plain(one) for one in value]
-    if hasattr(value, "item"):  # a number of NumPy's
-        value = value.item()
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

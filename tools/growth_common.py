@@ -19,7 +19,7 @@ import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import rotation_angle, so3_log
+from featuredb.geometry.rotation import rotation_angle
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import Truth, read_truth
 from featuredb.store import Database
@@ -73,7 +73,7 @@ class Registered:
     Attributes:
         fact: what it is. map_id, status, generation: of its map.
         offset_m: (3,) east, north, up, registered minus true; None for photos without a true place here.
-        angle_deg: between the orientations. turn_rad: (3,) the rotation between them, about east, north, up.
+        angle_deg: between the orientations.
         drift_m: 95 % bound that its map claims against its anchors; None for anchors.
         bound_m: 95 % bound that its map claims on Earth, the anchors' own uncertainty included.
     """
@@ -86,7 +86,6 @@ class Registered:
     angle_deg: float
     drift_m: float | None
     bound_m: float
-    turn_rad: FloatArray | None = None
 
     @property
     def error_m(self) -> float:
@@ -205,10 +204,10 @@ def _candidate_names(folder: Path) -> dict[str, str]:
     }
 
 
-def registered(database: Database, album: Album, version: int | None = None) -> list[Registered]:
+def registered(database: Database, album: Album) -> list[Registered]:
     """All photos of the album in living maps, anchors included, with their errors."""
     found: list[Registered] = []
-    snapshot = database.snapshot(version)
+    snapshot = database.snapshot()
     for summary in snapshot.maps():
         feature_map = snapshot.load_map(summary.map_id)
         here = album.truth.frame.enu_from(feature_map.frame)
@@ -216,13 +215,12 @@ def registered(database: Database, album: Album, version: int | None = None) -> 
         for image in feature_map.images:
             fact = _fact_of(album, feature_map, image.name)
             true = album.truth.images.get(fact.name)
-            offset, angle, turn = None, float("nan"), None
+            offset, angle = None, float("nan")
             if true is not None:
                 center = here.act(image.cam_from_local.center[None])[0]
                 offset = center - true.cam_from_local.center
                 turned = image.cam_from_local.rotation @ here.rotation.T
                 angle = float(np.degrees(rotation_angle(turned @ true.cam_from_local.rotation.T)))
-                turn = so3_log(turned.T @ true.cam_from_local.rotation)
             found.append(
                 Registered(
                     fact=fact,
@@ -233,7 +231,6 @@ def registered(database: Database, album: Album, version: int | None = None) -> 
                     angle_deg=angle,
                     drift_m=summary.drift_m,
                     bound_m=bound_m,
-                    turn_rad=turn,
                 )
             )
     return found

@@ -88,7 +88,6 @@ class Outcome:
     quarantined: int
     wrong: int
     off_share: float
-    honest_active: int
     forced: int = 0
     changed: bool = False
     restored: bool = True
@@ -183,7 +182,6 @@ def try_poison(
         quarantined=sum(r.fact.kind in kinds and r.status == "quarantined" for r in found),
         wrong=sum(r.wrong for r in active),
         off_share=max((shares[m] for m in poisoned if m in shares), default=0.0),
-        honest_active=sum(r.fact.kind in ("honest", "late") for r in active),
         forced=forced["forced"],
         changed=forced["changed"],
         restored=forced["restored"],

@@ -92,7 +92,6 @@ class IntensityRefinement:
             result, at the finest octave; `*_before` at the start.
         shift_px: root mean square movement of the picture, pixels of the photo.
         samples: scan points compared at the finest octave.
-        evaluations: of the measure, over all octaves.
         message: why the start was kept, or "".
     """
 
@@ -105,7 +104,6 @@ class IntensityRefinement:
     gradients_before: float
     shift_px: float
     samples: int
-    evaluations: int
     message: str
 
     def __post_init__(self) -> None:
@@ -129,15 +127,14 @@ def refine_by_intensity(
         source: which picture of the scan is compared.
     """
     finest = min(options.side_px, finest_side_px(camera, cam_from_local, cloud, options.finest_spacing))
-    pose, evaluations = cam_from_local, 0
+    pose = cam_from_local
     octave: _Octave | None = None
     for level in range(options.octaves - 1, -1, -1):
         view = pinhole_view(photo_gray, camera, max(finest >> level, 48))
         octave = _octave(view, pose, cloud, source, options)
         if len(octave.points) < _LEAST_SAMPLES:
             return _kept(cam_from_local, octave, f"only {len(octave.points)} scan points to compare")
-        pose, used = _climb(octave, pose, options)
-        evaluations += used
+        pose = _climb(octave, pose, options)
     assert octave is not None
     shift = octave.shift_px(cam_from_local, pose)
     leash = options.leash_px * 2 ** (options.octaves - 1)
@@ -157,7 +154,6 @@ def refine_by_intensity(
         gradients_before=before[1],
         shift_px=shift * max(camera.width, camera.height) / max(octave.camera.width, octave.camera.height),
         samples=len(octave.points),
-        evaluations=evaluations,
         message="",
     )
 
@@ -277,8 +273,8 @@ def _steps(octave: _Octave, pose: Rigid3, pixels: float) -> FloatArray:
     return small * pixels / np.maximum(effect, 1e-6)
 
 
-def _climb(octave: _Octave, pose: Rigid3, options: IntensityOptions) -> tuple[Rigid3, int]:
-    """Downhill simplex from a pose at one octave; the pose reached, and how many evaluations it took."""
+def _climb(octave: _Octave, pose: Rigid3, options: IntensityOptions) -> Rigid3:
+    """The pose that a downhill simplex reaches from another at one octave."""
     scale = _steps(octave, pose, options.simplex_px)
 
     def cost(step: FloatArray) -> float:
@@ -295,7 +291,7 @@ def _climb(octave: _Octave, pose: Rigid3, options: IntensityOptions) -> tuple[Ri
             "fatol": 1e-5,
         },
     )
-    return Rigid3.exp(result.x * scale) @ pose, int(result.nfev)
+    return Rigid3.exp(result.x * scale) @ pose
 
 
 def _covariance(octave: _Octave, pose: Rigid3, options: IntensityOptions) -> FloatArray | None:
@@ -354,7 +350,6 @@ def _kept(start: Rigid3, octave: _Octave, message: str) -> IntensityRefinement:
         gradients_before=gradients,
         shift_px=0.0,
         samples=len(octave.points),
-        evaluations=0,
         message=message,
     )
 

@@ -272,12 +272,12 @@ def ask_alone(
     own_limits: bool,
 ) -> Alone:
     """One query by pycolmap, its steps timed."""
-    marks = [time.perf_counter()]
+    clock = StageClock()
     data = path.read_bytes()
     gray = decode_gray(data)
-    marks.append(time.perf_counter())
+    clock.lap("decode")
     keypoints, descriptors, xy = extract_alone(gray, extractor, _max_side(own_limits))
-    marks.append(time.perf_counter())
+    clock.lap("features")
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu, matching.num_threads = False, 1
     matcher = pycolmap.FeatureMatcher.create(matching, pycolmap.Device.cpu)
@@ -285,13 +285,12 @@ def ask_alone(
     for other, other_descriptors, point in colmap_map.images:
         found = matcher.match(keypoints, descriptors, other, other_descriptors)
         pairs |= {(int(q), int(point[m])) for q, m in np.asarray(found) if point[m] >= 0}
-    marks.append(time.perf_counter())
+    clock.lap("matching")
     rows = np.array(sorted(pairs), dtype=np.int64).reshape(-1, 2)
     pose, inliers = _pose_alone(gray, data, xy[rows[:, 0]], colmap_map.points[rows[:, 1]], localiser)
-    marks.append(time.perf_counter())
-    steps = np.diff(marks) * 1e3
+    clock.lap("pose")
     return Alone(
-        stages_ms=dict(zip(_STEPS, (float(ms) for ms in steps), strict=True)),
+        stages_ms={step: 1e3 * s for step, s in clock.seconds.items()},
         inliers=inliers,
         matches=len(rows),
         cam_from_local=pose,

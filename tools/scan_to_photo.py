@@ -259,9 +259,7 @@ def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(128 + 45 * (values - mean) / (deviation + 4), 0, 255).astype(np.uint8)
 
 
-def adjust(
-    photos: list[Photo], lens: Lens, free: tuple[int, ...], rounds: int = 30
-) -> tuple[list[Photo], Lens, Floats]:
+def adjust(photos: list[Photo], lens: Lens, free: tuple[int, ...]) -> tuple[list[Photo], Lens, Floats]:
     """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2, 5 p1, 6 p2) from all
     correspondences, robustly (Geman-McClure at three times the spread); also the covariance of the lens."""
     count = len(photos)
@@ -269,7 +267,7 @@ def adjust(
     values = lens.values()
     k = len(free)
     size = 6 * count + k
-    for _ in range(rounds):
+    for _ in range(30):
         normal, gradient = np.zeros((size, size)), np.zeros(size)
         current = Lens(lens.width, lens.height, *values.tolist())
         results = [_linearise(p, pose, current) for p, pose in zip(photos, poses, strict=True)]

@@ -16,18 +16,16 @@ from reloc.viewer.query import Queries
 from reloc.viewer.scene import Scene
 from reloc.viewer.server import HOST, create_app, listen, uvicorn_server
 
-SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+_SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 @contextmanager
-def open_page(
-    database: Database, scene: Scene, photos: Path | None, *, arguments: tuple[str, ...] = SOFTWARE_GL
-) -> Iterator[Page]:
+def open_page(database: Database, scene: Scene, photos: Path | None) -> Iterator[Page]:
     """The page of a scene, 1280 x 720, loaded."""
     chromium = shutil.which("chromium")
     if chromium is None:
         raise SystemExit("there is no Chromium: apt-get install chromium")
-    options = [*arguments, *(["--no-sandbox"] if os.geteuid() == 0 else [])]
+    options = [*_SOFTWARE_GL, *(["--no-sandbox"] if os.geteuid() == 0 else [])]
     server = uvicorn_server(create_app(scene, Pictures(photos), Queries(database, scene)))
     with listen(0) as bound, sync_playwright() as playwright:
         thread = threading.Thread(target=server.run, kwargs={"sockets": [bound]}, daemon=True)

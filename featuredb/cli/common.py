@@ -4,11 +4,12 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from datetime import UTC, date, datetime
+from datetime import UTC, datetime
 from decimal import Decimal
 from typing import TYPE_CHECKING, Any
 
 from featuredb.errors import InvalidValueError
+from featuredb.plain_json import plain
 
 if TYPE_CHECKING:
     from featuredb.store import Database
@@ -28,6 +29,16 @@ def add_database_argument(parser: argparse.ArgumentParser) -> None:
         default=[],
         help="option of the object store, e.g. AWS_ENDPOINT_URL=...; may be repeated",
     )
+
+
+def add_command(
+    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
+) -> argparse.ArgumentParser:
+    """Add a subcommand on a database."""
+    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text, epilog=epilog)
+    add_database_argument(parser)
+    parser.set_defaults(run=run)
+    return parser
 
 
 def storage_options(args: argparse.Namespace) -> dict[str, str]:
@@ -137,20 +148,5 @@ def write_json(value: Any) -> None:
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """A value as JSON; see `_plain`."""
-    return json.dumps(_plain(value), indent=indent, allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold: times as ISO 8601, bytes as hex, NaN and infinity as null."""
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, datetime | date):
-        return value.isoformat()
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, float):
-        return value if abs(value) < float("inf") else None
-    return value if isinstance(value, bool | int | str | None) else str(value)
+    """A value as JSON; see `plain`."""
+    return json.dumps(plain(value), indent=indent, allow_nan=False)

@@ -6,13 +6,13 @@
 import argparse
 import csv
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from featuredb.cli import candidates, lineage
 from featuredb.cli.common import (
     add_as_of_argument,
-    add_database_argument,
+    add_command,
     format_table,
     hours,
     json_text,
@@ -33,13 +33,13 @@ _DEFAULTS = VacuumOptions()
 
 def register(subparsers: Any) -> None:
     """Add the database commands to the parser of `featuredb`."""
-    _command(subparsers, "init", run_init, "make an empty database")
-    maps = _command(subparsers, "maps", run_maps, "list the maps")
+    add_command(subparsers, "init", run_init, "make an empty database")
+    maps = add_command(subparsers, "maps", run_maps, "list the maps")
     maps.add_argument("--all", action="store_true", help="retired maps, too")
     add_as_of_argument(maps)
     maps.add_argument("--json", action="store_true", help="everything that is known, as JSON")
-    _command(subparsers, "history", run_history, "list the versions of the database")
-    sql = _command(
+    add_command(subparsers, "history", run_history, "list the versions of the database")
+    sql = add_command(
         subparsers,
         "sql",
         run_sql,
@@ -50,21 +50,21 @@ def register(subparsers: Any) -> None:
     sql.add_argument("query", metavar="SELECT", help="one reading statement")
     sql.add_argument("--format", choices=("table", "csv", "json"), default="table", help="default: table")
     add_as_of_argument(sql)
-    check = _command(
+    check = add_command(
         subparsers, "verify", run_verify, "check every file, row and reference; exit 1 if broken"
     )
     check.add_argument("--json", action="store_true", help="the report as JSON")
-    retire = _command(
+    retire = add_command(
         subparsers, "retire", run_retire, "take a map out of service, with all that hangs on it, or a scan"
     )
     retire.add_argument("map_id", metavar="MAP", help="id of a map or of a LiDAR scan")
     retire.add_argument("--reason", required=True, help="kept with the map or scan")
-    rollback = _command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
+    rollback = add_command(subparsers, "rollback", run_rollback, "show again what an earlier version showed")
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
     lineage.register(subparsers)
     candidates.register(subparsers)
-    _command(subparsers, "compact", run_compact, "merge small files")
-    _command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
+    add_command(subparsers, "compact", run_compact, "merge small files")
+    add_command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
 
 
@@ -239,17 +239,8 @@ def write_result(result: SqlResult, output: str) -> None:
         sys.stdout.write("\n]\n")
 
 
-def _command(
-    subparsers: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
-) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = subparsers.add_parser(name, help=text, description=text, epilog=epilog)
-    add_database_argument(parser)
-    parser.set_defaults(run=run)
-    return parser
-
-
 def _register_vacuum(subparsers: Any) -> None:
-    parser = _command(subparsers, "vacuum", run_vacuum, "remove what no snapshot needs any more")
+    parser = add_command(subparsers, "vacuum", run_vacuum, "remove what no snapshot needs any more")
     parser.add_argument(
         "--keep-history-hours",
         type=hours,

@@ -1,7 +1,6 @@
 """The commands for LiDAR scans: lidar add, lidar list, lidar picture."""
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,7 +18,13 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from featuredb.cli.common import add_database_argument, format_table, open_database, storage_options
+from featuredb.cli.common import (
+    add_command,
+    format_table,
+    open_database,
+    storage_options,
+    write_json,
+)
 from featuredb.geo.crs import HEIGHT_UNITS
 from featuredb.geo.datum import HEIGHT_DATUMS
 from featuredb.store import Database
@@ -46,10 +51,10 @@ def register(subparsers: Any) -> None:
     )
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _register_add(commands)
-    listing = _command(commands, "list", run_list, "list the scans")
+    listing = add_command(commands, "list", run_list, "list the scans")
     listing.add_argument("--all", action="store_true", help="retired scans, too")
     listing.add_argument("--json", action="store_true", help="everything that is known, as JSON")
-    picture = _command(commands, "picture", run_picture, "draw a scan from above")
+    picture = add_command(commands, "picture", run_picture, "draw a scan from above")
     picture.add_argument("scan_id", metavar="SCAN")
     picture.add_argument("out", metavar="PNG", type=Path)
 
@@ -87,8 +92,7 @@ def run_list(args: argparse.Namespace) -> int:
     """Print a table of the scans."""
     scans = list_scans(open_database(args), include_retired=args.all)
     if args.json:
-        rows = [{**scan.row, "created_at": scan.created_at.isoformat()} for scan in scans]
-        sys.stdout.write(json.dumps({"scans": rows}, indent=2) + "\n")
+        write_json({"scans": [{**scan.row, "created_at": scan.created_at} for scan in scans]})
         return 0
     header = (
         "scan", "name", "status", "epsg", "heights", "points", "spacing_m", "colour", "intensity",
@@ -172,7 +176,7 @@ def _intensity(scan: ScanSummary) -> str:
 
 
 def _register_add(commands: Any) -> None:
-    parser = _command(
+    parser = add_command(
         commands,
         "add",
         run_add,
@@ -206,15 +210,6 @@ def _register_add(commands: Any) -> None:
     )
     job.add_argument("--picture", type=Path, metavar="PNG", help="draw the scan from above")
     job.add_argument("--quiet", action="store_true", help="no progress bars")
-
-
-def _command(
-    commands: Any, name: str, run: Callable[[argparse.Namespace], int], text: str, epilog: str | None = None
-) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=text, description=text, epilog=epilog)
-    add_database_argument(parser)
-    parser.set_defaults(run=run)
-    return parser
 
 
 @contextmanager

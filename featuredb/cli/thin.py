@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from featuredb.cli.common import add_database_argument, open_database
-from featuredb.errors import MapNotFoundError, StoreError
+from featuredb.errors import StoreError
 from featuredb.maps.thin import ThinOptions, described_points_of_images, thin_map
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import MapSummary, Snapshot, UnplacedSummary
@@ -50,7 +50,7 @@ def run_thin(args: argparse.Namespace) -> int:
     """Thin the map and commit it as a new state of itself.
 
     Raises:
-        MapNotFoundError: no live map of that id.
+        MapNotFoundError: no live map of that id, or several that begin so.
         StoreError: the map is quarantined.
         InvalidValueError: options out of range.
         ConflictError: someone else changed the map meanwhile.
@@ -82,17 +82,12 @@ def run_thin(args: argparse.Namespace) -> int:
 
 
 def _thinnable(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
-    maps: list[MapSummary | UnplacedSummary] = [*snapshot.maps(), *snapshot.unplaced_maps()]
-    found = [m for m in maps if m.map_id == map_id] or [m for m in maps if m.map_id.startswith(map_id)]
-    if len(found) != 1:
-        raise MapNotFoundError(
-            f"snapshot {snapshot.version} has {len(found)} live maps {map_id}; `featuredb maps` lists them"
-        )
-    if found[0].status not in ("active", "unplaced"):
+    found = snapshot.find(map_id)
+    if found.status not in ("active", "unplaced"):
         raise StoreError(
-            f"map {found[0].map_id} is {found[0].status}; active maps are thinned, and those without a place"
+            f"map {found.map_id} is {found.status}; active maps are thinned, and those without a place"
         )
-    return found[0]
+    return found
 
 
 def _figures(feature_map: AnyMap) -> str:

@@ -32,10 +32,10 @@ class Ifd:
     values: dict[int, TagValue] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
-    def number(self, tag: int, index: int = 0) -> float | None:
-        """A number of the tag, or None where it is absent or not a number; may be NaN."""
+    def number(self, tag: int) -> float | None:
+        """The first number of the tag, or None where it is absent or not a number; may be NaN."""
         value = self.values.get(tag)
-        return float(value[index]) if isinstance(value, tuple) and len(value) > index else None
+        return float(value[0]) if isinstance(value, tuple) and value else None
 
     def numbers(self, tag: int) -> tuple[float, ...] | None:
         value = self.values.get(tag)

@@ -9,7 +9,7 @@ import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 
-BODY_AXES = "x forward, y left, z up"
+BODY_AXES: Final = "x forward, y left, z up"
 
 BODY_FROM_CAM: FloatArray = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 BODY_FROM_CAM.setflags(write=False)
@@ -138,13 +138,6 @@ def geopose_from_camera(cam_from_local: Rigid3, frame: LocalFrame) -> GeoPose:
         height_m=float(height),
         quaternion_xyzw=(float(x), float(y), float(z), float(w)),
     )
-
-
-def camera_from_geopose(geopose: GeoPose, frame: LocalFrame) -> Rigid3:
-    """The pose cam_from_local, in a local frame, of a GeoPose; the inverse of `geopose_from_camera`."""
-    center = frame.enu_from_geodetic((geopose.latitude_deg, geopose.longitude_deg, geopose.height_m))
-    rotation = BODY_FROM_CAM.T @ geopose.true_enu_from_body.T @ frame.true_enu_from_enu(center)
-    return Rigid3(rotation=rotation, translation=-rotation @ center)
 
 
 def _numbers(document: Any, member: str, names: tuple[str, ...]) -> list[float]:

@@ -100,11 +100,6 @@ class Camera:
         """Tangent of the angle off the axis from which on `project` answers NaN; infinity for most lenses."""
         return _tan_of_fold(self.model, self.params)
 
-    def lens_parameters(self) -> tuple[int, ...]:
-        """Indices of `params` that are focal lengths and distortion, without the principal point."""
-        template = _template(self.model)
-        return (*template.focal_length_idxs(), *template.extra_params_idxs())
-
     def with_focal(self, focal_px: float) -> "Camera":
         """The same camera with every focal length scaled so that their mean is `focal_px`."""
         params = list(self.params)

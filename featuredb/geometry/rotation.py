@@ -10,10 +10,20 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 _SHORTEST_QUATERNION = 1e-6  # a shorter one is an unset field, not a rotation
 
 
-def skew(vector: ArrayLike) -> FloatArray:
-    """The matrix [v]x with [v]x w = v x w. vector (3,) -> (3, 3)."""
-    x, y, z = np.asarray(vector, dtype=np.float64)
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+def skew(vectors: ArrayLike) -> FloatArray:
+    """The matrices [v]x with [v]x w = v x w. vectors (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(vectors, dtype=np.float64)
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(*v.shape, 3)
+
+
+def rotation_to_up(up: FloatArray) -> FloatArray:
+    """A rotation (3, 3) that carries the unit vector `up` to (0, 0, 1)."""
+    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
+    east = np.cross(helper, up)
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(up, east), up])
 
 
 def so3_exp(omega: ArrayLike) -> FloatArray:

@@ -48,15 +48,12 @@ def open_dsm(path: Path) -> ScanFile:
         sha256=file_sha256(path),
         size_bytes=path.stat().st_size,
         version="",
-        compression="GeoTIFF",
-        point_format=0,
         points=points,
         low=low,
         high=high,
         wkt=wkt,
         geo_keys=None,
         wkt_counts=True,
-        has_rgb=False,
     )
 
 

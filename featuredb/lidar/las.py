@@ -40,29 +40,23 @@ class ScanFile:
         sha256: of its bytes.
         size_bytes: of the file.
         version: of LAS, "1.2" to "1.4".
-        compression: "none", "LAZ" or "COPC"; "GeoTIFF" of a raster of heights.
-        point_format: 0 to 10.
         points: number of points by the header.
         low, high: (3,) box in file coordinates, by the header or, where that is wrong, by the points.
         wkt: the WKT record, or None.
         geo_keys: GeoTIFF keys, or None.
         wkt_counts: the header says that the WKT is the CRS and not the keys.
-        has_rgb: the point format has colours (they may all be zero).
     """
 
     path: Path
     sha256: str
     size_bytes: int
     version: str
-    compression: str
-    point_format: int
     points: int
     low: FloatArray
     high: FloatArray
     wkt: str | None
     geo_keys: GeoKeys | None
     wkt_counts: bool
-    has_rgb: bool
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,9 +101,7 @@ def open_scan_file(path: Path) -> ScanFile:
         wkt, keys = _crs_records(header)
         low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
         first = _raw_points(reader.read_points(min(int(header.point_count), 10_000)))
-        names = {vlr.user_id for vlr in header.vlrs}
-        compression = "COPC" if "copc" in names else "LAZ" if header.are_points_compressed else "none"
-        version, point_format = str(header.version), int(header.point_format.id)
+        version = str(header.version)
         points, wkt_counts = int(header.point_count), bool(header.global_encoding.wkt)
     slack = 1e-6 * (1.0 + np.abs(np.concatenate([low, high])).max())
     if not (
@@ -124,15 +116,12 @@ def open_scan_file(path: Path) -> ScanFile:
         sha256=file_sha256(path),
         size_bytes=size,
         version=version,
-        compression=compression,
-        point_format=point_format,
         points=points,
         low=low,
         high=high,
         wkt=wkt,
         geo_keys=keys,
         wkt_counts=wkt_counts,
-        has_rgb=first.rgb is not None,
     )
 
 

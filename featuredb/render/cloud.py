@@ -10,7 +10,6 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import frozen_array
 
 UNCLASSIFIED = 1  # ASPRS class of points that nobody classified
-GROUND = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

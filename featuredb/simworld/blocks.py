@@ -10,7 +10,6 @@ from featuredb.simworld.scene import Building, Faces
 from featuredb.simworld.solids import box, car
 
 Rect = tuple[float, float, float, float]
-Height = Callable[[float, float], float]
 
 _CAR_COLOURS = (
     (0.95, 0.95, 0.95),
@@ -22,7 +21,6 @@ _CAR_COLOURS = (
 )
 _HOUSE_FACADES = ("facade_brick", "facade_plaster", "facade_ochre", "facade_stone")
 _TILED_ROOFS = ("roof_red", "roof_brown", "roof_slate")
-_FREE_GROUND_M = 0.35  # parked cars and clutter keep this distance
 
 
 @dataclass(slots=True, kw_only=True)

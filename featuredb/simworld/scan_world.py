@@ -15,7 +15,7 @@ from featuredb.simworld.airborne import ScanOptions, scan_town
 from featuredb.simworld.ortho import OrthoOptions, make_ortho
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.town import make_town
-from featuredb.simworld.world import Progress, World, WorldOptions, open_world, town_of, write_world
+from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 
 SCAN_FILE, ORTHO_FILE = "scan.laz", "ortho.tif"
 OTHER_SCAN_FILE, OTHER_ORTHO_FILE = "other_town_scan.laz", "other_town_ortho.tif"
@@ -77,11 +77,8 @@ def make_scan_world(out: Path, seed: int = 1, size: Size = "short", workers: int
     return write_scan_world(out, ScanWorldOptions(world=replace(world, workers=workers)))
 
 
-def write_scan_world(folder: Path, options: ScanWorldOptions, progress: Progress | None = None) -> ScanWorld:
+def write_scan_world(folder: Path, options: ScanWorldOptions) -> ScanWorld:
     """Write photos, scan and ortho image into `folder`; a folder that holds just these is left as it is.
-
-    Args:
-        progress: called with (files done, files in all) for the photos.
 
     Raises:
         MissingExtraError: the packages of the extra `lidar` are not installed.
@@ -94,7 +91,7 @@ def write_scan_world(folder: Path, options: ScanWorldOptions, progress: Progress
     require(*_NEEDS)
     # The stamp comes last: a folder with it is complete.
     stamp.unlink(missing_ok=True)
-    write_world(folder, options.world, progress)
+    write_world(folder, options.world)
     write_lidar(folder, options)
     stamp.write_text(json.dumps({"fingerprint": fingerprint}) + "\n")
     return open_scan_world(folder)

@@ -100,17 +100,17 @@ class Faces:
             **{n: getattr(self, n) for n, _, _ in _FACE_COLUMNS[3:]},
         )
 
-    def shaded(self, to_sun: ArrayLike, ambient: float = 0.55) -> "Faces":
+    def shaded(self, to_sun: ArrayLike) -> "Faces":
         """The same faces with Lambert's light from the unit vector `to_sun` multiplied into `tint`."""
-        light = self.sunlight(to_sun, ambient)
+        light = self.sunlight(to_sun)
         columns = {n: getattr(self, n) for n, _, _ in _FACE_COLUMNS}
         return Faces(**{**columns, "tint": self.tint * light[:, None]})
 
-    def sunlight(self, to_sun: ArrayLike, ambient: float = 0.55) -> FloatArray:
-        """Lambert's light (n,) from the unit vector `to_sun`, between `ambient` and 1.1."""
+    def sunlight(self, to_sun: ArrayLike) -> FloatArray:
+        """Lambert's light (n,) from the unit vector `to_sun`, between 0.55 and 1.1."""
         normal = np.cross(self.edge_s, self.edge_t)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        light = ambient + (1.1 - ambient) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0)
+        light = 0.55 + (1.1 - 0.55) * np.clip(normal @ np.asarray(to_sun), 0.0, 1.0)
         return np.asarray(light, dtype=np.float64)
 
 

@@ -158,9 +158,7 @@ def reopen(database: Database, candidate_ids: Iterable[str], reason: str) -> Non
     note_events(database, {c: {"event": REOPENED, "reason": reason} for c in wanted})
 
 
-def withdraw(
-    database: Database, candidate_ids: Iterable[str], reason: str, *, reason_code: str = "OWNER"
-) -> WithdrawReport:
+def withdraw(database: Database, candidate_ids: Iterable[str], reason: str) -> WithdrawReport:
     """Delete the bytes of photos, as their owner asks: from the table and from the disk or bucket, at once.
 
     Hash, owner, licence and events stay, so that it is known what was withdrawn. Running it again finishes
@@ -173,7 +171,7 @@ def withdraw(
         raise StoreError("withdraw: expected a reason, for those who will ask later")
     wanted = list(dict.fromkeys(candidate_ids))
     found = {c.candidate_id: c for c in list_candidates(database)}
-    event: Row = {"event": WITHDRAWN, "reason_code": reason_code, "reason": reason}
+    event: Row = {"event": WITHDRAWN, "reason_code": "OWNER", "reason": reason}
     pending = [c for c in wanted if c not in found or found[c].state != "withdrawn"]
     note_events(database, dict.fromkeys(pending, event))
     files = delete_images(database, wanted) if wanted else []
@@ -205,18 +203,6 @@ def list_candidates(
     return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
 
 
-def find_candidate(database: Database, candidate_id: str) -> Candidate:
-    """One contributed photo.
-
-    Raises:
-        CandidateNotFoundError: there is none of this id.
-    """
-    events = by_candidate(read_events(database, candidate_ids=[candidate_id]))
-    if candidate_id not in events:
-        raise not_found([candidate_id])
-    return candidate_of(events[candidate_id], live_maps(database, None))
-
-
 def count_candidates(database: Database) -> InboxCounts:
     """How many there are in each state, how many wait of each owner, and how many bytes they take."""
     live = live_maps(database, None)
@@ -234,18 +220,13 @@ def count_candidates(database: Database) -> InboxCounts:
     return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
 
 
-def load_image(database: Database, candidate_id: str) -> bytes:
-    """The bytes of a photo.
+def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    """Id and bytes of photos, one in memory at a time.
 
     Raises:
         CandidateNotFoundError: no such photo, or it was withdrawn.
         StoreError: they cannot be read, or are not those that were contributed.
     """
-    return next(load_images(database, [candidate_id]))[1]
-
-
-def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-    """Id and bytes of photos, one in memory at a time; raises as `load_image`."""
     table = database.table(CANDIDATE_IMAGES) if has_candidates(database) else None
     for candidate_id in candidate_ids:
         if table is None:

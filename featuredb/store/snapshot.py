@@ -155,6 +155,24 @@ class Snapshot:
         row = self._row(map_id)
         return _summary(row) if has_place(row) else _unplaced_summary(row)
 
+    def find(self, start: str) -> MapSummary | UnplacedSummary:
+        """The map, not retired, of this id, or the only one whose id begins so.
+
+        Raises:
+            MapNotFoundError: there is none, or several begin so.
+        """
+        live = [map_id for map_id, row in self._rows.items() if row["status"] != RETIRED]
+        found = [start] if start in live else [m for m in live if start and m.startswith(start)]
+        if len(found) > 1:
+            raise MapNotFoundError(
+                f"{start}: {len(found)} maps begin so ({', '.join(sorted(found)[:4])}); write more of the id"
+            )
+        if not found:
+            raise MapNotFoundError(
+                f"snapshot {self.version} has no live map {start}; `featuredb maps` lists what there is"
+            )
+        return self.get_any(found[0])
+
     def lineages(self) -> dict[str, Lineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""
         known = {m.map_id: m for m in self.maps(include_retired=True)}

@@ -260,10 +260,8 @@ def _info(
 ) -> VideoInfo:
     clockwise_deg = _rotation(first, opening.name)
     size = (first.width, first.height)
-    ratio = stream.sample_aspect_ratio
-    aspect = float(ratio) if ratio and ratio > 0 else 1.0
     if clockwise_deg in (90, 270):
-        size, aspect = size[::-1], 1.0 / aspect
+        size = size[::-1]
     frame_size = fitted_size(*size, options.max_side_px)
     texts = {**container.metadata, **stream.metadata}
     tags = {name.lower(): value for name, value in texts.items()}
@@ -276,7 +274,6 @@ def _info(
         frame_width=frame_size[0],
         frame_height=frame_size[1],
         rotation_deg=clockwise_deg,
-        pixel_aspect=aspect,
         frame_rate_hz=float(rate) if rate else None,
         duration_s=None if opening.live else _duration_s(container, stream),
         frame_count=stream.frames if stream.frames > 0 else None,

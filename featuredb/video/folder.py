@@ -238,6 +238,6 @@ def _seconds(path: Path, number: int, text: str) -> float:
     return value
 
 
-def _some(names: list[str], most: int = 5) -> str:
-    said = ", ".join(names[:most]) or "none"
-    return said + (f" and {len(names) - most} more" if len(names) > most else "")
+def _some(names: list[str]) -> str:
+    said = ", ".join(names[:5]) or "none"
+    return said + (f" and {len(names) - 5} more" if len(names) > 5 else "")

@@ -96,14 +96,13 @@ class Confirmation:
         gates: "sources", "confirmed_share", "confirming_pairs"; the map is confirmed when
             all pass.
         sources: those among the photos that confirm each other, or are trusted.
-        confirmed, unconfirmed: image ids of the map.
+        confirmed: image ids of the map.
         witnesses: names of witnesses that confirm a photo of the map.
     """
 
     gates: tuple[Gate, ...]
     sources: tuple[Source, ...]
     confirmed: tuple[int, ...]
-    unconfirmed: tuple[int, ...]
     witnesses: tuple[str, ...] = ()
 
     @property
@@ -166,7 +165,6 @@ def confirm(
         gates=gates,
         sources=tuple(groups),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
-        unconfirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if not yes),
         witnesses=tuple(w.name for w, yes in zip(witnesses, vouching, strict=True) if yes),
     )
 

@@ -138,12 +138,10 @@ def runner_up(rival_photos: int, agreeing: int, limit: float) -> Gate:
     )
 
 
-def geotags(
-    offsets_m: FloatArray, covariances: FloatArray, limit: float, least: int = 2, by: str = ""
-) -> Gate:
+def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, by: str = "") -> Gate:
     """Share of the photos with a position that their place contradicts.
 
-    At least `least` must contradict before it counts: a photo may lie about its place. Then most of them may
+    Two must contradict before it counts: a photo may lie about its place. Then most of them may
     not, and not more than honest positions do by accident: a tenth of a community's are wrong by kilometres.
     Nineteen photos of a block's twin and one of the block were once half against their place, and taken.
 
@@ -169,7 +167,7 @@ def geotags(
         reason="CONTRADICTS_GPS",
         figure=share,
         limit=limit,
-        passes=against < least or (share <= limit and by_accident >= _ACCIDENT),
+        passes=against < 2 or (share <= limit and by_accident >= _ACCIDENT),
         message=f"{against} of {len(offsets_m)} positions contradict the placement{where} (chi-square above "
         f"{GPS_LIMIT}), a share of {limit:.0%} is allowed, and what happens once in {1 / _ACCIDENT:.0f} "
         f"times if {_WRONG_TAGS:.0%} of all positions are wrong",

@@ -296,16 +296,6 @@ def places_of(feature_map: FeatureMap) -> FloatArray:
     return np.concatenate([points[:: max(1, len(points) // 2000)], np.reshape(centers, (-1, 3))])
 
 
-def corners_of(feature_map: FeatureMap) -> FloatArray:
-    """(8, 3) corners of the box of a map's points in its frame, the wildest per mille of points left out."""
-    points = feature_map.points_local()
-    if not len(points):
-        return np.zeros((0, 3))
-    low, high = np.percentile(points, (0.1, 99.9), axis=0)
-    picks = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
-    return np.asarray(np.stack([low, high])[picks, np.arange(3)], dtype=np.float64)
-
-
 def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
     """What growth has written into a placement's evidence; empty for others."""
     return dict(evidence.get(GROWTH) or {})

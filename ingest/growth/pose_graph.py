@@ -69,12 +69,12 @@ class GraphSolution:
 
     Attributes:
         reason: None, NO_ANCHOR or CONTRADICTION; `message` says it for people.
-        corrections: new_from_present of each map, graph's frame; empty where there is a reason.
+        corrections: new_from_present of each map that a chain of edges ties to an anchor, graph's frame;
+            empty where there is a reason.
         covariance: (7, 7) of each new place on Earth.
         covariance_relative: (7, 7) relative to the anchors, as if those were the truth; zero for anchors.
         chi_square, degrees: of the fit; `variance_factor` is their ratio where it was needed, else 1.
         edges: all of them, those left out too.
-        unanchored: maps with no chain of edges to an anchor; they have no correction.
     """
 
     reason: str | None
@@ -86,7 +86,6 @@ class GraphSolution:
     degrees: int = 0
     variance_factor: float = 1.0
     edges: tuple[EdgeFit, ...] = ()
-    unanchored: tuple[str, ...] = ()
 
     @property
     def left_out(self) -> tuple[EdgeFit, ...]:
@@ -109,9 +108,7 @@ def solve_pose_graph(
     while True:
         reached = _anchored(nodes, remaining)
         if not reached:
-            return GraphSolution(
-                reason="NO_ANCHOR", message="no map of the graph is an anchor", unanchored=_ids(nodes)
-            )
+            return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
         fitted = Fit.of([n for n in nodes if n.map_id in reached], remaining)
         fits = _edge_fits(fitted)
         worst = _contradicting(fitted, fits, options)
@@ -119,18 +116,15 @@ def solve_pose_graph(
             break
         left_out.append(replace(worst, left_out=True))
         remaining.remove(worst.edge)
-    return _solution(nodes, fitted, (*fits, *left_out), options)
+    return _solution(fitted, (*fits, *left_out), options)
 
 
-def _solution(
-    nodes: Sequence[GraphNode], fitted: "Fit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions
-) -> GraphSolution:
+def _solution(fitted: "Fit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions) -> GraphSolution:
     factor = 1.0
     unlikely = fitted.degrees > 0 and chi2.sf(fitted.chi_square, fitted.degrees) < options.contradiction_p
     if unlikely:
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    unanchored = tuple(n.map_id for n in nodes if n.map_id not in fitted.corrections)
     if factor > options.max_variance_factor:
         worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
         named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
@@ -141,7 +135,6 @@ def _solution(
             degrees=fitted.degrees,
             variance_factor=factor,
             edges=fits,
-            unanchored=unanchored,
         )
     on_earth, relative = fitted.marginals(), fitted.relative_marginals()
     return GraphSolution(
@@ -154,7 +147,6 @@ def _solution(
         degrees=fitted.degrees,
         variance_factor=factor,
         edges=fits,
-        unanchored=unanchored,
     )
 
 
@@ -204,10 +196,6 @@ def _check(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
     unknown = {m for e in edges for m in (e.a, e.b)} - set(ids)
     if unknown:
         raise InvalidValueError(f"pose graph: edges name unknown maps {sorted(unknown)}")
-
-
-def _ids(nodes: Sequence[GraphNode]) -> tuple[str, ...]:
-    return tuple(node.map_id for node in nodes)
 
 
 def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str]:

@@ -143,16 +143,13 @@ def _digests(new: NewPhotos | None) -> list[str]:
     return [] if new is None else [new.photos[row].sha256 for row in new.rows]
 
 
-def promote_by_hand(
-    database: Database, map_id: str, reason: str, *, force: bool, options: PromotionOptions | None = None
-) -> Promotion:
+def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
     """Promote one map without confirmation; canaries are asked, and refuse it unless forced.
 
     Raises:
         MapNotFoundError, StoreError: it is retired, or no active map holds it.
         ConflictError: it was changed by someone else meanwhile.
     """
-    options = options or PromotionOptions()
     snapshot = database.snapshot()
     summary = snapshot.get(map_id)
     if summary.status == "active":
@@ -160,7 +157,7 @@ def promote_by_hand(
     if summary.status == "retired":
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
     before = Localiser.open(database)
-    gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], options))
+    gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], PromotionOptions()))
     if not gate.passes and not force:
         return _stays(map_id, gate.reason, gate.message, (gate,))
     text = f"{reason} (by hand; {gate.message})"

@@ -8,7 +8,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
-from featuredb.store import Database, MapSummary
+from featuredb.store import Database, MapSummary, Snapshot
 from ingest.growth.canaries import CanaryOptions
 from ingest.growth.map_graph import StoredEdge, growth_of, place_of
 from ingest.growth.replacing import ask_persons_canaries
@@ -64,16 +64,17 @@ def adjust_maps(
         dry_run: adjust, and commit nothing.
 
     Raises:
-        InvalidValueError: fewer than two maps, unknown or ambiguous ids, several extractors or datums.
+        InvalidValueError: fewer than two maps, one that is not active, several extractors or datums.
         ConflictError: someone else changed one of the maps meanwhile; nothing has changed.
-        MapNotFoundError, StoreError
+        MapNotFoundError: no live map of that id, or several that begin so.
+        StoreError
     """
     snapshot = database.snapshot()
     live = {m.map_id: m for m in snapshot.maps() if m.status != "retired"}
     active = {name: m for name, m in live.items() if m.status == "active"}
-    chosen = [_resolved(active, name) for name in named]
+    chosen = [_active(snapshot, name) for name in named]
     wanted = [m for m in _with_descendants(live, chosen) if m in active]
-    free_ids = {_resolved(active, name) for name in free}
+    free_ids = {_active(snapshot, name) for name in free}
     held = {m for m in wanted if active[m].method in _MEASURED and not active[m].parents} - free_ids
     # Parents that are not named hold their children, too: else these would drift away from them.
     parents = sorted({p for m in wanted for p in active[m].parents if p in active} - set(wanted))
@@ -110,16 +111,11 @@ def adjust_maps(
     )
 
 
-def _resolved(active: Mapping[str, MapSummary], name: str) -> str:
-    if name in active:
-        return name
-    fits = [m for m in active if m.startswith(name)]
-    if len(fits) != 1:
-        raise InvalidValueError(
-            f"expected the id of an active map, or its first letters, found {name!r}, which "
-            f"{'fits none' if not fits else 'fits ' + ', '.join(fits)}"
-        )
-    return fits[0]
+def _active(snapshot: Snapshot, name: str) -> str:
+    found = snapshot.find(name)
+    if found.status != "active":
+        raise InvalidValueError(f"expected an active map, found {found.map_id}, which is {found.status}")
+    return found.map_id
 
 
 def _with_descendants(live: Mapping[str, MapSummary], chosen: Sequence[str]) -> list[str]:

@@ -42,7 +42,6 @@ class Links:
 
     Attributes:
         map_a, point_a, map_b, point_b: (k,) indices of the maps, a below b, and rows of their points.
-        votes: (k,) images that say so.
         heard: number of images that were localised in other maps where their own has them.
         elsewhere: names of those that were localised elsewhere. elsewhere_m: how far, their median.
     """
@@ -51,7 +50,6 @@ class Links:
     point_a: NDArray[np.int64]
     map_b: NDArray[np.int64]
     point_b: NDArray[np.int64]
-    votes: NDArray[np.int64]
     heard: int
     elsewhere: tuple[str, ...]
     elsewhere_m: float = 0.0
@@ -102,14 +100,12 @@ def _voted(
         total = np.bincount(number.reshape(-1), weights=votes)
         sure &= votes > options.min_share * total[number.reshape(-1)]
     pairs, votes = pairs[sure], votes[sure]
-    order = np.lexsort((*pairs.T[::-1], -votes))
-    pairs, votes = pairs[order], votes[order]
+    pairs = pairs[np.lexsort((*pairs.T[::-1], -votes))]
     return Links(
         map_a=pairs[:, 0],
         point_a=pairs[:, 1],
         map_b=pairs[:, 2],
         point_b=pairs[:, 3],
-        votes=votes.astype(np.int64),
         heard=heard,
         elsewhere=tuple(elsewhere),
         elsewhere_m=float(np.median(list(elsewhere.values()))) if elsewhere else 0.0,

@@ -64,7 +64,7 @@ def add_video_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run_video(args: argparse.Namespace) -> int:
-    """Choose keyframes, write them, ingest them; as `ingest.cli.run_photos`.
+    """Choose keyframes, write them, ingest them; as `ingest_folder`.
 
     Raises:
         VideoError: no film can be read, or they show too little motion.
@@ -73,7 +73,7 @@ def run_video(args: argparse.Namespace) -> int:
     from featuredb.cli.common import storage_options
     from featuredb.geo.datum import HEIGHT_DATUMS
     from featuredb.store import Database
-    from ingest.cli import ingest_folder
+    from ingest.cli_run import ingest_folder
     from ingest.progress_bars import progress_bars
     from ingest.video.films import find_films, make_films
     from ingest.video.keyframes import KeyframeOptions

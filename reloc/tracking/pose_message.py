@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from featuredb.geo.geopose import GeoPose
+from featuredb.geo.geopose import BODY_AXES, GeoPose
 from featuredb.geometry.camera import Camera
 from reloc.answer import radius_68
-from reloc.reply import BODY_AXES, place_fields
+from reloc.reply import place_fields
 from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
 from reloc.wire import Accuracy
 from reloc.wire_track import Intrinsics, TrackPose

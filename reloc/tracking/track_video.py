@@ -1,6 +1,5 @@
 """A whole video: frames in, a trajectory out, and a film with the track drawn over it on request."""
 
-import logging
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -13,6 +12,7 @@ from featuredb.errors import VideoError
 from featuredb.features.film_lens import unnamed_model
 from featuredb.file_digest import file_sha256
 from featuredb.geometry.camera import Camera
+from featuredb.stage_clock import StageClock
 from featuredb.video.ahead import ReadAhead
 from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import Source, open_video
@@ -25,7 +25,6 @@ from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
 
-_LOG = logging.getLogger(__name__)
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4
 
@@ -107,9 +106,8 @@ def track_video(
     options = options or TrackVideoOptions()
     points: list[TrajectoryPoint] = []
     trouble: list[str] = []
-    clock = time.perf_counter
-    began = last = clock()
-    waiting = drawing = gap = 0.0
+    clock = StageClock()
+    last = gap = 0.0
     settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
     threads = cv2.getNumThreads()
     # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
@@ -134,23 +132,24 @@ def track_video(
                 )
             first_s: float | None = None
             ahead = stack.enter_context(ReadAhead(video))
-            mark = clock()
+            clock.lap("tracking")
             for frame in until_it_ends(ahead, trouble):
-                waiting += clock() - mark
+                clock.lap("waiting")
                 tracked = tracker.track(frame.gray, frame.time_s)
                 point = point_of(tracked)
                 points.append(point)
                 _filled(points, tracker.late)
-                now = clock()
+                now = time.perf_counter()
                 gap, last = (max(gap, now - last) if len(points) > 1 else 0.0), now
+                clock.lap("tracking")
                 if writer is not None:
                     first_s = frame.time_s if first_s is None else first_s
                     picture = draw_frame(frame.rgb(), tracked, point)
                     writer.write(picture[: writer.height, : writer.width], frame.time_s - first_s)
-                    drawing += clock() - now
+                    clock.lap("drawing")
                 if not tracker.busy:
                     ahead.read_on(_READ_ON)
-                mark = clock()
+                clock.lap("tracking")
             if not points:
                 raise VideoError(f"{info.name}: no frames in the film, or none in the stretch asked for")
             _filled(points, tracker.finish())
@@ -158,16 +157,17 @@ def track_video(
             lens = tracker.camera
     finally:
         cv2.setNumThreads(threads)
-    total = clock() - began
+    clock.lap("tracking")
+    seconds = clock.seconds
     return TrackedVideo(
         trajectory=Trajectory(source=info.name, points=tuple(points), start=info.creation_time),
         camera=lens,
         seconds=TrackSeconds(
-            total=total,
-            waiting=waiting,
+            total=sum(seconds.values()),
+            waiting=seconds["waiting"],
             decoding=ahead.seconds,
-            tracking=total - waiting - drawing,
-            drawing=drawing,
+            tracking=seconds["tracking"],
+            drawing=seconds.get("drawing", 0.0),
             longest_gap=gap,
         ),
         complaints=complaints,

@@ -11,13 +11,13 @@ from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
 from featuredb.store.candidate_events import append_events
-from featuredb.store.candidates import contribute, find_candidate, list_candidates, load_image, withdraw
+from featuredb.store.candidates import contribute, list_candidates, withdraw
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum
 from featuredb.store.tables import CANDIDATE_IMAGES, SPECS
 from featuredb.store.verify import verify
-from tests.support.contributions import contribution
+from tests.support.contributions import contribution, find_candidate, load_image
 from tests.support.growth_suite import GrowthSuite
 from tests.support.store_suite import NOTHING_KEPT, Place
 

@@ -322,7 +322,7 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
     assert [m["map_id"] for m in said["maps"]] == ["anchor", "child"]
     code, _, err = run("nobody")
     assert code != 0
-    assert "'nobody', which fits none" in err
+    assert "has no live map nobody" in err
     database.commit_maps([strip_map("away", 180.0)])
     code, out, _ = run("anchor", "away")
     assert code == 1
@@ -331,7 +331,7 @@ def test_the_command(database: Database, capsys: pytest.CaptureFixture[str]) -> 
 
 def test_focal_lengths_that_exif_told_are_known_beforehand(anchor: FeatureMap, child: FeatureMap) -> None:
     none = Links(
-        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b", "votes")},
+        **{name: np.zeros(0, dtype=np.int64) for name in ("map_a", "point_a", "map_b", "point_b")},
         heard=0,
         elsewhere=(),
     )

@@ -22,8 +22,8 @@ from ingest.report import (
     PlanView,
     StageTiming,
     report_json,
-    write_report,
 )
+from ingest.report_html import write_report
 from ingest.report_plots import histograms_png, nice_length, plan_png, residual_exaggeration
 
 SCHEMA = json.loads(

@@ -23,12 +23,13 @@ from featuredb.geo.utm import geodetic_from_utm
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.store import Database
-from featuredb.store.candidates import list_candidates, load_image
+from featuredb.store.candidates import list_candidates
 from reloc.client import CameraRequest, Client, PriorRequest
 from reloc.overlay import project_utm
 from reloc.service.options import ServeOptions
 from reloc.service.serve import serve
 from reloc.wire import LocaliseReply
+from tests.support.contributions import load_image
 from tests.support.planar_map import (
     CAMERA,
     EASTING,

@@ -14,6 +14,7 @@ from featuredb.geometry.rotation import (
     matrix_from_quaternion,
     nearest_rotation,
     quaternion_from_matrix,
+    rotation_to_up,
     skew,
     so3_exp,
 )
@@ -267,3 +268,20 @@ def test_nearest_rotation_recovers_and_minimises(omega: FloatArray, seed: int) -
     for _ in range(20):
         other = so3_exp(0.02 * rng.normal(size=3)) @ best
         assert np.linalg.norm(noisy - other) >= distance - 1e-12
+
+
+@LAWS
+@given(rotation_vectors())
+def test_a_rotation_to_up_carries_the_vector_to_z(omega: FloatArray) -> None:
+    up = so3_exp(omega) @ [0.0, 0.0, 1.0]
+    rotation = rotation_to_up(up)
+    np.testing.assert_allclose(rotation @ up, [0.0, 0.0, 1.0], atol=1e-12)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) > 0.0
+
+
+def test_skew_is_the_cross_product_of_many_as_of_one() -> None:
+    v, w = np.random.default_rng(0).normal(size=(2, 5, 3))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", skew(v), w), np.cross(v, w), atol=1e-12)
+    np.testing.assert_array_equal(skew(v)[2], skew(v[2]))
+    assert skew(np.zeros((0, 3))).shape == (0, 3, 3)

@@ -6,7 +6,9 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from featuredb.store.canaries import KnownPose
-from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidate_states import Candidate, Contribution
+from featuredb.store.candidates import list_candidates, load_images
+from featuredb.store.database import Database
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING
 
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -38,3 +40,15 @@ def known_pose(tolerance_m: float = 0.3) -> KnownPose:
         tolerance_m=tolerance_m,
         tolerance_deg=0.5,
     )
+
+
+def find_candidate(database: Database, candidate_id: str) -> Candidate:
+    """One contributed photo."""
+    (found,) = [c for c in list_candidates(database) if c.candidate_id == candidate_id]
+    return found
+
+
+def load_image(database: Database, candidate_id: str) -> bytes:
+    """The bytes of one contributed photo."""
+    ((_, image),) = load_images(database, [candidate_id])
+    return image

@@ -18,9 +18,7 @@ from featuredb.store.canaries import add_canary, list_canaries, load_canary_imag
 from featuredb.store.candidates import (
     contribute,
     count_candidates,
-    find_candidate,
     list_candidates,
-    load_image,
     load_images,
     mark_used,
     refuse,
@@ -30,7 +28,7 @@ from featuredb.store.candidates import (
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
-from tests.support.contributions import contribution, known_pose
+from tests.support.contributions import contribution, find_candidate, known_pose, load_image
 from tests.support.maps import random_map
 from tests.support.store_suite import NOTHING_KEPT, Place
 
@@ -50,8 +48,6 @@ class GrowthSuite:
         assert list_candidates(database) == []
         assert count_candidates(database).by_state == {}
         assert list_canaries(database) == []
-        with pytest.raises(CandidateNotFoundError):
-            find_candidate(database, "0" * 32)
         with pytest.raises(CandidateNotFoundError):
             load_image(database, "0" * 32)
         with pytest.raises(CanaryNotFoundError):

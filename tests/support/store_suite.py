@@ -272,6 +272,22 @@ class StoreSuite:
         with pytest.raises(MapNotFoundError, match="map-9"):
             snapshot.load_map("map-9")
 
+    def test_a_map_is_found_by_the_first_letters_of_its_id(self, database: Database) -> None:
+        database.commit_maps(
+            [random_map(i, map_id=name) for i, name in enumerate(("ab", "abc", "abd", "x1"))]
+        )
+        database.retire("x1", "wrong")
+        snapshot = database.snapshot()
+        assert [snapshot.find(start).map_id for start in ("ab", "abc", "abd")] == ["ab", "abc", "abd"]
+        database.retire("abd", "wrong")
+        database.retire("ab", "wrong")
+        assert database.snapshot().find("a").map_id == "abc"
+        with pytest.raises(MapNotFoundError, match=r"a: 3 maps begin so \(ab, abc, abd\)"):
+            snapshot.find("a")
+        for start in ("x", "x1", "abcd", ""):
+            with pytest.raises(MapNotFoundError, match="no live map"):
+                snapshot.find(start)
+
     def test_compact_keeps_every_row(self, database: Database) -> None:
         for seed in range(4):
             database.commit_map(random_map(seed))

@@ -25,7 +25,7 @@ from reloc.acceptance import (
 )
 
 OPTIONS = AcceptanceOptions()
-GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, visible_share=0.5, agreement=0.8, spread=0.9)
+GOOD = Evidence(inliers=40, log_nfa=30.0, coverage=0.2, agreement=0.8, spread=0.9)
 
 
 @settings(deadline=None, max_examples=60)

@@ -45,7 +45,6 @@ def answer_of(
     uncertainty = PoseUncertainty(
         covariance=np.zeros((6, 6)) if measured is None else measured,
         residual_rms_px=0.5,
-        variance_factor=1.0,
     )
     return make_answer(area, hypothesis, uncertainty, np.zeros((len(rows), 2)), rows, want_inliers=True)
 

@@ -36,14 +36,6 @@ def test_finds_most_true_matches_among_few(rate: float) -> None:
     assert precision > 0.85, f"{precision:.2f} of the kept matches true; {rate} before"
 
 
-def test_similarity_of_the_neighbourhood_is_reported() -> None:
-    photo, reference, true = matches(0.2, seed=4)
-    found = consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions())
-    kept = found.kept & true
-    assert np.degrees(np.median(found.turn_rad[kept])) == pytest.approx(8.0, abs=1.5)
-    assert np.exp(np.median(found.log_zoom[kept])) == pytest.approx(1.15, abs=0.04)
-
-
 def test_random_matches_are_hardly_ever_kept() -> None:
     kept = 0
     for seed in range(3):

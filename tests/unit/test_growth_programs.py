@@ -123,9 +123,7 @@ def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
 
 
 def test_poison_that_gets_in_fails() -> None:
-    clean = Outcome(
-        poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0, honest_active=5
-    )
+    clean = Outcome(poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0)
     good = {"changed": True, "restored": True}
     assert all(holding(growth_poison.judge([clean], 0.01, good)).values())
     for bad in (replace(clean, wrong=1), replace(clean, off_share=0.03)):

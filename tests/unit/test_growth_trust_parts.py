@@ -18,7 +18,6 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_graph import (
     PlacedMap,
     StoredEdge,
-    corners_of,
     drift_m,
     growth_of,
     no_surer_than,
@@ -50,7 +49,7 @@ def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
         frame=feature_map.frame,
         covariance=feature_map.placement.covariance,
         place=place_of(feature_map),
-        corners=corners_of(feature_map),
+        corners=places_of(feature_map),
         edges=tuple(StoredEdge.from_json(e) for e in growth.get("edges", ())),
         evidence=feature_map.placement.evidence,
     )

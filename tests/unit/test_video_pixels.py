@@ -238,13 +238,3 @@ def test_pixels_belong_to_the_caller(tmp_path: Path) -> None:
         assert [shown(frame.rgb()[:, :, 0]) for frame in frames] == list(range(30))
         frames[3].rgb()[:] = 0
         assert frames[3].rgb().any()
-
-
-def test_non_square_pixels_are_said(tmp_path: Path) -> None:
-    path = write_film(tmp_path / "film.mp4", options={"x264-params": "sar=4/3"})
-    with open_video(path) as video:
-        assert video.info.pixel_aspect == pytest.approx(4 / 3)
-    with open_video(_with_matrix(path, MATRICES[90])) as video:
-        assert video.info.pixel_aspect == pytest.approx(3 / 4)
-    with open_video(_corner_film(tmp_path / "square.mp4")) as video:
-        assert video.info.pixel_aspect == 1.0

@@ -151,15 +151,13 @@ def _mirrored(image: Image8, edit: Edit, rng: np.random.Generator) -> Image8:
     return image[:, ::-1]
 
 
-def _patch(
-    image: Image8, share: float, rng: np.random.Generator, above: float = 1.0
-) -> tuple[int, int, int, int]:
-    """A rectangle x0, y0, x1, y1 of about that share of the area, its lower edge within `above` of height."""
+def _patch(image: Image8, share: float, rng: np.random.Generator) -> tuple[int, int, int, int]:
+    """A rectangle x0, y0, x1, y1 of about that share of the area."""
     h, w = image.shape[:2]
     aspect = float(rng.uniform(0.7, 1.4))
     side = np.sqrt(share * h * w)
     pw, ph = min(round(side * aspect), w - 2), min(round(side / aspect), h - 2)
-    x0, y0 = int(rng.integers(0, w - pw)), int(rng.integers(0, max(1, round(above * h) - ph)))
+    x0, y0 = int(rng.integers(0, w - pw)), int(rng.integers(0, max(1, h - ph)))
     return x0, y0, x0 + pw, y0 + ph
 
 

@@ -89,8 +89,8 @@ def with_copied_block(scene: Scene, source: Rect, target: Rect, *, mirrored: boo
     )
 
 
-def forged(scene: Scene, within: Rect, seed: int, share: float = 0.5) -> Scene:
-    """The scene as somebody wants it to be: of the buildings in a rectangle, `share` are moved by 2 to 6 m or
+def forged(scene: Scene, within: Rect, seed: int) -> Scene:
+    """The scene as somebody wants it to be: of the buildings in a rectangle, half are moved by 2 to 6 m or
     wear another facade. Photos of it agree with each other, and not with the town.
     """
     rng = np.random.default_rng((seed, 71))
@@ -103,9 +103,9 @@ def forged(scene: Scene, within: Rect, seed: int, share: float = 0.5) -> Scene:
         mine = is_building & (faces.object_id == object_id)
         angle, distance, fate = rng.uniform(0, 2 * np.pi), rng.uniform(2.0, 6.0), rng.random()
         other = int(rng.choice(facades))
-        if fate < 0.6 * share:
+        if fate < 0.3:
             origin[mine] += [distance * np.cos(angle), distance * np.sin(angle), 0.0]
-        elif fate < share:
+        elif fate < 0.5:
             texture[mine & np.isin(texture, facades)] = other
     changed = replace(faces, origin=origin, texture=texture)
     return replace(scene, faces=changed.moved(scene.enu_from_town, np.zeros(3)))

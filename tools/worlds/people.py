@@ -60,17 +60,15 @@ def make_device(
     focal_35mm: float,
     lens: tuple[float, ...],
     focal_mm: float = 5.0,
-    off_axis: tuple[float, float] = (0.001, -0.0007),
 ) -> Device:
     """A camera by its 35 mm equivalent (of the width) and its distortion.
 
     Args:
         lens: one number for SIMPLE_RADIAL, two for RADIAL, four for OPENCV.
-        off_axis: principal point from the middle, share of the width.
     """
     w, h = size
     f = focal_35mm / 36.0 * w
-    cx, cy = (0.5 + off_axis[0]) * w, 0.5 * h + off_axis[1] * w
+    cx, cy = (0.5 + 0.001) * w, 0.5 * h - 0.0007 * w
     if len(lens) == 4:
         camera = Camera(model="OPENCV", width=w, height=h, params=(f, 1.0005 * f, cx, cy, *lens))
     else:

@@ -44,7 +44,7 @@ def moment(day: int, hour: float) -> datetime:
 
 
 def survey_photos(
-    scene: Scene, flight: FlightOptions, seed: int, *, folder: str = "survey", town: str = "home"
+    scene: Scene, flight: FlightOptions, seed: int, *, folder: str = "survey"
 ) -> list[PlannedPhoto]:
     """An anchored survey as planned photos: full EXIF, positions as its receiver believes them."""
     photos = []
@@ -62,7 +62,7 @@ def survey_photos(
             time=shot.time,
         )
         tag = Geotag(latitude_deg=float(latitude), longitude_deg=float(longitude), height_m=float(height))
-        photos.append(PlannedPhoto(shot=shot, scene=f"{town}/0/000", fact=fact, geotag=tag))
+        photos.append(PlannedPhoto(shot=shot, scene="home/0/000", fact=fact, geotag=tag))
     return photos
 
 

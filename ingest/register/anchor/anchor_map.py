@@ -5,7 +5,6 @@ agree with each other on where the map goes, and then place it together. Nothing
 is a new map, or a reason.
 """
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
+from featuredb.stage_clock import StageClock
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.agreement import FrameAgreement, LoneFrame, frames_that_agree
 from ingest.register.anchor.frames import TriedFrame, TriedFrames
@@ -45,7 +45,7 @@ def place_map(
     frames = tried.accepted
     if not frames:
         return _nothing_registered(tried)
-    started = time.perf_counter()
+    clock = StageClock()
     lone, refusals = _alone(feature_map, frames, cloud, options)
     agreement = frames_that_agree(lone, options.agreement)
     needed = 1 if confirmed else options.min_agreeing
@@ -53,9 +53,9 @@ def place_map(
     if refusal is not None:
         return replace(refusal, agreement=agreement if lone else None)
     used = [frame for frame in frames if frame.image.image_id in agreement.agreeing]
-    seconds = {"agreement": time.perf_counter() - started}
+    clock.lap("agreement")
     placed, rounds, words = place_in_rounds(feature_map, used, cloud, read_gray, options, progress)
-    seconds |= {
+    seconds = clock.seconds | {
         "structure projection": sum(r.structure_s for r in rounds),
         "adjustment": sum(r.adjust_s for r in rounds),
         "frames again": sum(f.seconds for r in rounds[1:] for f in r.frames),

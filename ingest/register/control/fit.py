@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity, similarity_closed_form
 from ingest.register.control.marks import Control
@@ -275,14 +276,6 @@ def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3
     shift = target.mean() - turn * source.mean()
     up = vertical.anchor_up_m - scale * (rotation @ vertical.anchor_block)[2]
     return Sim3(scale=scale, rotation=rotation, translation=np.array([shift.real, shift.imag, up]))
-
-
-def rotation_to_up(up: FloatArray) -> FloatArray:
-    """A rotation (3, 3) that carries the unit vector `up` to (0, 0, 1)."""
-    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    east = np.cross(helper, up)
-    east /= np.linalg.norm(east)
-    return np.stack([east, np.cross(up, east), up])
 
 
 def _sigma(

@@ -99,7 +99,6 @@ def place_unplaced_by_gcp(
     file: ControlFile,
     options: GcpOptions,
     height_datum: str = "unknown",
-    other_photos: Mapping[str, str] | None = None,
 ) -> GcpRegistration:
     """Place a map that has no place by control points; arguments as in `register_by_gcp`.
 
@@ -112,7 +111,7 @@ def place_unplaced_by_gcp(
         residual_rms_m=0.0,
     )
     start = placed_map(unplaced, at_the_points, control_frame(file), "unknown")
-    return replace(register_by_gcp(start, file, options, height_datum, other_photos), moved_m=None)
+    return replace(register_by_gcp(start, file, options, height_datum), moved_m=None)
 
 
 def datum_of(file: ControlFile, control: Control, before: str, said: str) -> str:

@@ -19,8 +19,7 @@ class PointResidual:
     """One control point.
 
     Attributes:
-        surveyed_m: (3,) local east, north, up; up NaN where unknown.
-        found_m: (3,) where the adjusted block has it; NaN where nothing shows it.
+        found_m: (3,) local east, north, up where the adjusted block has it; NaN where nothing shows it.
         residual_m: (3,) surveyed minus found, NaN where unknown.
         leave_one_out_m: (3,) the same, had the point taken no part.
         marks: how many of its marks were used, of `marks_given`.
@@ -29,7 +28,6 @@ class PointResidual:
     """
 
     name: str
-    surveyed_m: FloatArray
     found_m: FloatArray
     residual_m: FloatArray
     leave_one_out_m: FloatArray
@@ -94,7 +92,6 @@ def _point(adjusted: Adjusted, control: Control, point: int) -> PointResidual:
         remark = f"{control.names[point]} cannot be located by its marks; not used"
     return PointResidual(
         name=control.names[point],
-        surveyed_m=control.surveyed[point],
         found_m=found,
         residual_m=residual,
         leave_one_out_m=single,

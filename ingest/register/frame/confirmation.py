@@ -90,7 +90,6 @@ class Confirmation:
         log_nfa: evidence, see ConfirmOptions.
         cells: parts of the photo, of 16, that hold an agreeing piece.
         message: why not, or "".
-        low_share, high_share: of agreeing pieces among the lower and the upper half, by height.
     """
 
     confirmed: bool
@@ -99,8 +98,6 @@ class Confirmation:
     log_nfa: float
     cells: int
     message: str
-    low_share: float = 0.0
-    high_share: float = 0.0
 
     @property
     def share(self) -> float:
@@ -153,8 +150,6 @@ def confirm_pose(
         log_nfa=log_nfa,
         cells=cells,
         message=message,
-        low_share=layers.low,
-        high_share=layers.high,
     )
 
 

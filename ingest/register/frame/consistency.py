@@ -53,14 +53,11 @@ class Consistency:
         support: (m,) int64, neighbours that agree with the match and with each other.
         log_chance: (m,) -log10 of the expected number of matches with that support among as many random ones.
         kept: (m,) bool, those above the options' limit.
-        turn_rad, log_zoom: (m,) the neighbourhood's similarity, reference from photo.
     """
 
     support: NDArray[np.int64]
     log_chance: FloatArray
     kept: NDArray[np.bool_]
-    turn_rad: FloatArray
-    log_zoom: FloatArray
 
 
 def consistent_matches(
@@ -85,7 +82,6 @@ def consistent_matches(
     finite = np.isfinite(reference).all(axis=1)
     support = np.zeros(m, np.int64)
     expected = np.full(m, 1.0)
-    log_z = np.zeros((m, 2))
     rows = np.flatnonzero(finite)
     if len(rows) >= 3:
         tree = cKDTree(photo[rows])
@@ -93,7 +89,7 @@ def consistent_matches(
         distance, neighbour = tree.query(photo[rows], k=k, distance_upper_bound=options.reach_rel * side_px)
         neighbour = np.where(np.isfinite(distance), neighbour, -1).astype(np.int64)
         loops = compiled_module("ingest.register.frame.consistency_loops")
-        support[rows], expected[rows], log_z[rows] = loops.neighbour_support(
+        support[rows], expected[rows] = loops.neighbour_support(
             np.ascontiguousarray(photo[rows], dtype=np.float64),
             np.ascontiguousarray(reference[rows], dtype=np.float64),
             neighbour,
@@ -105,13 +101,7 @@ def consistent_matches(
             area_px,
         )
     log_chance = _log_chance(support, expected, options.neighbours, m)
-    return Consistency(
-        support=support,
-        log_chance=log_chance,
-        kept=log_chance >= options.min_log_chance,
-        turn_rad=log_z[:, 1],
-        log_zoom=log_z[:, 0],
-    )
+    return Consistency(support=support, log_chance=log_chance, kept=log_chance >= options.min_log_chance)
 
 
 def _log_chance(

@@ -18,7 +18,7 @@ def neighbour_support(
     max_turn: float,
     max_log_zoom: float,
     area: float,
-) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+) -> tuple[NDArray[np.int64], FloatArray]:
     """Largest number of neighbours of each match that one similarity moves to where they are.
 
     Args:
@@ -27,17 +27,16 @@ def neighbour_support(
         area: square pixels over which false matches are spread.
 
     Returns:
-        Support (m,); expected number of chance hits at the winning similarity (m,); log scale and rotation
-        (m, 2) of that similarity.
+        Support (m,); expected number of chance hits at the winning similarity (m,).
     """
     m, k = neighbour.shape
     support = np.zeros(m, np.int64)
     expected = np.zeros(m)
-    log_z = np.zeros((m, 2))
     px, py, qx, qy = np.empty(k), np.empty(k), np.empty(k), np.empty(k)
     reach = np.empty(k)
     for i in range(m):
         n = 0
+        best = 1.0
         for c in range(k):
             j = neighbour[i, c]
             if j < 0 or j == i:
@@ -70,8 +69,7 @@ def neighbour_support(
                     count += 1
             if count > support[i]:
                 support[i] = count
-                log_z[i, 0], log_z[i, 1] = zoom, turn
-        scale = np.exp(log_z[i, 0])
+                best = scale
         for c in range(n):
-            expected[i] += np.pi * (reach[c] * scale) ** 2 / area
-    return support, expected, log_z
+            expected[i] += np.pi * (reach[c] * best) ** 2 / area
+    return support, expected

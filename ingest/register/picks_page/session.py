@@ -1,7 +1,6 @@
 """What the page of picks works on: one map, its photos, a scan; picks to a pose, a verdict, a place."""
 
 import csv
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,6 @@ from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start import StartOptions
 from ingest.register.picks_page.ground import Ground, ground_of
 
-_LOG = logging.getLogger(__name__)
 _PHOTO_PX = 4096
 PICKS_FILE = "picks.csv"
 

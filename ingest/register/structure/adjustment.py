@@ -7,7 +7,6 @@ correspondences) and the scan's surface under all points of the map determine po
 """
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
@@ -97,9 +96,7 @@ class LidarAdjustment:
         covariance: (7, 7) of what moves the whole map (left perturbation of a similarity), or None.
         poses: (6, 6) of each pose, with all that points and lenses leave open; none when refused.
         lenses: what is left open of the lenses; None when refused, or where no lens has OPENCV's parameters.
-        before_m, after_m: signed distance of every point from the scan's surface, NaN where none is near.
         figures: before and after, JSON-able.
-        seconds: of the whole.
     """
 
     reason: AdjustReason | None
@@ -108,10 +105,7 @@ class LidarAdjustment:
     covariance: FloatArray | None
     poses: tuple[FloatArray, ...]
     lenses: LensUncertainty | None
-    before_m: FloatArray
-    after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
-    seconds: float = 0.0
 
     @property
     def accepted(self) -> bool:
@@ -136,35 +130,31 @@ def adjust_to_scan(
         begin: the map as an earlier adjustment left it, from which the solver starts.
     """
     options = options or AdjustLidarOptions()
-    started = time.perf_counter()
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
     control = control_of(feature_map, structure, registered)
-    nothing = np.full(len(start.xyz), np.nan)
     if len(control.xyz) < options.min_control:
         words = f"{len(control.xyz)} correspondences with the scan, at least {options.min_control} are needed"
-        return _refused("NO_CONTROL", words, nothing, nothing, {}, started)
+        return _refused("NO_CONTROL", words, {})
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
     if surface is None:
-        return _refused("NO_SCAN", "the scan has no points under the map", nothing, nothing, {}, started)
+        return _refused("NO_SCAN", "the scan has no points under the map", {})
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
     block = _iterate(first, start.cameras, control, surface, options)
-    before = plane_distances(surface, start.xyz, options.reach_m)
-    after = plane_distances(surface, block.xyz, options.reach_m)
     figures = {
         "control": len(control.xyz),
         "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, before),
-        "after": _state(block, control, after),
+        "before": _state(start, control, plane_distances(surface, start.xyz, options.reach_m)),
+        "after": _state(block, control, plane_distances(surface, block.xyz, options.reach_m)),
         "options": asdict(options),
     }
     reason, message = _gate(block, figures, options)
     if reason is not None:
-        return _refused(reason, message, before, after, figures, started)
+        return _refused(reason, message, figures)
     poses, lenses = _left_open(block, control, surface, structure, start, options)
     return LidarAdjustment(
         reason=None,
@@ -173,10 +163,7 @@ def adjust_to_scan(
         covariance=structure.covariance,
         poses=poses,
         lenses=lenses,
-        before_m=before,
-        after_m=after,
         figures=figures,
-        seconds=time.perf_counter() - started,
     )
 
 
@@ -437,10 +424,7 @@ def _further(before: dict[str, Any], after: dict[str, Any]) -> bool:
 def _refused(
     reason: AdjustReason,
     message: str,
-    before: FloatArray,
-    after: FloatArray,
     figures: dict[str, Any],
-    started: float,
 ) -> LidarAdjustment:
     return LidarAdjustment(
         reason=reason,
@@ -449,8 +433,5 @@ def _refused(
         covariance=None,
         poses=(),
         lenses=None,
-        before_m=before,
-        after_m=after,
         figures=figures,
-        seconds=time.perf_counter() - started,
     )

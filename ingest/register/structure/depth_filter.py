@@ -72,12 +72,6 @@ class SurfaceHits:
         )
 
 
-def reliable_depth(rendering: Rendering, options: DepthFilterOptions) -> NDArray[np.bool_]:
-    """(h, w) bool: depths that are neither across a silhouette nor beyond the far plane."""
-    pixels = np.indices(rendering.depth.shape)
-    return _reliable_at(rendering, pixels[0], pixels[1], sample_stride(rendering), options)
-
-
 def _reliable_at(
     rendering: Rendering,
     row: NDArray[np.int64],

@@ -173,12 +173,8 @@ def _errors(
     own += along[:, None, None] * direction[:, :, None] * direction[:, None, :]
     # T_true = exp(xi) T moves the point at camera coordinates p by -R' (omega x p + nu).
     in_camera = pose.act(hits.points)
-    by_pose = np.concatenate([_skews(in_camera), np.broadcast_to(-np.eye(3), (len(rays), 3, 3))], axis=2)
+    by_pose = np.concatenate([skew(in_camera), np.broadcast_to(-np.eye(3), (len(rays), 3, 3))], axis=2)
     return own, slide @ (pose.rotation.T @ by_pose)
-
-
-def _skews(vectors: FloatArray) -> FloatArray:
-    return np.asarray(np.einsum("nk,kij->nij", vectors, np.array([skew(axis) for axis in np.eye(3)])))
 
 
 def _point_covariances(feature_map: FeatureMap) -> FloatArray:

@@ -17,7 +17,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
-from featuredb.stage_clock import StageClock
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
@@ -88,7 +87,6 @@ class StructurePlacement:
         before_m, after_m: signed distance of the map's points from the scan's surface; NaN where no scan is
             near. After: at the new place; before: of a sample of the same points.
         figures: what the decision rests on, JSON-able.
-        seconds: by step, in order.
     """
 
     reason: StructureReason | None
@@ -100,7 +98,6 @@ class StructurePlacement:
     before_m: FloatArray
     after_m: FloatArray
     figures: dict[str, Any] = field(default_factory=dict)
-    seconds: dict[str, float] = field(default_factory=dict)
 
     @property
     def accepted(self) -> bool:
@@ -119,36 +116,32 @@ def project_structure(
         registered: frames with their poses in the cloud's local frame; one is enough.
     """
     options = options or StructureOptions()
-    clock = StageClock()
     count = len(feature_map.points)
     if not registered:
-        return _refused("NO_FRAMES", "no frame is registered to the scan", count, clock)
+        return _refused("NO_FRAMES", "no frame is registered to the scan", count)
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud, options.pairs)
-    clock.lap("depth and pairs")
     if len(pairs) < options.min_pairs:
         words = f"{len(pairs)} of the map's points meet the scan, at least {options.min_pairs} are needed"
-        return _refused("TOO_FEW_PAIRS", words, count, clock, pairs)
+        return _refused("TOO_FEW_PAIRS", words, count, pairs)
     distances = _distances(pairs, registered)
     tolerance = np.maximum(options.min_tolerance_m, options.tolerance_rel * distances)
     start = ransac_similarity(pairs, tolerance, options.similarity)
-    clock.lap("RANSAC")
     if start is None:
-        return _refused("NO_SIMILARITY", "the pairs lie on a line or coincide", count, clock, pairs)
+        return _refused("NO_SIMILARITY", "the pairs lie on a line or coincide", count, pairs)
     near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
     reason, message, figures = _gate_of_pairs(pairs, near, distances, options)
     if reason is not None:
-        return _refused(reason, message, count, clock, pairs, figures)
+        return _refused(reason, message, count, pairs, figures)
     kept = _rows(pairs, near)
     fit = refine_similarity(start, kept, options.similarity)
-    clock.lap("refinement")
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
     reason, message = _gate_of_fit(fit, distances[near], figures, options)
     inliers = near.copy()
     inliers[near] = fit.inliers
     if reason is not None:
-        return _refused(reason, message, count, clock, pairs, figures, inliers)
-    return _onto_surface(source, pairs, inliers, fit, cloud, figures, clock, options)
+        return _refused(reason, message, count, pairs, figures, inliers)
+    return _onto_surface(source, pairs, inliers, fit, cloud, figures, options)
 
 
 def _onto_surface(
@@ -158,7 +151,6 @@ def _onto_surface(
     fit: SimilarityFit,
     cloud: PointCloud,
     figures: dict[str, Any],
-    clock: StageClock,
     options: StructureOptions,
 ) -> StructurePlacement:
     """The last step of an accepted similarity: GICP under its guard, and the residuals before and after."""
@@ -168,7 +160,6 @@ def _onto_surface(
     # Points far from all others (gross errors of matching) would make the box endless.
     low, high = np.percentile(placed, [1, 99], axis=0)
     surface = surface_near(cloud, np.clip(placed, low, high), options.surface)
-    clock.lap("surface")
     if surface is not None:
         reach = reach_of(surface, options.surface)
         after = plane_distances(surface, placed, reach)
@@ -179,13 +170,11 @@ def _onto_surface(
             if outcome.accepted:
                 sim = moved(sim, outcome.move)
                 after = plane_distances(surface, sim.act(source), reach)
-            clock.lap("GICP")
         # The nearest neighbour of what is far away costs most; a sample says as much.
         some = np.flatnonzero(np.isfinite(after))
         some = some[:: max(1, -(-len(some) // _MAX_BEFORE))]
         before[some] = plane_distances(surface, source[some], np.inf)
         figures["surface"] = {"before": _summary(before), "after": _summary(after)}
-        clock.lap("residuals")
     return StructurePlacement(
         reason=None,
         message="placed on the scan",
@@ -196,7 +185,6 @@ def _onto_surface(
         before_m=before,
         after_m=after,
         figures=figures,
-        seconds=clock.seconds,
     )
 
 
@@ -356,7 +344,6 @@ def _refused(
     reason: StructureReason,
     message: str,
     points: int,
-    clock: StageClock,
     pairs: Pairs | None = None,
     figures: dict[str, Any] | None = None,
     inliers: NDArray[np.bool_] | None = None,
@@ -373,5 +360,4 @@ def _refused(
         before_m=nothing,
         after_m=nothing,
         figures=figures or {},
-        seconds=clock.seconds,
     )
