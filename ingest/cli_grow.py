@@ -140,9 +140,9 @@ def _show(report: "GrowthReport", args: argparse.Namespace) -> None:
 def _options(args: argparse.Namespace) -> "GrowingOptions":
     from featuredb.features.extractor import ExtractorOptions
     from ingest.growing import GrowingOptions
-    from ingest.growth.confirmation import ConfirmationOptions
-    from ingest.growth.grow import GrowthOptions
-    from ingest.growth.promotion import PromotionOptions
+    from ingest.growth.run import GrowthOptions
+    from ingest.growth.trust.confirmation import ConfirmationOptions
+    from ingest.growth.trust.promotion import PromotionOptions
     from ingest.reconstruction import MapMakingOptions
 
     confirmation = ConfirmationOptions(independent_by=args.confirm_by, trusted_owners=tuple(args.trust))
@@ -159,7 +159,7 @@ def _options(args: argparse.Namespace) -> "GrowingOptions":
 def run_promote(args: argparse.Namespace) -> int:
     """Promote by hand; 0, or 1 where canaries refuse."""
     from featuredb.cli.common import open_database
-    from ingest.growth.promotion import promote_by_hand
+    from ingest.growth.trust.promotion import promote_by_hand
 
     outcome = promote_by_hand(open_database(args), args.map_id, args.reason, force=args.force)
     became = "promoted" if outcome.promoted else f"stays in quarantine: {outcome.reason_code}"
@@ -172,7 +172,7 @@ def run_canary_add(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from featuredb.errors import InvalidValueError
     from featuredb.store.canaries import Origin, add_canary
-    from ingest.growth.canaries import answer_now
+    from ingest.growth.trust.canaries import answer_now
 
     database, image = open_database(args), args.image.read_bytes()
     name = args.name or args.image.name
@@ -241,7 +241,7 @@ def run_canary_run(args: argparse.Namespace) -> int:
     """Ask all known queries of the active maps; 1 if one is not answered rightly."""
     from featuredb.cli.common import format_table, open_database
     from featuredb.store.canaries import list_canaries
-    from ingest.growth.canaries import CanaryOptions, check_known
+    from ingest.growth.trust.canaries import CanaryOptions, check_known
     from reloc.localiser import Localiser
 
     database = open_database(args)

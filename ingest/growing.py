@@ -15,8 +15,8 @@ from featuredb.store.candidates import list_candidates, refuse
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
-from ingest.growth.grow import GrowthOptions, extractor_for, grow
 from ingest.growth.growth_report import GrowthReport, PhotoFate
+from ingest.growth.run import GrowthOptions, extractor_for, grow
 from ingest.growth.run_record import GrowthPhotos, no_photos
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
@@ -80,7 +80,7 @@ def grow_candidates(
 
 
 def reconstructed_photos(done: Reconstructed, candidate_ids: Mapping[int, str] | None = None) -> GrowthPhotos:
-    """Photos that `reconstruct_photos` has gone through, for `ingest.growth.grow.grow`: of any origin.
+    """Photos that `reconstruct_photos` has gone through, for `ingest.growth.run.grow`: of any origin.
 
     Args:
         candidate_ids: of contributed photos, by row of the usable ones.

@@ -26,9 +26,9 @@ from featuredb.store import Database
 from featuredb.store.candidate_states import Contribution, candidate_id_of
 from featuredb.store.candidates import contribute
 from ingest.growing import GrowingOptions
-from ingest.growth.grow import GrowthOptions
 from ingest.growth.growth_report import GrowthReport
-from ingest.growth.map_graph import drift_m, places_of
+from ingest.growth.map_places import drift_m, places_of
+from ingest.growth.run import GrowthOptions
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions

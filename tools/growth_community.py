@@ -8,7 +8,7 @@ with the accuracy of its receiver. All other photos are contributed and grown at
 most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
 
 With --scan an airborne scan of the town is in store, and what grows is compared with it
-(`ingest/growth/scan_check.py`).
+(`ingest/growth/trust/scan_check.py`).
 
 Prints what became of each kind of photo, by kind, owner and geotag, and by how much of what it shows the
 survey has mapped; writes community.json and plan.png.

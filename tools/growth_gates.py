@@ -28,8 +28,9 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from ingest.growth import grow, grown_map
+from ingest.growth import run
 from ingest.growth.gates import Gate
+from ingest.growth.place import component
 from ingest.growth.values import Refused
 from ingest.photo import Photo
 
@@ -71,11 +72,11 @@ def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[N
     with ExitStack() as stack, path.open("a", encoding="utf-8") as file:
         note = _Note(file=file, frame=frame, true_place=true_place)
         for module, name, wrapped in (
-            (grown_map, "place_by_maps", note.placing),
-            (grown_map, "settle", note.refining),
-            (grow, "drift_gate", note.budget),
-            (grow, "with_drift", note.drifting),
-            (grow, "promote_confirmed", note.promoting),
+            (component, "place_by_maps", note.placing),
+            (component, "settle", note.refining),
+            (run, "drift_gate", note.budget),
+            (run, "with_drift", note.drifting),
+            (run, "promote_confirmed", note.promoting),
         ):
             stack.enter_context(patch.object(module, name, wrapped(getattr(module, name))))
         yield
@@ -90,8 +91,8 @@ class _Note:
         self._last: FeatureMap | None = None
 
     def placing(self, step: Any) -> Any:
-        def place_by_maps(model: Any, localised: Any, anchors: Any, photos: Any, *more: Any) -> Any:
-            held = step(model, localised, anchors, photos, *more)
+        def place_by_maps(model: Any, localised: Any, correspondences: Any, photos: Any, *more: Any) -> Any:
+            held = step(model, localised, correspondences, photos, *more)
             self._photos = photos
             self._model("place", model, held.placement, held.placement.gates)
             return held

@@ -38,7 +38,7 @@ from featuredb.simworld.photograph import render_depth
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growing import GrowingOptions, grow_candidates
-from ingest.growth.promotion import promote_by_hand
+from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire import LocaliseWireRequest

@@ -38,12 +38,12 @@ from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.extract import PhotoFeatures, features_key, read_features
 from ingest.fingerprint import digest
-from ingest.growth.grow_photos import Grown, GrowPhotosOptions, grow_photos
-from ingest.growth.grown_map import GrowOptions
-from ingest.growth.localised import localise_photos
-from ingest.growth.settle import SettleOptions
+from ingest.growth.graph.joint.in_database import adjust_maps
+from ingest.growth.place.component import GrowOptions
+from ingest.growth.place.grow_photos import Grown, GrowPhotosOptions, grow_photos
+from ingest.growth.place.localised import localise_photos
+from ingest.growth.place.settle import SettleOptions
 from ingest.growth.values import GrownMap
-from ingest.joint.in_database import adjust_maps
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photo import Photo
 from ingest.placed_models import Component, place_models

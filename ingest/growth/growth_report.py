@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
-from ingest.growth.promotion import Promotion
-from ingest.growth.replacing import Replacement
+from ingest.growth.graph.replacing import Replacement
+from ingest.growth.trust.promotion import Promotion
 
 PhotoOutcome = Literal["promoted", "quarantined", "waiting", "refused"]
 _WORDS: tuple[tuple[PhotoOutcome, str], ...] = (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.localised import LocaliseEachOptions
+from ingest.growth.place.localised import LocaliseEachOptions
 from ingest.growth.values import FeaturesOf
 from ingest.photo import Photo
 from ingest.workspace import read_json, write_json

@@ -8,11 +8,11 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Snapshot
 from ingest.colmap_bridge import Model
 from ingest.extract import PhotoFeatures
+from ingest.growth.graph.replacing import Replacement
 from ingest.growth.growth_report import GrownEntry, PhotoFate
-from ingest.growth.map_graph import growth_of
+from ingest.growth.map_places import growth_of
 from ingest.growth.not_found import NotFoundRows
-from ingest.growth.promotion import Promotion
-from ingest.growth.replacing import Replacement
+from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.pairs import Pair
 from ingest.photo import Photo

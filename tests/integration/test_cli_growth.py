@@ -32,7 +32,7 @@ def grown(seed: int, map_id: str, parents: tuple[str, ...], drift_m: float | Non
 
 @pytest.fixture
 def db(tmp_path: Path) -> str:
-    """Anchors a and z; b on a, c on b, d on c and z; q in quarantine, r retired."""
+    """Correspondences a and z; b on a, c on b, d on c and z; q in quarantine, r retired."""
     database = Database.create(tmp_path / "town.db")
     database.commit_maps([random_map(1, map_id="a"), random_map(2, map_id="z")])
     database.commit_map(grown(3, "b", ("a",), 0.1))

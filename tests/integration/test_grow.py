@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import ingest.growing as growing_module
-import ingest.growth.localised as localised_module
+import ingest.growth.place.localised as localised_module
 from featuredb.cli.main import main
 from featuredb.errors import StoreError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
@@ -20,8 +20,8 @@ from featuredb.store import Database
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import contribute, list_candidates
 from ingest.growing import grow_candidates, watch_and_grow
-from ingest.growth.confirmation import ConfirmationOptions
 from ingest.growth.growth_report import GrowthReport
+from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.photo import Photo
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser

@@ -13,9 +13,9 @@ from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
-from ingest.growth.grow import grow
-from ingest.growth.place_unplaced import PlaceUnplacedOptions, left_over, place_unplaced_maps
+from ingest.growth.run import grow
 from ingest.growth.run_record import no_photos
+from ingest.growth.unplaced import PlaceUnplacedOptions, left_over, place_unplaced_maps
 from ingest.map_builder import MapOptions, build_unplaced_map
 from ingest.register.place_map import placed_map
 from reloc.localiser import Localiser

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ingest.growth.grow as grow_module
+import ingest.growth.run as grow_module
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.store import Database
 from ingest.colmap_bridge import Model
-from ingest.growth.apart import AT_SEVERAL_PLACES
-from ingest.growth.grow import GrowthOptions, grow
 from ingest.growth.growth_report import GrowthReport
+from ingest.growth.place.component import AT_SEVERAL_PLACES
+from ingest.growth.run import GrowthOptions, grow
 from ingest.growth.run_record import GrowthPhotos
 from ingest.growth.values import Refused
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.camera import Camera
-from ingest.growth.grown_map import grow_component
-from ingest.growth.localised import LocaliseEachOptions, localise_photos
-from ingest.growth.lone_lenses import with_shared_lenses
+from ingest.growth.place.component import grow_component
+from ingest.growth.place.localised import LocaliseEachOptions, localise_photos, with_shared_lenses
 from ingest.growth.values import GrownMap
 from reloc.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, centers_error, existing, walk

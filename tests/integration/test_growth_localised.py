@@ -6,22 +6,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-import ingest.growth.localised as localised_module
+import ingest.growth.place.localised as localised_module
 from featuredb.features.features import Features
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
-from ingest.growth.confirmation import ConfirmationOptions
-from ingest.growth.contradictions import pose_by_focal
-from ingest.growth.localised import (
+from ingest.growth.place.contradictions import pose_by_focal
+from ingest.growth.place.localised import (
     LocaliseEachOptions,
     localise_photo,
     localise_photos,
     share_shown,
     with_lens,
 )
+from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.trust.witnesses import NewPhotos as WitnessPhotos
+from ingest.growth.trust.witnesses import hear_witnesses
 from ingest.growth.values import LocalisedPhoto
-from ingest.growth.witnesses import NewPhotos as WitnessPhotos
-from ingest.growth.witnesses import hear_witnesses
 from reloc.candidates import IndexedArea
 from reloc.localise import Localised
 from reloc.options import LocaliseOptions

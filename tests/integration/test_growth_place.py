@@ -10,9 +10,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
 from ingest.colmap_anchored import with_observations
 from ingest.colmap_bridge import Model
-from ingest.growth.grow_photos import grow_photos
-from ingest.growth.grown_map import grow_component
-from ingest.growth.localised import (
+from ingest.growth.place.component import grow_component
+from ingest.growth.place.grow_photos import grow_photos
+from ingest.growth.place.localised import (
     localise_photos,
 )
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
@@ -122,7 +122,7 @@ def test_what_no_step_foresaw_costs_this_reconstruction_only(
     def singular(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("ingest.growth.grown_map.place_by_maps", singular)
+    monkeypatch.setattr("ingest.growth.place.component.place_by_maps", singular)
     refused = grow_component(new.model, new.photos, new.features_of, localised, [area], identity())
     assert isinstance(refused, Refused)
     assert (refused.reason, refused.rows) == ("FAILED", tuple(range(len(new.photos))))

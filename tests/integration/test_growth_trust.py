@@ -12,12 +12,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
 from featuredb.store import Database
-from ingest.growth.canaries import CanaryOptions, CanaryRun, features_of_image, own_canaries, run_canaries
-from ingest.growth.confirmation import ConfirmationOptions
-from ingest.growth.map_graph import placed_maps
-from ingest.growth.overlaps import measure_overlap
-from ingest.growth.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
-from ingest.growth.replacing import replace_descendants
+from ingest.growth.graph.map_graph import placed_maps
+from ingest.growth.graph.replacing import replace_descendants
+from ingest.growth.map_images import features_of_image
+from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, own_canaries, run_canaries
+from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
 from reloc.localise import localise_features
 from reloc.localiser import Localiser
 from reloc.result import LocaliseRequest
@@ -82,7 +83,7 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
 
     first = ask()
     with monkeypatch.context() as patch:
-        patch.setattr("ingest.growth.promotion.examine", None)
+        patch.setattr("ingest.growth.trust.promotion.examine", None)
         assert ask() == first
     database.commit_map(strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
     assert ask().promoted  # something new has come

@@ -17,12 +17,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, MapObservations
 from featuredb.store import Database
-from ingest.growth.map_graph import growth_of, place_of
-from ingest.joint.adjust import adjust_together
-from ingest.joint.in_database import adjust_maps
-from ingest.joint.joined import join_maps
-from ingest.joint.links import Links
-from ingest.joint.values import JointOptions
+from ingest.growth.graph.joint.adjust import adjust_together
+from ingest.growth.graph.joint.in_database import adjust_maps
+from ingest.growth.graph.joint.joined import join_maps
+from ingest.growth.graph.joint.links import Links
+from ingest.growth.graph.joint.values import JointOptions
+from ingest.growth.graph.map_graph import place_of
+from ingest.growth.map_places import growth_of
 from tests.support.scene_strip import POINTS, east, grown, strip_map
 
 _HALF_A_METRE = np.diag(np.repeat([1e-7, 0.5], [4, 3]) ** 2)
@@ -293,11 +294,11 @@ def test_measured_anchors_stay_unless_freed(anchor: FeatureMap, child: FeatureMa
 def test_a_known_query_that_would_be_lost_stops_it(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ingest.growth.canaries import CanaryCheck, CanaryRun
+    from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 
     check = CanaryCheck(name="known", before="right", after="moved", regression="2.00 m off")
     monkeypatch.setattr(
-        "ingest.joint.in_database.ask_persons_canaries",
+        "ingest.growth.graph.joint.in_database.ask_persons_canaries",
         lambda *_: CanaryRun(checks=(check,), note="1 known queries"),
     )
     version = database.snapshot().version

@@ -16,8 +16,8 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
-from ingest.growth.canaries import CanaryOptions, answer_now, check_known
-from ingest.growth.replacing import replace_descendants
+from ingest.growth.graph.replacing import replace_descendants
+from ingest.growth.trust.canaries import CanaryOptions, answer_now, check_known
 from reloc.localiser import Localiser
 from tests.support.planar_map import EASTING, EPSG, HEIGHT, NORTHING, field_texture, planar_map, render, view
 from tests.support.scene_strip import east, grown

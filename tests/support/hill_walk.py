@@ -14,9 +14,9 @@ from featuredb.store import Database
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import contribute
 from ingest.growing import GrowingOptions
-from ingest.growth.confirmation import ConfirmationOptions
-from ingest.growth.grow import GrowthOptions
-from ingest.growth.promotion import PromotionOptions
+from ingest.growth.run import GrowthOptions
+from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.trust.promotion import PromotionOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from tests.support.hill_photos import CAMERA, FRAME, _exif, _render

@@ -14,7 +14,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapStatus, Placement
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import move_map
-from ingest.growth.map_graph import StoredEdge, place_of
+from ingest.growth.graph.map_graph import StoredEdge, place_of
 from tests.support.scenes import (
     EASTING,
     EPSG,

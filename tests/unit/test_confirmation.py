@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from featuredb.maps.feature_map import FeatureMap
-from ingest.growth.confirmation import (
+from ingest.growth.trust.confirmation import (
     Confirmation,
     ConfirmationOptions,
     Source,

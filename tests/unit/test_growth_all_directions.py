@@ -5,8 +5,13 @@ import pytest
 
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
-from ingest.growth.all_directions import in_all_directions, with_all_directions
-from ingest.growth.map_graph import drift_m, place_sigmas_m, places_of
+from ingest.growth.map_places import (
+    drift_m,
+    in_all_directions,
+    place_sigmas_m,
+    places_of,
+    with_all_directions,
+)
 from tests.support.growth_box import existing
 
 

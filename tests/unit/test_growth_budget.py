@@ -8,7 +8,7 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
-from ingest.growth.budget import drift_gate, rows_within
+from ingest.growth.graph.budget import drift_gate, rows_within
 from tests.support.scenes import box_points, random_descriptors, ring, scene_map
 
 RNG = np.random.default_rng(4)

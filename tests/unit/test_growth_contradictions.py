@@ -10,8 +10,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap_bridge import Model
-from ingest.growth.contradictions import ContradictionOptions, contradicting_photos
-from ingest.growth.similarity_fit import Fit
+from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
+from ingest.growth.place.similarity_fit import Fit
 from ingest.growth.values import LocalisedPhoto
 from tests.support.localised_photos import localised_photo
 from tests.support.posed_models import model_of

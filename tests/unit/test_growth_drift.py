@@ -14,15 +14,16 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap_anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, with_observations
 from ingest.colmap_bridge import Model
-from ingest.growth.drift import DriftOptions, photo_covariances
-from ingest.growth.photo_spread import (
+from ingest.growth.place.drift import (
+    DriftOptions,
     PhotoSpread,
     bending_variance_m2,
     center_covariances,
+    photo_covariances,
     shared_turn,
     turning_covariance,
 )
-from ingest.growth.settle import loose_photos
+from ingest.growth.place.settle import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.growth.groups import GroupOptions, PairCheck, intersections
+from ingest.growth.place.groups import GroupOptions, PairCheck, intersections
 from tests.support.scenes import CAMERA, box_points, ring
 
 OPTIONS = GroupOptions()

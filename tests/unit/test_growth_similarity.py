@@ -7,11 +7,11 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.anchors import Anchors, find_anchors
-from ingest.growth.similarity_fit import (
+from ingest.growth.place.correspondences import Correspondences, find_correspondences
+from ingest.growth.place.similarity_fit import (
     FitOptions,
     agreeing_photos,
-    anchor_errors,
+    correspondence_errors,
     fit_similarity,
     neighbours_factor,
     tolerances_px,
@@ -39,13 +39,15 @@ def world(seed: int, noise_px: float = 0.5, photos: int = 5) -> tuple[NewPhotos,
     return new, points
 
 
-def anchors_of(new: NewPhotos, points: FloatArray, sigma_m: float = 0.0, seed: int = 0) -> Anchors:
+def correspondences_of(
+    new: NewPhotos, points: FloatArray, sigma_m: float = 0.0, seed: int = 0
+) -> Correspondences:
     """Every feature is anchored to its world point, which the existing map has with that error."""
     there = points + np.random.default_rng(seed).normal(0, 1, points.shape) * sigma_m
     photo_of = np.concatenate([np.full(len(w), k) for k, w in enumerate(new.world_of)])
     world_of = np.concatenate(new.world_of)
     pixels = np.concatenate([f.features.xy.astype(np.float64) for f in new.features])
-    return Anchors(
+    return Correspondences(
         map_ids=("old",),
         photo_of=photo_of,
         feature=np.concatenate([np.arange(len(w)) for w in new.world_of]),
@@ -66,24 +68,30 @@ def error_of(sim: Sim3) -> FloatArray:
 
 def test_exact_pixels_give_the_exact_similarity() -> None:
     new, points = world(1, noise_px=0.0)
-    anchors = anchors_of(new, points)
+    correspondences = correspondences_of(new, points)
     start = Sim3.exp(np.array([0.02, 0.01, -0.02, 0.015, 0.4, -0.3, 0.5])) @ TRUTH
-    fit = fit_similarity(new.model, start, anchors, np.ones(len(anchors), dtype=np.bool_), OPTIONS)
+    fit = fit_similarity(
+        new.model, start, correspondences, np.ones(len(correspondences), dtype=np.bool_), OPTIONS
+    )
     error = error_of(fit.local_from_sfm)
     assert np.abs(error[:4]).max() < 1e-5
     assert np.abs(error[4:]).max() < 1e-4  # keypoints are float32
     assert fit.errors_px.max() < 1e-2
 
 
-def test_wrong_anchors_do_not_move_it() -> None:
+def test_wrong_correspondences_do_not_move_it() -> None:
     new, points = world(2)
-    anchors = anchors_of(new, points)
-    wrong = np.random.default_rng(0).random(len(anchors)) < 0.25
-    pixels = anchors.pixels.copy()
+    correspondences = correspondences_of(new, points)
+    wrong = np.random.default_rng(0).random(len(correspondences)) < 0.25
+    pixels = correspondences.pixels.copy()
     pixels[wrong] += 60.0
-    clean = fit_similarity(new.model, TRUTH, anchors, ~wrong, OPTIONS)
+    clean = fit_similarity(new.model, TRUTH, correspondences, ~wrong, OPTIONS)
     dirty = fit_similarity(
-        new.model, TRUTH, replace(anchors, pixels=pixels), np.ones(len(anchors), dtype=np.bool_), OPTIONS
+        new.model,
+        TRUTH,
+        replace(correspondences, pixels=pixels),
+        np.ones(len(correspondences), dtype=np.bool_),
+        OPTIONS,
     )
     apart = (clean.local_from_sfm @ dirty.local_from_sfm.inverse()).log()
     sigma = np.sqrt(np.diag(clean.covariance))
@@ -99,21 +107,23 @@ def test_the_covariance_is_as_wide_as_the_errors(sigma_m: float) -> None:
     lengths = []
     for seed in range(12):
         new, points = world(50 + seed)
-        anchors = anchors_of(new, points, sigma_m, seed)
-        fit = fit_similarity(new.model, TRUTH, anchors, np.ones(len(anchors), dtype=np.bool_), OPTIONS)
+        correspondences = correspondences_of(new, points, sigma_m, seed)
+        fit = fit_similarity(
+            new.model, TRUTH, correspondences, np.ones(len(correspondences), dtype=np.bool_), OPTIONS
+        )
         error = error_of(fit.local_from_sfm)
         lengths.append(float(error @ np.linalg.solve(fit.covariance, error)))
     assert 2.0 < np.mean(lengths) < 11.0, lengths
 
 
 def test_photos_that_are_bent_alike_widen_the_covariance() -> None:
-    """Every photo's pixels are off by an offset of its own: what its anchors say is one statement."""
+    """Every photo's pixels are off by an offset of its own: what its correspondences say is one statement."""
     new, points = world(3)
-    anchors = anchors_of(new, points)
-    every = np.ones(len(anchors), dtype=np.bool_)
-    straight = fit_similarity(new.model, TRUTH, anchors, every, OPTIONS)
+    correspondences = correspondences_of(new, points)
+    every = np.ones(len(correspondences), dtype=np.bool_)
+    straight = fit_similarity(new.model, TRUTH, correspondences, every, OPTIONS)
     offsets = np.random.default_rng(1).normal(0, 3.0, (5, 2))
-    bent = replace(anchors, pixels=anchors.pixels + offsets[anchors.photo_of])
+    bent = replace(correspondences, pixels=correspondences.pixels + offsets[correspondences.photo_of])
     fit = fit_similarity(new.model, TRUTH, bent, every, OPTIONS)
     assert straight.neighbours_factor < 3.0
     assert fit.neighbours_factor > 10.0
@@ -123,55 +133,59 @@ def test_photos_that_are_bent_alike_widen_the_covariance() -> None:
     assert error @ np.linalg.solve(naive, error) > 24.3
 
 
-def test_what_no_anchor_holds_is_open_and_stays() -> None:
+def test_what_no_correspondence_holds_is_open_and_stays() -> None:
     """One photo does not tell the scale; points behind all cameras tell nothing at all."""
     new, points = world(6)
-    anchors = anchors_of(new, points)
-    fit = fit_similarity(new.model, TRUTH, anchors, anchors.photo_of == 0, OPTIONS)
+    correspondences = correspondences_of(new, points)
+    fit = fit_similarity(new.model, TRUTH, correspondences, correspondences.photo_of == 0, OPTIONS)
     assert np.linalg.eigvalsh(fit.covariance).min() > 0.0
     assert np.sqrt(fit.covariance[0, 0]) > 1.0
     center = new.model.cam_from_sfm[0].center
     assert np.linalg.norm(fit.local_from_sfm.act(center) - TRUTH.act(center)) < 0.5
     away = Sim3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1e4])) @ TRUTH
     down = fit_similarity(
-        new.model, away, anchors_behind(new, anchors), np.ones(len(anchors), np.bool_), OPTIONS
+        new.model,
+        away,
+        correspondences_behind(new, correspondences),
+        np.ones(len(correspondences), np.bool_),
+        OPTIONS,
     )
     np.testing.assert_allclose(down.local_from_sfm.matrix(), away.matrix())
     assert np.sqrt(np.diag(down.covariance)).min() > 1.0
 
 
-def anchors_behind(new: NewPhotos, anchors: Anchors) -> Anchors:
+def correspondences_behind(new: NewPhotos, correspondences: Correspondences) -> Correspondences:
     """The same pixels with points a kilometre behind their cameras, wherever these are moved."""
-    behind = np.empty_like(anchors.points)
+    behind = np.empty_like(correspondences.points)
     for k, pose in enumerate(new.model.cam_from_sfm):
         camera = TRUTH.act_on_pose(pose)
-        behind[anchors.photo_of == k] = camera.inverse().act(np.array([[0.0, 0.0, -1e3]]))
-    return replace(anchors, points=behind + np.array([0.0, 0.0, 1e4]))
+        behind[correspondences.photo_of == k] = camera.inverse().act(np.array([[0.0, 0.0, -1e3]]))
+    return replace(correspondences, points=behind + np.array([0.0, 0.0, 1e4]))
 
 
 def test_neighbours_factor_of_independent_scores_is_about_one() -> None:
     new, points = world(4)
-    anchors = anchors_of(new, points)
-    score = np.random.default_rng(2).normal(size=(len(anchors), 7))
-    assert neighbours_factor(score, np.eye(7), anchors) < 2.0
+    correspondences = correspondences_of(new, points)
+    score = np.random.default_rng(2).normal(size=(len(correspondences), 7))
+    assert neighbours_factor(score, np.eye(7), correspondences) < 2.0
 
 
-def test_photos_agree_by_their_own_anchors() -> None:
+def test_photos_agree_by_their_own_correspondences() -> None:
     new, points = world(5)
-    anchors = anchors_of(new, points)
-    pixels = anchors.pixels.copy()
-    pixels[anchors.photo_of == 2] += 40.0
-    off = replace(anchors, pixels=pixels)
-    errors = anchor_errors(new.model, TRUTH, off)
+    correspondences = correspondences_of(new, points)
+    pixels = correspondences.pixels.copy()
+    pixels[correspondences.photo_of == 2] += 40.0
+    off = replace(correspondences, pixels=pixels)
+    errors = correspondence_errors(new.model, TRUTH, off)
     agree = agreeing_photos(errors, tolerances_px(new.model, off, 0.005), off, 0.5)
     assert agree.tolist() == [0, 1, 3, 4]
 
 
 def test_points_behind_a_camera_never_agree() -> None:
     new, points = world(6)
-    anchors = anchors_of(new, points)
-    anchors = replace(anchors, points=anchors.points + np.array([0.0, 0.0, 500.0]))
-    assert np.isinf(anchor_errors(new.model, TRUTH, anchors)).any()
+    correspondences = correspondences_of(new, points)
+    correspondences = replace(correspondences, points=correspondences.points + np.array([0.0, 0.0, 500.0]))
+    assert np.isinf(correspondence_errors(new.model, TRUTH, correspondences)).any()
 
 
 def test_anchors_are_carried_along_tracks() -> None:
@@ -189,11 +203,14 @@ def test_anchors_are_carried_along_tracks() -> None:
         points=points[world_rows],
         point_covariance=np.tile(np.eye(3) * 1e-4, (20, 1, 1)),
     )
-    anchors = find_anchors(new.model, {0: photo}, new.keypoints())
-    assert (~anchors.carried).sum() == 20
+    correspondences = find_correspondences(new.model, {0: photo}, new.keypoints())
+    assert (~correspondences.carried).sum() == 20
     seen_by_others = sum(int(np.isin(w, world_rows).sum()) for w in new.world_of[1:])
-    assert anchors.carried.sum() == seen_by_others
+    assert correspondences.carried.sum() == seen_by_others
     for photo_of, feature, point in zip(
-        anchors.photo_of.tolist(), anchors.feature.tolist(), anchors.point_of.tolist(), strict=True
+        correspondences.photo_of.tolist(),
+        correspondences.feature.tolist(),
+        correspondences.point_of.tolist(),
+        strict=True,
     ):
         assert new.world_of[photo_of][feature] == point

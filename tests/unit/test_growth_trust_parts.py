@@ -11,26 +11,18 @@ import pytest
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap_bridge import Model
-from ingest.growth.budget import drift_gate
-from ingest.growth.canaries import CanaryCheck, CanaryRun
-from ingest.growth.confirmation import ConfirmationOptions, Source, Witness
+from ingest.growth.graph.budget import drift_gate
+from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, place_of, solve_with_new
+from ingest.growth.graph.new_overlaps import overlaps_to_measure
+from ingest.growth.graph.replacing import MovedMap, Replacement
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
-from ingest.growth.map_graph import (
-    PlacedMap,
-    StoredEdge,
-    drift_m,
-    growth_of,
-    no_surer_than,
-    place_of,
-    places_of,
-    solve_with_new,
-)
-from ingest.growth.new_overlaps import overlaps_to_measure
-from ingest.growth.overlaps import model_of
-from ingest.growth.promotion import Promotion, canary_gate, contradiction_gate, points_gate
-from ingest.growth.replacing import MovedMap, Replacement
-from ingest.growth.trusted_points import answering_with, confirmed_points
-from ingest.growth.witnesses import Heard
+from ingest.growth.map_places import drift_m, growth_of, places_of
+from ingest.growth.place.overlaps import model_of
+from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
+from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witness
+from ingest.growth.trust.promotion import Promotion, canary_gate, contradiction_gate, points_gate
+from ingest.growth.trust.trusted_points import answering_with, confirmed_points
+from ingest.growth.trust.witnesses import Heard
 from ingest.submodel import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, strip_map
 

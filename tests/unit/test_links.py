@@ -3,7 +3,7 @@
 import numpy as np
 
 from ingest.colmap_bridge import Model
-from ingest.growth.apart import taken_apart
+from ingest.growth.place.component import taken_apart
 from ingest.links import firm_parts, firmness
 from tests.support.posed_models import model_of
 

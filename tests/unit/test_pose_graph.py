@@ -9,14 +9,14 @@ from scipy.linalg import expm
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.pose_graph import (
+from ingest.growth.graph.pose_graph import (
     GraphEdge,
     GraphNode,
     PoseGraphOptions,
     equivalent_sigmas,
     solve_pose_graph,
 )
-from ingest.growth.sim3_jacobian import left_jacobian, small_adjoint
+from ingest.growth.place.similarity_fit import left_jacobian, small_adjoint
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])
 _EDGE = np.diag(_SIGMA**2)

@@ -10,8 +10,8 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.growth.map_graph import StoredEdge, in_graph
-from ingest.growth.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
+from ingest.growth.graph.map_graph import StoredEdge, in_graph
+from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
 
 MAPS, STEP_M = 12, 30.0
 OWN = np.diag(np.array([1e-5, 5e-5, 5e-5, 5e-5, 0.005, 0.005, 0.005]) ** 2)

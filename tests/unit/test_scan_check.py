@@ -7,7 +7,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from ingest.growth.gates import Gate
-from ingest.growth.scan_check import ScanCheckOptions, cloud_gate
+from ingest.growth.trust.scan_check import ScanCheckOptions, cloud_gate
 from tests.support.scanned_map import ground_points, plain_cloud, scan
 
 pytest.importorskip("small_gicp")

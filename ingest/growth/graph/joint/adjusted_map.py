@@ -1,0 +1,108 @@
+"""A map made anew of the reconstruction in which it was adjusted with others."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3
+from featuredb.geometry.similarity import similarity_closed_form
+from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints
+from featuredb.maps.subset import take_observations
+from ingest.colmap_anchored import Anchored
+from ingest.colmap_bridge import Model
+from ingest.growth.graph.joint.joined import Joined, MapRows, observed_pixels
+from ingest.growth.graph.joint.values import JOINT, AdjustedMap
+from ingest.precision import linearise, point_covariances, residual_variance, upper_triangle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Precision:
+    """Of all points of the model: covariances (n, 3, 3) in its frame, mean errors (n,) in pixels."""
+
+    covariance: FloatArray
+    error_px: FloatArray
+
+
+def precision_of(joined: Joined, model: Model) -> Precision:
+    """Of the points of an adjusted model."""
+    linear = linearise(
+        model.cameras,
+        model.camera_of,
+        model.cam_from_sfm,
+        model.xyz,
+        model.point_of,
+        model.photo_of,
+        observed_pixels(joined, model),
+    )
+    variance = residual_variance(linear, len(model.rows), len(model.xyz))
+    errors = np.bincount(
+        model.point_of, weights=np.linalg.norm(linear.residual, axis=1), minlength=len(model.xyz)
+    )
+    return Precision(
+        covariance=point_covariances(linear, len(model.xyz), variance),
+        error_px=errors / np.maximum(model.track_lengths(), 1),
+    )
+
+
+def adjusted_map(
+    feature_map: FeatureMap,
+    rows: MapRows,
+    result: Anchored,
+    precision: Precision,
+    frame: LocalFrame,
+    together: Sequence[FeatureMap],
+    report: AdjustedMap,
+) -> FeatureMap:
+    """The map with its photos, lenses and points as they are now; what no longer fits is gone."""
+    model = result.model
+    to_own = Sim3.from_rigid3(feature_map.frame.enu_from(frame))
+    cameras = list(feature_map.cameras)
+    images: list[MapImage] = []
+    for image, k in zip(feature_map.images, rows.photos.tolist(), strict=True):
+        cameras[image.camera_id] = model.cameras[int(model.camera_of[k])]
+        images.append(replace(image, cam_from_local=to_own.act_on_pose(model.cam_from_sfm[k])))
+    kept, joint_point = kept_observations(rows, result)
+    seen, old = feature_map.observations, feature_map.points
+    points, first, index = np.unique(seen.point_index[kept], return_index=True, return_inverse=True)
+    index, joint = index.reshape(-1).astype(np.int64), joint_point[first]
+    places = to_own.act(model.xyz[joint])
+    move = similarity_closed_form(feature_map.points_local()[points], places) if len(points) >= 3 else None
+    turned = to_own.rotation @ precision.covariance[joint] @ to_own.rotation.T
+    placement = feature_map.placement
+    evidence = {
+        **placement.evidence,
+        JOINT: {"with": sorted(m.map_id for m in together), **report.as_json()},
+    }
+    return replace(
+        feature_map,
+        cameras=tuple(cameras),
+        images=tuple(images),
+        points=MapPoints(
+            utm=feature_map.frame.utm_from_enu(places, feature_map.epsg),
+            rgb=old.rgb[points],
+            track_length=np.bincount(index, minlength=len(points)).astype(np.int32),
+            error_px=precision.error_px[joint].astype(np.float32),
+            covariance=upper_triangle(turned),
+        ),
+        observations=replace(take_observations(seen, kept), point_index=index),
+        placement=replace(
+            placement,
+            local_from_sfm=(move or Sim3.identity()) @ placement.local_from_sfm,
+            evidence=evidence,
+        ),
+    )
+
+
+def kept_observations(rows: MapRows, result: Anchored) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows (k,) of a map's observations that still fit, and the model's points (k,) that they see."""
+    model = result.model
+    now = np.stack([result.old_point[model.point_of], model.photo_of, model.keypoint_of], axis=1)
+    place = {tuple(key): int(point) for key, point in zip(now.tolist(), model.point_of, strict=True)}
+    asked = np.stack([rows.point_of, rows.photo_of, rows.keypoint_of], axis=1).tolist()
+    found = np.array([place.get(tuple(key), -1) for key in asked], dtype=np.int64).reshape(-1)
+    kept = np.flatnonzero(found >= 0)
+    return kept, found[kept]

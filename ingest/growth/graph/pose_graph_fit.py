@@ -1,0 +1,269 @@
+"""The least squares behind a pose graph over maps: solution, marginal covariances, tests of measurements."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.sparse import coo_array, csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.sim3 import Sim3
+from ingest.growth.place.similarity_fit import left_jacobian
+
+# Standard deviations that nothing is known better than: log scale and radians, metres. They keep a covariance
+# of zero, an anchor that is the truth by decree, invertible.
+_FLOOR = np.diag(np.repeat([1e-9, 1e-6], [4, 3]) ** 2)
+_DENSE_MAPS = 150  # up to here the exact dense solver takes milliseconds; beyond, the iterative sparse one
+_FREE = 1e-6  # a direction of an edge whose redundancy is smaller is not checked by anything
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphNode:
+    """A map.
+
+    Attributes:
+        prior: (7, 7) covariance of its own placement, left perturbation in the graph's frame, where it is an
+            anchor; None for a map that others placed.
+        present_from_own: where an earlier graph has moved the anchor, from where its own placement has it.
+    """
+
+    map_id: str
+    prior: FloatArray | None = None
+    present_from_own: Sim3 = field(default_factory=Sim3.identity)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphEdge:
+    """A measured overlap of two maps at their present places.
+
+    Attributes:
+        a, b: map ids.
+        b_from_a: carries what map a says to where map b says it; graph's frame.
+        covariance: (7, 7) of its left perturbation.
+        shared: (7, 3) the part of it that all edges have in common: what they are off for one sigma of three
+            errors that no edge has alone.
+    """
+
+    a: str
+    b: str
+    b_from_a: Sim3
+    covariance: FloatArray
+    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shared", frozen_array("GraphEdge.shared", self.shared, (7, 3)))
+        object.__setattr__(self, "covariance", frozen_array("GraphEdge.covariance", self.covariance, (7, 7)))
+
+    def __str__(self) -> str:
+        return f"{self.a} - {self.b}"
+
+
+class Fit:
+    """A graph solved by least squares, with what is needed to judge it.
+
+    Attributes:
+        edges: of the maps that were solved.
+        corrections: new_from_present by map id.
+        chi_square, degrees: of the fit.
+    """
+
+    def __init__(
+        self,
+        nodes: Sequence[GraphNode],
+        edges: Sequence[GraphEdge],
+        places: Sequence[Sim3],
+        jacobian: csr_array,
+        residuals: FloatArray,
+    ) -> None:
+        self._nodes, self.edges = nodes, edges
+        self._rows = {node.map_id: i for i, node in enumerate(nodes)}
+        self._jacobian, self._residuals = jacobian, residuals
+        self.corrections = {node.map_id: place for node, place in zip(nodes, places, strict=True)}
+        self.chi_square = float(residuals @ residuals)
+        self.degrees = len(residuals) - 7 * len(nodes)
+        wanted = [(i, i) for i in range(len(nodes))]
+        wanted += [(self._rows[e.a], self._rows[e.b]) for e in edges]
+        self._blocks = _inverse_blocks(jacobian, wanted)
+
+    @classmethod
+    def of(cls, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> "Fit":
+        rows = {node.map_id: i for i, node in enumerate(nodes)}
+        held = [e for e in edges if e.a in rows and e.b in rows]
+        problem = _Problem(nodes, held, rows)
+        places = problem.solve()
+        residuals, jacobian = problem.linearise(places)
+        return cls(nodes, held, places, jacobian, residuals)
+
+    def edges_judged(self) -> list[tuple[float, int]]:
+        """What each edge takes of chi-square, and in how many directions others check it."""
+        return [self._test(k, (self._rows[e.a], self._rows[e.b])) for k, e in enumerate(self.edges)]
+
+    def priors_judged(self) -> list[tuple[float, int]]:
+        """The same of each anchor's own placement."""
+        first = len(self.edges)
+        anchors = [i for i, node in enumerate(self._nodes) if node.prior is not None]
+        return [self._test(first + k, (i,)) for k, i in enumerate(anchors)]
+
+    def marginals(self) -> dict[str, FloatArray]:
+        """Covariance (7, 7) of each map's correction, with what edges have in common."""
+        common = self._in_common(self._jacobian)
+        return {node.map_id: self._blocks[i, i] + common[i] for i, node in enumerate(self._nodes)}
+
+    def relative_marginals(self) -> dict[str, FloatArray]:
+        """The same if the anchors were where they are without error; zero for themselves."""
+        free = [i for i, node in enumerate(self._nodes) if node.prior is None]
+        found = {node.map_id: np.zeros((7, 7)) for node in self._nodes}
+        if not free:
+            return found
+        columns = (7 * np.array(free)[:, None] + np.arange(7)).ravel()
+        jacobian = self._jacobian[:, columns]
+        blocks = _inverse_blocks(jacobian, [(k, k) for k in range(len(free))])
+        common = self._in_common(jacobian)
+        for k, i in enumerate(free):
+            found[self._nodes[i].map_id] = blocks[k, k] + common[k]
+        return found
+
+    def _in_common(self, jacobian: csr_array) -> FloatArray:
+        """(n, 7, 7) what comes on top where edges err together: along a chain their errors add up.
+
+        The independent sum holds the same errors once each; what that has beyond is not taken away.
+        """
+        count = jacobian.shape[1] // 7
+        together, apart = np.zeros((count, 7, 3)), np.zeros((count, 7, 7))
+        errors_of = {k: _whitening(e.covariance) @ e.shared for k, e in enumerate(self.edges)}
+        shared = {k: errors for k, errors in errors_of.items() if errors.any()}
+        if not shared:
+            return apart
+        solve = _solver(jacobian)
+        by_row = csc_array(jacobian.T)
+        for k, errors in shared.items():
+            moved = solve(by_row[:, 7 * k : 7 * k + 7] @ errors).reshape(count, 7, 3)
+            together += moved
+            apart += moved @ np.swapaxes(moved, 1, 2)
+        values, vectors = np.linalg.eigh(together @ np.swapaxes(together, 1, 2) - apart)
+        return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+
+    def _test(self, k: int, nodes: tuple[int, ...]) -> tuple[float, int]:
+        """The fall of chi-square without the k-th measurement of these nodes, and its redundancy."""
+        rows = slice(7 * k, 7 * k + 7)
+        columns = (7 * np.array(nodes)[:, None] + np.arange(7)).ravel()
+        part = self._jacobian[rows][:, columns].toarray()
+        covariance = np.block([[_block(self._blocks, i, j) for j in nodes] for i in nodes])
+        spread = np.eye(7) - part @ covariance @ part.T
+        values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
+        free = values > _FREE
+        along = vectors[:, free].T @ self._residuals[rows]
+        return float((along**2 / values[free]).sum()), int(free.sum())
+
+
+def _block(blocks: Mapping[tuple[int, int], FloatArray], i: int, j: int) -> FloatArray:
+    return blocks[i, j] if (i, j) in blocks else blocks[j, i].T
+
+
+def _inverse_blocks(
+    jacobian: csr_array, wanted: Sequence[tuple[int, int]]
+) -> dict[tuple[int, int], FloatArray]:
+    """Blocks (7, 7) of the inverse normal matrix."""
+    solve, size = _solver(jacobian), jacobian.shape[1]
+    columns: dict[int, FloatArray] = {}
+    blocks: dict[tuple[int, int], FloatArray] = {}
+    for i, j in sorted(set(wanted), key=lambda pair: pair[1]):
+        if j not in columns:
+            columns.clear()
+            unit = np.zeros((size, 7))
+            unit[7 * j : 7 * j + 7] = np.eye(7)
+            columns[j] = solve(unit)
+        blocks[i, j] = columns[j][7 * i : 7 * i + 7]
+        if i == j:
+            blocks[i, j] = 0.5 * (blocks[i, j] + blocks[i, j].T)
+    return blocks
+
+
+def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:
+    """What solves the normal equations for columns of right-hand sides."""
+    normal = csc_array(jacobian.T @ jacobian)
+    scale = 1.0 / np.sqrt(normal.diagonal())
+    turned = coo_array(normal)
+    turned.data = turned.data * scale[turned.row] * scale[turned.col]
+    solver = splu(csc_array(turned))
+    return lambda right: np.asarray(scale[:, None] * solver.solve(scale[:, None] * right))
+
+
+class _Problem:
+    """Residuals and their derivatives: edges first, then the anchors' priors; each whitened."""
+
+    def __init__(
+        self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge], rows: Mapping[str, int]
+    ) -> None:
+        self._count = len(nodes)
+        self._edges = [(rows[e.a], rows[e.b], e.b_from_a.inverse(), _whitening(e.covariance)) for e in edges]
+        self._priors = [
+            (i, n.present_from_own, _whitening(n.prior)) for i, n in enumerate(nodes) if n.prior is not None
+        ]
+
+    def solve(self) -> list[Sim3]:
+        """Corrections; started from the present places, then once more from where that ends."""
+        places = [Sim3.identity() for _ in range(self._count)]
+        exact = self._count <= _DENSE_MAPS
+        for _ in range(2):  # the second round confirms, in a tangent that is about the answer
+            start = list(places)
+            found = least_squares(
+                self._residuals,
+                np.zeros(7 * self._count),
+                jac=self._jacobian,
+                args=(start, exact),
+                x_scale="jac",
+                tr_solver="exact" if exact else "lsmr",
+                # Whitened: a step of 1e-9 of the corrections, or 1e-12 of chi-square, is far below any sigma.
+                xtol=1e-9,
+                ftol=1e-12,
+                gtol=1e-9,
+                max_nfev=50,
+            )
+            places = self._moved(start, found.x)
+        return places
+
+    def linearise(self, places: Sequence[Sim3]) -> tuple[FloatArray, csr_array]:
+        """Whitened residuals (7 m,) and their derivatives by left perturbations of the corrections."""
+        residuals: list[FloatArray] = []
+        blocks: list[tuple[int, int, FloatArray]] = []
+        for k, (a, b, measured_inverse, white) in enumerate(self._edges):
+            b_inverse = places[b].inverse()
+            miss = (b_inverse @ places[a] @ measured_inverse).log()
+            along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
+            residuals.append(white @ miss)
+            blocks += [(k, a, along), (k, b, -along)]
+        for k, (i, present_from_own, white) in enumerate(self._priors, start=len(self._edges)):
+            miss = (places[i] @ present_from_own).log()
+            residuals.append(white @ miss)
+            blocks.append((k, i, white @ np.linalg.inv(left_jacobian(miss))))
+        return np.concatenate(residuals), _assemble(blocks, len(residuals), self._count)
+
+    def _residuals(self, x: FloatArray, start: Sequence[Sim3], dense: bool) -> FloatArray:
+        return self.linearise(self._moved(start, x))[0]
+
+    def _jacobian(self, x: FloatArray, start: Sequence[Sim3], dense: bool) -> "FloatArray | csr_array":
+        """Derivatives by the tangent about `start`."""
+        _, by_place = self.linearise(self._moved(start, x))
+        turns = [(i, i, left_jacobian(part)) for i, part in enumerate(x.reshape(-1, 7))]
+        jacobian = csr_array(by_place @ _assemble(turns, self._count, self._count))
+        return jacobian.toarray() if dense else jacobian
+
+    def _moved(self, start: Sequence[Sim3], x: FloatArray) -> list[Sim3]:
+        return [Sim3.exp(part) @ place for part, place in zip(x.reshape(-1, 7), start, strict=True)]
+
+
+def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns: int) -> csr_array:
+    """A sparse matrix of (7, 7) blocks."""
+    inner = np.arange(7)
+    row = np.concatenate([np.repeat(7 * r + inner, 7) for r, _, _ in blocks])
+    column = np.concatenate([np.tile(7 * c + inner, 7) for _, c, _ in blocks])
+    value = np.concatenate([block.ravel() for _, _, block in blocks])
+    return csr_array(coo_array((value, (row, column)), shape=(7 * rows, 7 * columns)))
+
+
+def _whitening(covariance: FloatArray) -> FloatArray:
+    """W (7, 7) with W C W^T = I."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + _FLOOR)), dtype=np.float64)

@@ -1,0 +1,84 @@
+"""How far a map may be off at the places that it answers for, and what growth has noted of it."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import skew
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lineage import GROWTH
+
+# 95 % of a normal error along the worst axis.
+_SIGMAS_95 = 1.96
+# Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
+_SHARE_OF_PLACES = 0.99
+
+
+def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
+    """Bound of 95 % on the position errors of a map against its anchors, metres, at 99 % of the places.
+
+    Args:
+        covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
+    """
+    return _SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
+
+
+def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
+    """(n,) largest standard deviation of each of the places (n, 3) under a similarity (7, 7), metres."""
+    jacobian = point_jacobian(places)
+    spread = jacobian @ covariance @ np.swapaxes(jacobian, -1, -2)
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(spread)[:, -1], 0.0)))
+
+
+def at_most_places(values: FloatArray) -> float:
+    """The largest of the values (n,), one hundredth of them left out; 0 for none."""
+    return float(np.quantile(values, _SHARE_OF_PLACES, method="higher")) if len(values) else 0.0
+
+
+def places_of(feature_map: FeatureMap) -> FloatArray:
+    """(n, 3) where a map answers for what it says, in its frame: its points, a sample of them, and images.
+
+    Points and not the corners of their box: there is nothing in most of these.
+    """
+    points = feature_map.points_local()
+    centers = [image.cam_from_local.center for image in feature_map.images]
+    return np.concatenate([points[:: max(1, len(points) // 2000)], np.reshape(centers, (-1, 3))])
+
+
+def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
+    """What growth has written into a placement's evidence; empty for others."""
+    return dict(evidence.get(GROWTH) or {})
+
+
+def with_all_directions(feature_map: FeatureMap) -> FeatureMap:
+    """The map with its placement's covariance `in_all_directions`."""
+    placement = feature_map.placement
+    alike = in_all_directions(feature_map, placement.covariance)
+    return replace(feature_map, placement=replace(placement, covariance=alike))
+
+
+def in_all_directions(feature_map: FeatureMap, covariance: FloatArray) -> FloatArray:
+    """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
+
+    About the middle of its photos; not less, anywhere that the map answers for, than the given one says for
+    the worst direction there.
+
+    Args:
+        feature_map: whose places are meant.
+        covariance: (7, 7) of the placement's left perturbation, in the map's frame.
+    """
+    middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
+    jacobian = point_jacobian(middle)
+    shift_m2 = float(np.linalg.eigvalsh(jacobian @ covariance @ jacobian.T)[-1])
+    turn = float(np.linalg.eigvalsh(covariance[1:4, 1:4])[-1])
+    about = np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+    grow = np.concatenate([[1.0, 0.0, 0.0, 0.0], -middle])[:, None]
+    alike = covariance[0, 0] * grow @ grow.T + turn * about @ about.T
+    alike += np.diag([0.0] * 4 + [shift_m2] * 3)
+    places = places_of(feature_map)
+    ratio = place_sigmas_m(covariance, places) / place_sigmas_m(alike, places)
+    return np.asarray(max(1.0, at_most_places(ratio)) ** 2 * alike)

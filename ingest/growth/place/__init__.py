@@ -1,0 +1,1 @@
+"""Where new photos and reconstructions lie: localised photos, correspondences, placement, refinement."""

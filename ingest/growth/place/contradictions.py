@@ -1,0 +1,122 @@
+"""Step: do the photos' own localisations still fit the refined reconstruction, each by its own sigmas?
+
+Asked after the refinement, not before: as it comes, a reconstruction of a few photos is bent by more than
+localised poses are uncertain. Photos see the existing points within a pixel or two of where it has them and
+yet stand dozens of sigmas from it. Adjusted to the existing points it is bent no more, and what still
+differs contradicts.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_log
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.place.similarity_fit import Fit
+from ingest.growth.values import LocalisedPhoto
+from ingest.precision import linearise
+
+# What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
+# corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
+# `brighton`'s lens is off by 1.3 %.
+FOCAL_REL = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ContradictionOptions:
+    """When a photo contradicts.
+
+    Attributes:
+        sigmas: between its localised and its refined pose. They are those of the localisation, times the
+            spread and the neighbours factor of the similarity, those of the refined pose, and what the lens
+            that it was localised with makes where the refined one is another. Spread and
+            factor are the larger ones of before and after the refinement: poses from the same existing points
+            share their errors, which the refined model has taken over.
+    """
+
+    sigmas: float = 3.0
+
+
+def pose_offset(pose: Rigid3, photo: LocalisedPhoto) -> FloatArray:
+    """(6,) small rotation (rad) and displacement (m) from a pose to the localised one, local axes."""
+    turn = so3_log(photo.cam_from_local.rotation.T @ pose.rotation)
+    return np.concatenate([turn, photo.cam_from_local.center - pose.center])
+
+
+def contradicting_photos(
+    model: Model,
+    localised: Mapping[int, LocalisedPhoto],
+    spread: FloatArray,
+    fits: Sequence[Fit],
+    options: ContradictionOptions,
+) -> dict[int, str]:
+    """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+
+    Args:
+        model: refined, in metres.
+        localised: by place in the model; others than those that agreed with the placement are not asked.
+        spread: (k, 6, 6) of `PhotoSpread`; unknown ones (NaN) add nothing.
+        fits: of the model to the existing points, as it came and refined.
+    """
+    limit = gates.sigmas_limit(options.sigmas, 6)
+    dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
+    found: dict[int, str] = {}
+    for k, photo in sorted(localised.items()):
+        pose = model.cam_from_sfm[k]
+        offset = pose_offset(pose, photo)
+        into_local = block_diag(pose.rotation.T, pose.rotation.T)
+        by_focal = pose_by_focal(photo) * FOCAL_REL
+        by_lens = pose_by_lens(photo, model.cameras[int(model.camera_of[k])])
+        lenses = np.outer(by_focal, by_focal) + np.outer(by_lens, by_lens)
+        own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
+        square = float(offset @ np.linalg.solve(photo.covariance * dilution + own, offset))
+        if square > limit:
+            found[k] = (
+                f"the photo by itself is {float(np.linalg.norm(offset[3:])):.2f} m and "
+                f"{float(np.degrees(np.linalg.norm(offset[:3]))):.2f} degrees from where the others put it, "
+                f"chi-square {square:.0f}, {limit:.0f} is allowed"
+            )
+    return found
+
+
+def center_variance_m2(photo: LocalisedPhoto) -> float:
+    """Of a localised centre, all axes together, with what its focal length may be off."""
+    moved = pose_by_focal(photo)[3:] * FOCAL_REL
+    return float(np.trace(photo.covariance[3:, 3:]) + moved @ moved)
+
+
+def pose_by_focal(photo: LocalisedPhoto) -> FloatArray:
+    """(6,) how a localised pose moves (left perturbation) as its focal length grows by its own size."""
+    middle = photo.camera.project(np.array([[0.0, 0.0, 1.0]]))
+    return _pose_by_pixels(photo, photo.pixels - middle)
+
+
+def pose_by_lens(photo: LocalisedPhoto, refined: Camera) -> FloatArray:
+    """(6,) how far a localised pose is off, if the lens that it was localised with is not the refined one."""
+    seen = photo.cam_from_local.act(photo.points)
+    return _pose_by_pixels(photo, refined.project(seen) - photo.camera.project(seen))
+
+
+def _pose_by_pixels(photo: LocalisedPhoto, moved_px: FloatArray) -> FloatArray:
+    """(6,) the change of pose (left perturbation) that moves the pixels (k, 2) of its points most alike."""
+    count = len(photo.pixels)
+    if count < 4:
+        return np.zeros(6)
+    linear = linearise(
+        [photo.camera],
+        np.zeros(1, dtype=np.int64),
+        [photo.cam_from_local],
+        photo.points,
+        np.arange(count),
+        np.zeros(count, dtype=np.int64),
+        photo.pixels,
+    )
+    good = np.isfinite(linear.by_pose).all(axis=(1, 2)) & np.isfinite(moved_px).all(axis=1)
+    by_pose = linear.by_pose[good].reshape(-1, 6)
+    return np.asarray(np.linalg.lstsq(by_pose, moved_px[good].reshape(-1), rcond=None)[0])

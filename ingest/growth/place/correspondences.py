@@ -1,0 +1,180 @@
+"""Correspondences: pixels of a new reconstruction's photos in which points of existing maps are seen."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from ingest.colmap_bridge import Model
+from ingest.growth.values import LocalisedPhoto
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Correspondences:
+    """Existing points seen by photos of a model, all in one local frame.
+
+    Attributes:
+        map_ids: the existing maps, by name; `map_of` indexes into them.
+        photo_of: (m,) index into the model's photos.
+        feature: (m,) row of that photo's features.
+        pixels: (m, 2) float64.
+        points: (m, 3) metres. covariance: (m, 3, 3) relative to their map's gauge.
+        map_of: (m,), point_of: (m,) row of that map's points.
+        model_point: (m,) the model's own point that the same feature observes, -1 where it has none.
+        carried: (m,) the photo's own localisation did not find the match; it came along a track of the
+            model, from a photo whose localisation did.
+    """
+
+    map_ids: tuple[str, ...]
+    photo_of: NDArray[np.int64]
+    feature: NDArray[np.int64]
+    pixels: FloatArray
+    points: FloatArray
+    covariance: FloatArray
+    map_of: NDArray[np.int64]
+    point_of: NDArray[np.int64]
+    model_point: NDArray[np.int64]
+    carried: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.photo_of)
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
+        """The correspondences of the given rows."""
+        return Correspondences(
+            map_ids=self.map_ids,
+            photo_of=self.photo_of[rows],
+            feature=self.feature[rows],
+            pixels=self.pixels[rows],
+            points=self.points[rows],
+            covariance=self.covariance[rows],
+            map_of=self.map_of[rows],
+            point_of=self.point_of[rows],
+            model_point=self.model_point[rows],
+            carried=self.carried[rows],
+        )
+
+    def existing(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """One of each existing point (first row), and the number (m,) of each one's point."""
+        both = np.stack([self.map_of, self.point_of], axis=1)
+        _, first, number = np.unique(both, axis=0, return_index=True, return_inverse=True)
+        return first, number.reshape(-1)
+
+
+def find_correspondences(
+    model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Mapping[int, FloatArray]
+) -> Correspondences:
+    """Correspondences of a model's photos, own and carried along its tracks.
+
+    Args:
+        localised: by row of the photos, all in one frame.
+        keypoints: pixels (n, 2) of all features of the model's photos, by row.
+    """
+    map_ids = tuple(sorted({m for r in model.rows if int(r) in localised for m in localised[int(r)].map_ids}))
+    own = _own(model, localised, map_ids)
+    carried = _carried(model, own, keypoints)
+    return _concatenate(own, carried)
+
+
+def _own(model: Model, localised: Mapping[int, LocalisedPhoto], map_ids: tuple[str, ...]) -> Correspondences:
+    parts: list[Correspondences] = []
+    for k, row in enumerate(model.rows.tolist()):
+        photo = localised.get(row)
+        if photo is None:
+            continue
+        number = np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)
+        seen = model.photo_of == k
+        point_of_feature = dict(
+            zip(model.keypoint_of[seen].tolist(), model.point_of[seen].tolist(), strict=True)
+        )
+        count = len(photo.feature_rows)
+        parts.append(
+            Correspondences(
+                map_ids=map_ids,
+                photo_of=np.full(count, k, dtype=np.int64),
+                feature=photo.feature_rows,
+                pixels=photo.pixels,
+                points=photo.points,
+                covariance=photo.point_covariance,
+                map_of=number[photo.map_of],
+                point_of=photo.point_of,
+                model_point=np.array(
+                    [point_of_feature.get(f, -1) for f in photo.feature_rows.tolist()], dtype=np.int64
+                ).reshape(-1),
+                carried=np.zeros(count, dtype=np.bool_),
+            )
+        )
+    return _concatenate(*parts) if parts else _empty(map_ids)
+
+
+def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatArray]) -> Correspondences:
+    """Where more than half of a track's matches with one map name one point, its other photos see it too."""
+    linked = np.flatnonzero(own.model_point >= 0)
+    if not len(linked):
+        return _empty(own.map_ids)
+    triple = np.stack([own.model_point[linked], own.map_of[linked], own.point_of[linked]], axis=1)
+    links, first, votes = np.unique(triple, axis=0, return_index=True, return_counts=True)
+    pair, number = np.unique(links[:, :2], axis=0, return_inverse=True)
+    total = np.bincount(number.reshape(-1), weights=votes, minlength=len(pair))
+    sure = votes > 0.5 * total[number.reshape(-1)]
+    links, example = links[sure], linked[first[sure]]
+    start = np.searchsorted(model.point_of, np.arange(len(model.xyz) + 1))
+    have = set(zip(own.photo_of.tolist(), own.feature.tolist(), own.map_of.tolist(), strict=True))
+    found: list[int] = []
+    source: list[int] = []
+    for (point, map_row, _), row in zip(links.tolist(), example.tolist(), strict=True):
+        for o in range(int(start[point]), int(start[point + 1])):
+            if (int(model.photo_of[o]), int(model.keypoint_of[o]), map_row) not in have:
+                found.append(o)
+                source.append(row)
+    seen, s = np.array(found, dtype=np.int64), np.array(source, dtype=np.int64)
+    photo_of = model.photo_of[seen]
+    pixels = np.zeros((len(seen), 2))
+    for k in np.unique(photo_of):
+        mine = photo_of == k
+        pixels[mine] = keypoints[int(model.rows[k])][model.keypoint_of[seen[mine]]]
+    return Correspondences(
+        map_ids=own.map_ids,
+        photo_of=photo_of,
+        feature=model.keypoint_of[seen],
+        pixels=pixels,
+        points=own.points[s],
+        covariance=own.covariance[s],
+        map_of=own.map_of[s],
+        point_of=own.point_of[s],
+        model_point=model.point_of[seen],
+        carried=np.ones(len(seen), dtype=np.bool_),
+    )
+
+
+def _concatenate(*parts: Correspondences) -> Correspondences:
+    return Correspondences(
+        map_ids=parts[0].map_ids,
+        photo_of=np.concatenate([p.photo_of for p in parts]),
+        feature=np.concatenate([p.feature for p in parts]),
+        pixels=np.concatenate([p.pixels for p in parts]),
+        points=np.concatenate([p.points for p in parts]),
+        covariance=np.concatenate([p.covariance for p in parts]),
+        map_of=np.concatenate([p.map_of for p in parts]),
+        point_of=np.concatenate([p.point_of for p in parts]),
+        model_point=np.concatenate([p.model_point for p in parts]),
+        carried=np.concatenate([p.carried for p in parts]),
+    )
+
+
+def _empty(map_ids: tuple[str, ...]) -> Correspondences:
+    none = np.zeros(0, dtype=np.int64)
+    return Correspondences(
+        map_ids=map_ids,
+        photo_of=none,
+        feature=none,
+        pixels=np.zeros((0, 2)),
+        points=np.zeros((0, 3)),
+        covariance=np.zeros((0, 3, 3)),
+        map_of=none,
+        point_of=none,
+        model_point=none,
+        carried=np.zeros(0, dtype=np.bool_),
+    )

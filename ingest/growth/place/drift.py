@@ -1,0 +1,252 @@
+"""How far the photos of a refined reconstruction may be off, given the existing points that hold it.
+
+A similarity says how the whole may lie; that a reconstruction bends where nothing holds it any more, it does
+not. The adjustment does (`featuredb.adjust.marginals`): poses and lenses with the free points eliminated.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from featuredb.adjust.block import Block
+from featuredb.adjust.marginals import Marginals
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import Marks, Terms
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import skew
+from featuredb.geometry.sim3 import point_jacobian
+from ingest.colmap_adjust import longest_side, residuals_of
+from ingest.colmap_anchored import (
+    AnchoredOptions,
+    FixedPoints,
+    Lenses,
+    block_and_marks,
+    with_observations,
+)
+from ingest.colmap_bridge import Model
+from ingest.precision import design_effect
+
+_LEAST_FREEDOM = 0.1
+_PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DriftOptions:
+    """How the bending is judged.
+
+    Attributes:
+        least_px: of the standard deviation of an observation with what its neighbours share; it is measured
+            on the residuals, which a handful of observations keeps too small.
+        max_photos: of more, the rest is taken to be no worse; the equations are dense.
+        max_points: free points that take part; fewer know less, so the bound stays one.
+    """
+
+    least_px: float = 0.1
+    max_photos: int = 300
+    max_points: int = 20_000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhotoSpread:
+    """How far the photos of a model may be off, relative to the existing points.
+
+    Attributes:
+        poses: (k, 6, 6) of the left perturbation of each cam_from_local; NaN for photos that see nothing, and
+            for all where there are more than `DriftOptions.max_photos`.
+        turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
+            may be turned: the mean rotation of the photo and those that share most points with it. What comes
+            next is tied to such a piece. NaN as before.
+        lens_turns: (k, 3, 3) the part of `turns` that the lenses bring and that other maps have as well: all
+            but what a lens may differ by from the one that a map has lent.
+    """
+
+    poses: FloatArray
+    turns: FloatArray
+    lens_turns: FloatArray
+
+    def of(self, rows: Sequence[int]) -> "PhotoSpread":
+        """Of some of the photos."""
+        chosen = list(rows)
+        return PhotoSpread(
+            poses=self.poses[chosen], turns=self.turns[chosen], lens_turns=self.lens_turns[chosen]
+        )
+
+
+def photo_covariances(
+    model: Model,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    kept: NDArray[np.bool_],
+    lenses: Lenses,
+    adjust: AnchoredOptions,
+    options: DriftOptions,
+) -> PhotoSpread:
+    """Of all photos, relative to the existing points.
+
+    Observations count as their neighbours share, and for lenses as photos disagree about them
+    (`featuredb.adjust.lens_agreement`). By how much a lens differs from the one that a map has lent is this
+    reconstruction's alone: it may have changed since. All else that the lenses bring other maps of the same
+    cameras have as well.
+
+    Args:
+        model: refined, in metres. keypoints: of its photos.
+        fixed: existing points, those observations of `kept` (m,).
+        lenses: what is known of the model's cameras without the photos, as the adjustment had it.
+    """
+    count = len(model.rows)
+    spread = PhotoSpread(
+        poses=np.full((count, 6, 6), np.nan),
+        turns=np.full((count, 3, 3), np.nan),
+        lens_turns=np.full((count, 3, 3), np.nan),
+    )
+    if count > options.max_photos or not kept.any():
+        return spread
+    model = _thinned(model, options)
+    everything = np.ones(len(model.point_of), dtype=np.bool_)
+    block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
+    dilution = adjust.mapping.dilution
+    sigma_px = float(np.sqrt(_variance_px2(block, marks, options)))
+    terms = Terms(
+        keypoint_px=sigma_px,
+        dilution=dilution,
+        lenses=lenses.priors(model.cameras, adjust),
+        marks=replace(marks, sigma_px=sigma_px),
+    )
+    problem = Problem(block, terms)
+    found, weighted = problem.honest_marginals()
+    common = found.by_lenses() - dilution**2 * problem.by_lens_priors(weighted, lenses.lent)
+    seen = np.flatnonzero(found.pose_start >= 0)
+    for k in seen.tolist():
+        at = found.pose_start[k] + np.arange(6)
+        spread.poses[k] = found.shared[np.ix_(at, at)]
+    turn_of = _view_turns(block, found)
+    for k, piece in _pieces(model, fixed, kept, seen).items():
+        turn = turn_of[piece].mean(axis=0)
+        spread.turns[k] = turn @ found.shared @ turn.T
+        spread.lens_turns[k] = turn @ common @ turn.T
+    return spread
+
+
+def _view_turns(block: Block, found: Marginals) -> FloatArray:
+    """(k, 3, q) how what each photo sees turns about the block's axes with poses and lenses.
+
+    A principal point that is off turns the photo, and its points stay where they are: only what is left of
+    both turns what comes next.
+    """
+    result = np.zeros((len(block.names), 3, len(found.shared)))
+    for k, pose in enumerate(block.cam_from_block):
+        if found.pose_start[k] < 0:
+            continue
+        by_pose = slice(int(found.pose_start[k]), int(found.pose_start[k]) + 3)
+        result[k, :, by_pose] = pose.rotation.T
+        camera, first = block.camera(k), int(found.lens_start[block.camera_of[k]])
+        if first >= 0:
+            lens = camera.to_pycolmap()
+            focal, (cx, cy) = lens.focal_length_idxs(), lens.principal_point_idxs()
+            fx, fy = camera.params[focal[0]], camera.params[focal[-1]]
+            result[k, :, first + cx] = pose.rotation.T @ [0.0, 1.0 / fx, 0.0]
+            result[k, :, first + cy] = pose.rotation.T @ [-1.0 / fy, 0.0, 0.0]
+    return result
+
+
+def _variance_px2(block: Block, marks: Marks, options: DriftOptions) -> float:
+    """Of an observation, with what its neighbours share and what points and poses take up of it."""
+    count = 2.0 * (len(block.point_of) + len(marks.xyz))
+    taken = 3 * len(block.xyz) + 6 * len(block.names)
+    freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
+    residuals, pixels, photo_of = residuals_of(block, marks)
+    shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
+    return max(float((residuals**2).mean()) * shared / freedom, options.least_px**2)
+
+
+def _thinned(model: Model, options: DriftOptions) -> Model:
+    """The model with at most so many points, evenly chosen."""
+    if len(model.xyz) <= options.max_points:
+        return model
+    chosen = np.zeros(len(model.xyz), dtype=np.bool_)
+    chosen[np.linspace(0, len(model.xyz) - 1, options.max_points).astype(np.int64)] = True
+    return with_observations(model, chosen[model.point_of])
+
+
+def _pieces(
+    model: Model, fixed: FixedPoints, kept: NDArray[np.bool_], seen: NDArray[np.int64]
+) -> dict[int, NDArray[np.int64]]:
+    """For each photo that sees something, itself and those that share most points with it."""
+    photo = np.concatenate([model.photo_of, fixed.photo_of[kept]])
+    point = np.concatenate([model.point_of, len(model.xyz) + fixed.point_of[kept]])
+    shape = (len(model.rows), len(model.xyz) + len(fixed.xyz))
+    sees = sparse.csr_array((np.ones(len(photo)), (photo, point)), shape=shape)
+    shared = (sees @ sees.T).toarray()
+    np.fill_diagonal(shared, np.inf)
+    order = {k: np.argsort(-shared[k], kind="stable")[:_PIECE] for k in seen.tolist()}
+    return {k: rows[shared[k, rows] > 0.0] for k, rows in order.items()}
+
+
+def turning_covariance(model: Model, covariance: FloatArray, spread: PhotoSpread) -> FloatArray:
+    """(7, 7) to be added to a similarity's covariance to hold the directions of all pieces of a model.
+
+    A reconstruction that bends by centimetres at its far end has turned there, and what is tied to that end
+    goes on in the new direction: over many maps the turns are what counts. About the photos' middle.
+
+    Args:
+        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
+    """
+    seen = np.isfinite(spread.turns[:, 0, 0])
+    if not seen.any():
+        return np.zeros((7, 7))
+    more = np.zeros((3, 3))
+    for turn in spread.turns[seen]:
+        values, vectors = np.linalg.eigh(turn - covariance[1:4, 1:4] - more)
+        more += (vectors * np.maximum(values, 0.0)) @ vectors.T
+    about = _about(model.centers()[seen].mean(axis=0))
+    return np.asarray(about @ more @ about.T)
+
+
+def shared_turn(model: Model, spread: PhotoSpread) -> FloatArray:
+    """(7, 3) by what a model's end turns, about each local axis, for one sigma of its lenses; zeros for none.
+
+    Columns of a similarity's left perturbation, about the photos' middle. Maps share lenses, so that they
+    turn to the same side, map by map: along a chain such turns add up, where independent ones would not.
+    """
+    seen = np.isfinite(spread.lens_turns[:, 0, 0])
+    if not seen.any():
+        return np.zeros((7, 3))
+    turns = spread.lens_turns[seen]
+    values, vectors = np.linalg.eigh(turns[np.argmax(np.trace(turns, axis1=1, axis2=2))])
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    return np.asarray(_about(model.centers()[seen].mean(axis=0)) @ root)
+
+
+def _about(middle: FloatArray) -> FloatArray:
+    """(7, 3) left perturbations of rotations about a place."""
+    return np.vstack([np.zeros((1, 3)), np.eye(3), skew(middle)])
+
+
+def bending_variance_m2(model: Model, covariance: FloatArray, spread: FloatArray) -> float:
+    """What must be added to a similarity's covariance to hold the positions of all photos, square metres.
+
+    Added, and not multiplied: near what holds the model the similarity says millimetres, where a photo's own
+    position is good to centimetres; a factor that covers this would make metres of it at the far end.
+
+    Args:
+        model: refined, in metres.
+        covariance: (7, 7) of the similarity's left perturbation, in the local frame.
+        spread: (k, 6, 6) of `PhotoSpread`; NaN for photos that see nothing any more and say nothing.
+    """
+    seen = np.isfinite(spread[:, 0, 0])
+    if not seen.any():
+        return 0.0
+    jacobian = point_jacobian(model.centers()[seen])
+    claimed = jacobian @ covariance @ np.swapaxes(jacobian, 1, 2)
+    excess = center_covariances(model, spread)[seen] - claimed
+    return float(max(0.0, np.linalg.eigvalsh(excess)[:, -1].max()))
+
+
+def center_covariances(model: Model, spread: FloatArray) -> FloatArray:
+    """(k, 3, 3) square metres, of the photos' centres in the local frame, from those of their poses."""
+    turns = np.array([pose.rotation for pose in model.cam_from_sfm])
+    centers = np.swapaxes(turns, 1, 2) @ spread[:, 3:, 3:] @ turns
+    return np.asarray((centers + np.swapaxes(centers, 1, 2)) / 2)

@@ -1,0 +1,287 @@
+"""Step: localised photos that no reconstruction holds form groups where two-view geometry bears them out.
+
+Each of them was placed by matches with existing points. Matches between two of them are something else: if
+their geometry, estimated without any pose, fits the two poses, two independent statements agree. A single
+localised photo is never enough.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from ingest.colmap_anchored import (
+    AnchoredOptions,
+    FixedPoints,
+    Lenses,
+    adjust_anchored,
+    triangulate_posed,
+)
+from ingest.colmap_bridge import Model, SfmPhoto, TwoView, verify_pair
+from ingest.growth.place.localised import in_frame
+from ingest.growth.values import FeaturesOf, LocalisedPhoto
+from ingest.matching import MatchOptions, mutual_matches
+
+_REFERENCE_SIDE_PX = 1600.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroupOptions:
+    """When two localised photos vouch for each other.
+
+    Attributes:
+        partners: photos that each one is compared with, those first that share most existing points.
+        max_features: of each photo, strongest and best spread first.
+        matching: and verification of pairs, as for reconstruction.
+        tolerance_px: of a match against the two poses, at images of 1600 pixels: two poses, each good to
+            the 4 px of their inliers.
+        min_fitting: share of a pair's verified matches that must fit the poses.
+        min_angle_deg: median angle between the rays. Below, any two photos from one spot fit, and two copies
+            of one picture.
+        min_known: photos of existing maps that a new photo without another new one needs.
+    """
+
+    partners: int = 6
+    max_features: int = 6000
+    matching: MatchOptions = field(default_factory=MatchOptions)
+    tolerance_px: float = 8.0
+    min_fitting: float = 0.7
+    min_angle_deg: float = 1.0
+    min_known: int = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairCheck:
+    """What two photos say of each other's poses.
+
+    Attributes:
+        pair: their rows.
+        verified: matches with a two-view geometry of their own.
+        fitting: share of these that fits the two poses.
+        angle_deg: median angle between the rays of those that fit.
+    """
+
+    pair: tuple[int, int]
+    verified: int
+    fitting: float
+    angle_deg: float
+
+    def agrees(self, options: GroupOptions) -> bool:
+        """Whether the pair bears the two poses out."""
+        return (
+            self.verified >= options.matching.min_inliers
+            and self.fitting >= options.min_fitting
+            and self.angle_deg >= options.min_angle_deg
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Group:
+    """Photos that vouch for each other.
+
+    Attributes:
+        model: of their matches alone, with the lenses of the localisations; near their poses.
+        new: rows that are new; the other rows of the model are photos of existing maps.
+        checks: of the pairs that agree.
+    """
+
+    model: Model
+    new: tuple[int, ...]
+    checks: tuple[PairCheck, ...]
+
+
+def lone_groups(
+    localised: Mapping[int, LocalisedPhoto],
+    new: Sequence[int],
+    features_of: FeaturesOf,
+    options: GroupOptions | None = None,
+) -> tuple[list[Group], dict[int, str]]:
+    """Groups among localised photos, and for the new photos in none the reason.
+
+    Args:
+        localised: lone new photos and, if there are any, photos of existing maps that were localised
+            again, by row.
+        new: which of them are new.
+    """
+    options = options or GroupOptions()
+    if not localised:
+        return [], {}
+    frame = next(iter(localised.values())).frame
+    photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
+    geometries: dict[tuple[int, int], TwoView] = {}
+    checks: list[PairCheck] = []
+    for pair in candidate_pairs(photos, set(new), options):
+        view = _verified(photos, pair, features_of, options)
+        check = check_pair(photos[pair[0]], photos[pair[1]], view, features_of, options)
+        if check.agrees(options):
+            geometries[pair] = view
+            checks.append(check)
+    reasons = dict.fromkeys(new, "ALONE: no other photo bears its pose out")
+    groups: list[Group] = []
+    for rows in _connected(sorted(photos), [c.pair for c in checks]):
+        fresh = tuple(r for r in rows if r in set(new))
+        if not fresh or len(rows) < 2:
+            continue
+        if len(fresh) == 1 and len(rows) - 1 < options.min_known:
+            reasons[fresh[0]] = (
+                f"ALONE: {len(rows) - 1} photos of existing maps bear its pose out, "
+                f"{options.min_known} are needed"
+            )
+            continue
+        own = tuple(c for c in checks if c.pair[0] in rows)
+        model = _triangulated(rows, photos, {c.pair: geometries[c.pair] for c in own}, features_of)
+        groups.append(Group(model=model, new=fresh, checks=own))
+        for r in fresh:
+            reasons.pop(r)
+    return groups, reasons
+
+
+def candidate_pairs(
+    photos: Mapping[int, LocalisedPhoto], new: set[int], options: GroupOptions
+) -> list[tuple[int, int]]:
+    """Pairs with a new photo that share existing points or look at the same place, most shared first."""
+    seen = {
+        r: {(p.map_ids[m], q) for m, q in zip(p.map_of.tolist(), p.point_of.tolist(), strict=True)}
+        for r, p in photos.items()
+    }
+    scene = {r: np.median(p.points, axis=0) for r, p in photos.items()}
+    reach = {
+        r: float(np.median(np.linalg.norm(p.points - p.cam_from_local.center, axis=1)))
+        for r, p in photos.items()
+    }
+    pairs: set[tuple[int, int]] = set()
+    for r in sorted(new):
+        scores = []
+        for other in photos:
+            if other == r:
+                continue
+            shared = len(seen[r] & seen[other])
+            gap = float(np.linalg.norm(scene[r] - scene[other]))
+            if shared or gap < 0.5 * min(reach[r], reach[other]):
+                scores.append((-shared, gap, other))
+        for _, _, other in sorted(scores)[: options.partners]:
+            pairs.add((min(r, other), max(r, other)))
+    return sorted(pairs)
+
+
+def _verified(
+    photos: Mapping[int, LocalisedPhoto],
+    pair: tuple[int, int],
+    features_of: FeaturesOf,
+    options: GroupOptions,
+) -> TwoView:
+    """Two-view geometry of the pair; the lenses are those of the localisations, no pose takes part."""
+    a, b = (features_of(r).features for r in pair)
+    count = options.max_features
+    matches = mutual_matches(a.descriptors[:count], b.descriptors[:count], options.matching)
+    side = max(a.width, a.height, b.width, b.height)
+    return verify_pair(
+        photos[pair[0]].camera,
+        a.xy,
+        photos[pair[1]].camera,
+        b.xy,
+        matches,
+        focal_known=True,
+        max_error_px=options.matching.max_error_px * max(1.0, side / _REFERENCE_SIDE_PX),
+        seed=options.matching.seed,
+    )
+
+
+def check_pair(
+    a: LocalisedPhoto, b: LocalisedPhoto, view: TwoView, features_of: FeaturesOf, options: GroupOptions
+) -> PairCheck:
+    """How far a pair's verified matches fit the two localised poses, both in one frame."""
+    pixels_a = features_of(a.row).features.xy[view.inliers[:, 0]].astype(np.float64)
+    pixels_b = features_of(b.row).features.xy[view.inliers[:, 1]].astype(np.float64)
+    if not len(pixels_a):
+        return PairCheck(pair=(a.row, b.row), verified=0, fitting=0.0, angle_deg=0.0)
+    points, angle = intersections(a.camera, a.cam_from_local, pixels_a, b.camera, b.cam_from_local, pixels_b)
+    fits = np.ones(len(points), dtype=np.bool_)
+    for camera, pose, pixels in (
+        (a.camera, a.cam_from_local, pixels_a),
+        (b.camera, b.cam_from_local, pixels_b),
+    ):
+        error = np.linalg.norm(camera.project(pose.act(points)) - pixels, axis=1)
+        limit = options.tolerance_px * max(1.0, max(camera.width, camera.height) / _REFERENCE_SIDE_PX)
+        fits &= np.where(np.isfinite(error), error, np.inf) < limit
+    return PairCheck(
+        pair=(a.row, b.row),
+        verified=len(points),
+        fitting=float(fits.mean()),
+        angle_deg=float(np.median(np.degrees(angle[fits]))) if fits.any() else 0.0,
+    )
+
+
+def intersections(
+    camera_a: Camera,
+    pose_a: Rigid3,
+    pixels_a: FloatArray,
+    camera_b: Camera,
+    pose_b: Rigid3,
+    pixels_b: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Midpoints (m, 3) of the shortest lines between the rays of pixel pairs, and the rays' angles (rad)."""
+    ray_a, ray_b = _rays(camera_a, pose_a, pixels_a), _rays(camera_b, pose_b, pixels_b)
+    base = pose_b.center - pose_a.center
+    cosine = np.einsum("mi,mi->m", ray_a, ray_b)
+    sine2 = np.maximum(1.0 - cosine**2, 1e-12)
+    along_a, along_b = ray_a @ base, ray_b @ base
+    depth_a = (along_a - cosine * along_b) / sine2
+    depth_b = (cosine * along_a - along_b) / sine2
+    middle = 0.5 * (pose_a.center + depth_a[:, None] * ray_a + pose_b.center + depth_b[:, None] * ray_b)
+    return middle, np.arccos(np.clip(cosine, -1.0, 1.0))
+
+
+def _rays(camera: Camera, pose: Rigid3, pixels: FloatArray) -> FloatArray:
+    """Unit vectors (m, 3) in the local frame; along the axis for pixels that the lens cannot reach."""
+    xy = np.nan_to_num(camera.unproject(pixels))
+    rays = np.column_stack([xy, np.ones(len(xy))]) @ pose.rotation
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _connected(rows: Sequence[int], pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
+    place = {r: k for k, r in enumerate(rows)}
+    a: NDArray[np.int64] = np.array([place[p] for p, _ in pairs], dtype=np.int64)
+    b: NDArray[np.int64] = np.array([place[q] for _, q in pairs], dtype=np.int64)
+    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(rows), len(rows)))
+    count, label = connected_components(graph, directed=False)
+    return [tuple(r for r, of in zip(rows, label, strict=True) if of == c) for c in range(count)]
+
+
+def _triangulated(
+    rows: Sequence[int],
+    photos: Mapping[int, LocalisedPhoto],
+    geometries: Mapping[tuple[int, int], TwoView],
+    features_of: FeaturesOf,
+) -> Model:
+    """A model of the group from its verified matches; rows are those of the photos.
+
+    The localisations' poses are the start; then the model is adjusted to its matches alone, in a gauge of its
+    own. Whether it still fits the localisations is asked when it is placed, as of any reconstruction.
+    """
+    place = {r: k for k, r in enumerate(rows)}
+    cameras = list(dict.fromkeys(photos[r].camera for r in rows))
+    sfm = [
+        SfmPhoto(
+            name=str(r),
+            camera_row=cameras.index(photos[r].camera),
+            keypoints=features_of(r).features.xy,
+        )
+        for r in rows
+    ]
+    model = triangulate_posed(
+        cameras,
+        sfm,
+        [photos[r].cam_from_local for r in rows],
+        {(place[a], place[b]): view for (a, b), view in geometries.items()},
+    )
+    keypoints = [sfm[int(k)].keypoints.astype(np.float64) for k in model.rows]
+    lenses = Lenses(held=range(len(model.cameras)))
+    free = adjust_anchored(model, keypoints, FixedPoints.none(), lenses, AnchoredOptions()).model
+    return replace(free, rows=np.array([rows[int(k)] for k in model.rows], dtype=np.int64))

@@ -1,0 +1,312 @@
+"""Step: a reconstruction without a place of its own is placed by the existing maps, or refused.
+
+Photos localise by themselves; the similarity that most of them agree with is fitted to all pixels in which
+they see existing points; then gates ask whether to believe it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.index.area import Area
+from ingest.colmap_bridge import Model
+from ingest.growth import gates
+from ingest.growth.gates import Gate
+from ingest.growth.map_places import at_most_places, place_sigmas_m
+from ingest.growth.place.contradictions import center_variance_m2
+from ingest.growth.place.correspondences import Correspondences
+from ingest.growth.place.parents import ParentOptions, edges_of, parents_covariance
+from ingest.growth.place.similarity_fit import (
+    Fit,
+    FitOptions,
+    agreeing_photos,
+    fit_similarity,
+    proposals,
+    rank_proposals,
+    tolerances_px,
+)
+from ingest.growth.place.visibility import ShownParts, VisibilityOptions, shown_parts
+from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
+from ingest.photo import Photo
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacementOptions:
+    """When a placement is believed. `tools/growth_portions.py` prints the figures of real sets.
+
+    Attributes:
+        fit: how the similarity is found.
+        min_agreeing: photos; one alone proves nothing.
+        max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
+            above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
+        min_shared_points: distinct points of the parents; twice what a single pose needs.
+        max_rim_sigma: at the rim of the model, over the viewing distance; further off, over the distance.
+        max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
+            Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
+            look-alike place shows in pixels long before.
+        max_rival: share of photos that agree with another placement.
+        rival_views: placements count as different if they move the model's photos by more than this share
+            of the viewing distance.
+        max_against_gps: share of the photos with a position.
+        visibility: what a photo must show.
+        max_blind: share of photos that show less of the existing points. Single ones are left out
+            (`MapsPlacement.blind`).
+        parents: when an existing map is one of them.
+    """
+
+    fit: FitOptions = field(default_factory=FitOptions)
+    min_agreeing: int = 2
+    max_disagreeing: float = 0.34
+    min_shared_points: int = 30
+    max_rim_sigma: float = 0.02
+    max_residual: float = 0.01
+    max_rival: float = 0.5
+    rival_views: float = 0.05
+    max_against_gps: float = 0.5
+    visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
+    max_blind: float = 0.34
+    parents: ParentOptions = field(default_factory=ParentOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Held:
+    """A placement with what it rests on.
+
+    Attributes:
+        correspondences: all of the model's. fit: over those that agree; None where nothing fits.
+        used: (m,) correspondences that agree with the placement.
+    """
+
+    placement: MapsPlacement
+    correspondences: Correspondences
+    fit: Fit | None
+    used: NDArray[np.bool_]
+
+
+def place_by_maps(
+    model: Model,
+    localised: Mapping[int, LocalisedPhoto],
+    correspondences: Correspondences,
+    photos: Sequence[Photo],
+    areas: Sequence[Area],
+    frame: LocalFrame,
+    options: PlacementOptions,
+) -> Held:
+    """Place a model by the localisations of its photos.
+
+    Args:
+        model: with the lenses that it keeps.
+        localised: by row of the photos, in `frame`. Rows that are not in the model are ignored.
+        correspondences: of the model, in `frame`.
+        photos: all new photos, for their positions.
+        areas: that hold the existing maps.
+    """
+    own = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
+    ranked = rank_proposals(
+        model, proposals(model, localised, correspondences, options.fit), correspondences, options.fit
+    )
+    found = None
+    if ranked and len(ranked[0][1]) >= 1:
+        found = _settled(model, ranked[0][0], ranked[0][1], own, correspondences, options)
+    if found is None:
+        gate = gates.agreeing_photos(0 if not ranked else len(ranked[0][1]), options.min_agreeing)
+        placement = MapsPlacement(
+            reason=gate.reason,
+            message=f"no placement: {gate.message}",
+            frame=frame,
+            disagreeing=tuple(localised_rows(model, own)),
+            gates=(gate,),
+        )
+        return Held(
+            placement=placement,
+            correspondences=correspondences,
+            fit=None,
+            used=np.zeros(len(correspondences), dtype=np.bool_),
+        )
+    fit, agree = found
+    used = np.isin(correspondences.photo_of, list(agree)) | correspondences.carried
+    used &= fit.errors_px < tolerances_px(model, correspondences, options.fit.tolerance_rel)
+    maps = {m.map_id: m for area in areas for m in area.maps}
+    edges = edges_of(model, fit, correspondences, used, options.parents, options.fit)
+    on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
+    sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
+    shows = shown_parts(model, sim, held, areas, frame, options.visibility)
+    blind = _blind(shows, agree, own.keys() - agree, options.visibility)
+    asked = _ask(
+        model, fit, agree, own, held, shows.existing, edges, photos, frame, on_earth, ranked, options
+    )
+    refusal = gates.first_refusal(asked)
+    placement = MapsPlacement(
+        reason=refusal.reason if refusal else None,
+        message=refusal.message if refusal else f"placed by {', '.join(e.map_id for e in edges)}",
+        frame=frame,
+        local_from_sfm=fit.local_from_sfm,
+        covariance_relative=fit.covariance,
+        covariance=fit.covariance + on_earth,
+        agreeing=tuple(int(model.rows[k]) for k in sorted(agree)),
+        disagreeing=tuple(int(model.rows[k]) for k in sorted(set(own) - agree)),
+        blind=tuple(int(model.rows[k]) for k in sorted(blind)),
+        edges=edges,
+        residual_rms_m=_rms(_center_offsets(model, fit.local_from_sfm, own, agree)),
+        gates=asked,
+    )
+    return Held(placement=placement, correspondences=correspondences, fit=fit, used=used)
+
+
+def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: VisibilityOptions) -> set[int]:
+    """Photos that show too little of what they should; those that disagree are left out as such."""
+    little = set(np.flatnonzero(shows.witnessed < options.min_witnessed).tolist()) - disagree
+    return little | {k for k in agree if shows.existing[k] < options.min_visible}
+
+
+def localised_rows(model: Model, own: Mapping[int, LocalisedPhoto]) -> list[int]:
+    """Rows of the photos of the model's photos."""
+    return [int(model.rows[k]) for k in sorted(own)]
+
+
+def _settled(
+    model: Model,
+    start: Sim3,
+    agree: NDArray[np.int64],
+    own: Mapping[int, LocalisedPhoto],
+    correspondences: Correspondences,
+    options: PlacementOptions,
+) -> tuple[Fit, set[int]] | None:
+    """The fit to the photos that agree with it, and these; None where no photo does."""
+    tolerance = tolerances_px(model, correspondences, options.fit.tolerance_rel)
+    chosen: set[int] = {int(k) for k in agree}
+    sim, fit = start, None
+    for _ in range(5):  # the set of photos settles in two or three rounds
+        near = np.isin(correspondences.photo_of, list(chosen)) | correspondences.carried
+        if fit is not None:
+            near &= fit.errors_px < 2.0 * tolerance
+        if near.sum() < 4:
+            return None
+        fit = fit_similarity(model, sim, correspondences, near, options.fit)
+        sim = fit.local_from_sfm
+        agreed = agreeing_photos(fit.errors_px, tolerance, correspondences, options.fit.least_share)
+        again = {int(k) for k in agreed} & own.keys()
+        if not again:
+            return None
+        if again == chosen:
+            break
+        chosen = again
+    assert fit is not None
+    return fit, chosen
+
+
+def _center_offsets(
+    model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]
+) -> FloatArray:
+    """(n, 3) metres, from the placed to the localised centres of the photos that agree."""
+    return np.array(
+        [own[k].cam_from_local.center - sim.act(model.cam_from_sfm[k].center) for k in sorted(agree)]
+    ).reshape(-1, 3)
+
+
+def _ask(
+    model: Model,
+    fit: Fit,
+    agree: set[int],
+    own: Mapping[int, LocalisedPhoto],
+    held: Correspondences,
+    shows: FloatArray,
+    edges: Sequence[Edge],
+    photos: Sequence[Photo],
+    frame: LocalFrame,
+    on_earth: FloatArray,
+    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
+    options: PlacementOptions,
+) -> tuple[Gate, ...]:
+    sim = fit.local_from_sfm
+    centers = sim.act(model.centers())
+    reach = (
+        float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
+    )
+    rivals = _rival_photos(model, sim, ranked, agree, reach, options)
+    offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
+    return (
+        gates.agreeing_photos(len(agree), options.min_agreeing),
+        gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
+        gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
+        gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
+        gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
+        gates.runner_up(rivals, len(agree), options.max_rival),
+        gates.geotags(
+            offsets_gps, spreads_gps, options.max_against_gps, by=", ".join(e.map_id for e in edges)
+        ),
+        gates.visibility(shows[np.isfinite(shows)], options.visibility.min_visible, options.max_blind),
+    )
+
+
+def _rim_sigma_m(model: Model, fit: Fit, reach_m: float) -> float:
+    """How well the model's points and cameras are held; what lies further off than the reach, as seen there.
+
+    A tower on the horizon may be off by its share of its distance, as a house is by that of its own.
+    """
+    sim = fit.local_from_sfm
+    centers, points = sim.act(model.centers()), sim.act(model.xyz[:: max(1, len(model.xyz) // 2000)])
+    away = np.linalg.norm(points - centers.mean(axis=0), axis=1)
+    at_reach = place_sigmas_m(fit.covariance, points) * np.minimum(1.0, reach_m / np.maximum(away, 1e-9))
+    return at_most_places(np.concatenate([place_sigmas_m(fit.covariance, centers), at_reach]))
+
+
+def _rival_photos(
+    model: Model,
+    sim: Sim3,
+    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
+    agree: set[int],
+    reach_m: float,
+    options: PlacementOptions,
+) -> int:
+    """Most photos, not agreeing with the placement, that agree with a proposal elsewhere."""
+    here = sim.act(model.centers())
+    most = 0
+    for other, photos in ranked:
+        beside = [int(k) for k in photos if int(k) not in agree]
+        apart = float(np.median(np.linalg.norm(other.act(model.centers()) - here, axis=1)))
+        if len(beside) > most and apart > options.rival_views * reach_m:
+            most = len(beside)
+    return most
+
+
+def _against_positions(
+    model: Model, centers: FloatArray, photos: Sequence[Photo], frame: LocalFrame, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Horizontal offsets (n, 2) of the placed centres from the photos' positions, covariances (n, 2, 2).
+
+    Heights of photos are rarely in a known datum.
+    """
+    offsets, spreads = [], []
+    for center, row in zip(centers, model.rows.tolist(), strict=True):
+        gps = photos[row].gps
+        if gps is None:
+            continue
+        height = float(frame.geodetic_from_enu(center)[2])
+        place = frame.enu_from_geodetic([gps.latitude_deg, gps.longitude_deg, height])
+        jacobian = point_jacobian(center)[:2]
+        offsets.append((center - place)[:2])
+        spreads.append(jacobian @ covariance @ jacobian.T + np.eye(2) * gps.sigma_horizontal_m**2)
+    return np.array(offsets).reshape(-1, 2), np.array(spreads).reshape(-1, 2, 2)
+
+
+def _typical_excess_m(model: Model, sim: Sim3, own: Mapping[int, LocalisedPhoto], agree: set[int]) -> float:
+    """Median distance of the localised centres from the placed ones beyond what they are uncertain by.
+
+    Photos at the rim of a map are localised badly, which bends no model.
+    """
+    if not agree:
+        return float("nan")
+    squares = (_center_offsets(model, sim, own, agree) ** 2).sum(axis=1)
+    own_m2 = np.array([center_variance_m2(own[k]) for k in sorted(agree)])
+    return float(np.sqrt(np.median(np.maximum(squares - own_m2, 0.0))))
+
+
+def _rms(offsets: FloatArray) -> float:
+    """Root mean square length of (n, 3)."""
+    return float(np.sqrt((offsets**2).sum(axis=1).mean())) if len(offsets) else float("nan")

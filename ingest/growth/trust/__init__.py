@@ -1,0 +1,1 @@
+"""Who says so: confirmation by independent sources, scans, known answers, promotion."""

@@ -1,0 +1,341 @@
+"""Canaries: photos whose right answer is known are asked before and after a map would be promoted.
+
+A regression is a canary that was answered rightly and no longer is, or a photo of elsewhere that now finds a
+place. Beside those of the database, images of the active maps serve: their observations are features of
+photos, so they can be asked again without any file. Their answer leans on their own map and moves less than
+a stranger's would; what they show is an answer that the new map takes away, makes ambiguous or pulls along,
+and, asked of the new map alone, a new map that shows their place somewhere else.
+"""
+
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from featuredb.features.decode import DecodeLimits, decode_gray
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.features.features import Features
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.store import Database
+from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
+from ingest.growth.map_images import features_of_image
+from reloc.localise import localise_features
+from reloc.localiser import Localiser
+from reloc.options import LocaliseOptions
+from reloc.result import LocalisedPose, LocaliseRequest, LocaliseResult
+from reloc.service.handler import localise_request
+from reloc.wire import LocaliseWireRequest
+
+Verdict = Literal["right", "lost", "moved", "found", "not_found"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanaryOptions:
+    """Which images of maps are asked, and what counts as moved.
+
+    Attributes:
+        own_near: images of active maps around the new one. own_elsewhere: from the rest of the database.
+        near_m: how far from the new map's box "around" reaches.
+        min_features: observations with descriptors that an image needs to be asked; an answer has at least
+            15 inliers, and a third of the features of a good image are.
+        tolerance_m, tolerance_deg: of an own image's answer; half the drift budget's order, and well above
+            what new points within their sigma move a pose by.
+        sigmas: an answer by the new map alone may miss by so many of its own standard deviations instead,
+            if that is more.
+        limits: sizes of images that are decoded.
+    """
+
+    own_near: int = 8
+    own_elsewhere: int = 4
+    near_m: float = 50.0
+    min_features: int = 60
+    tolerance_m: float = 0.5
+    tolerance_deg: float = 1.0
+    sigmas: float = 3.0
+    limits: DecodeLimits = field(default_factory=DecodeLimits)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanaryCheck:
+    """One canary.
+
+    Attributes:
+        name: for people.
+        before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
+        error_before_m, error_m: of the answers; NaN where there is none.
+        regression: why it is one, "" where it is none.
+    """
+
+    name: str
+    before: Verdict
+    after: Verdict
+    alone: Verdict | Literal[""] = ""
+    error_before_m: float = float("nan")
+    error_m: float = float("nan")
+    regression: str = ""
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "before": self.before,
+            "after": self.after,
+            "alone": self.alone,
+            "error_m": None if np.isnan(self.error_m) else round(self.error_m, 4),
+            "regression": self.regression,
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CanaryRun:
+    """All canaries; `note` says where they come from."""
+
+    checks: tuple[CanaryCheck, ...]
+    note: str
+
+    @property
+    def regressions(self) -> tuple[CanaryCheck, ...]:
+        return tuple(check for check in self.checks if check.regression)
+
+    @property
+    def message(self) -> str:
+        if not self.regressions:
+            return f"{len(self.checks)} canaries answered as before ({self.note})"
+        first = self.regressions[0]
+        count = f"{len(self.regressions)} of {len(self.checks)} canaries regress"
+        return f"{count}: {first.name}: {first.regression}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Miss:
+    """How far an answer is from what is known."""
+
+    metres: float
+    degrees: float
+    sigma_m: float
+
+
+def run_canaries(
+    database: Database,
+    before: Localiser,
+    after: Localiser,
+    new_maps: Sequence[FeatureMap],
+    options: CanaryOptions | None = None,
+) -> CanaryRun:
+    """Ask all known queries and images of the maps, before and after.
+
+    Args:
+        before: the active maps. after: the same with the new ones.
+        new_maps: which are asked alone, too.
+
+    Raises:
+        StoreError, CanaryNotFoundError: a canary's image cannot be read.
+    """
+    options = options or CanaryOptions()
+    known = list_canaries(database)
+    checks = [check_known(database, canary, before, after, options) for canary in known]
+    own = own_canaries(before, new_maps, options)
+    checks += [
+        _check_own(feature_map, image, before, after, [m.map_id for m in new_maps], options)
+        for feature_map, image in own
+    ]
+    note = f"{len(known)} known queries, {len(own)} images of the active maps"
+    if not known:
+        note += "; the database has no known queries, `featuredb canary add` adds them"
+    return CanaryRun(checks=tuple(checks), note=note)
+
+
+def check_known(
+    database: Database, canary: Canary, before: Localiser, after: Localiser, options: CanaryOptions
+) -> CanaryCheck:
+    """Ask one known query of both."""
+    data = load_canary_image(database, canary)
+    gray = decode_gray(data, options.limits)
+    asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
+    request = localise_request(asked, data, gray)
+    results = [localiser.localise(gray, request) for localiser in (before, after)]
+    verdicts = [known_verdict(result, canary.pose) for result in results]
+    miss = _miss_of_known(results[1].pose, canary.pose)
+    return CanaryCheck(
+        name=canary.name,
+        before=verdicts[0],
+        after=verdicts[1],
+        error_before_m=_metres(_miss_of_known(results[0].pose, canary.pose)),
+        error_m=_metres(miss),
+        regression=_regression(verdicts[0], verdicts[1], miss, results[1]),
+    )
+
+
+def answer_now(
+    database: Database, image: bytes, tolerance_m: float, tolerance_deg: float
+) -> tuple[KnownPose | None, int]:
+    """What the active maps answer to a photo, as what is known of it; None where they do not localise it.
+
+    Raises:
+        ImageError: no usable image.
+    """
+    localiser = Localiser.open(database)
+    gray = decode_gray(image, DecodeLimits())
+    result = localiser.localise(gray, localise_request(LocaliseWireRequest(), image, gray))
+    if result.pose is None:
+        return None, localiser.snapshot
+    known = KnownPose(
+        epsg=result.pose.epsg,
+        utm=result.pose.utm,
+        height_datum=result.pose.height_datum,
+        cam_from_utm_xyzw=result.pose.cam_from_utm_xyzw,
+        tolerance_m=tolerance_m,
+        tolerance_deg=tolerance_deg,
+    )
+    return known, localiser.snapshot
+
+
+def known_verdict(result: LocaliseResult, expected: KnownPose | None) -> Verdict:
+    """What an answer to a known query is worth."""
+    if expected is None:
+        return "not_found" if result.pose is None else "found"
+    miss = _miss_of_known(result.pose, expected)
+    if miss is None:
+        return "lost"
+    near = miss.metres <= expected.tolerance_m and miss.degrees <= expected.tolerance_deg
+    return "right" if near else "moved"
+
+
+def own_canaries(
+    before: Localiser, new_maps: Sequence[FeatureMap], options: CanaryOptions
+) -> list[tuple[FeatureMap, MapImage]]:
+    """Images of the active maps that can be asked: those around the new maps, some from elsewhere.
+
+    The choice hangs on the images' names only, so that another run asks the same.
+    """
+    near: list[tuple[str, FeatureMap, MapImage]] = []
+    far: list[tuple[str, FeatureMap, MapImage]] = []
+    boxes = [_box(m) for m in new_maps if len(m.points)]
+    for indexed in before.areas:
+        for feature_map in indexed.area.maps:
+            count = _described(feature_map)
+            for image in feature_map.images:
+                if count.get(image.image_id, 0) < options.min_features:
+                    continue
+                key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
+                around = any(_near(feature_map, image, frame, box, options.near_m) for frame, box in boxes)
+                (near if around else far).append((key, feature_map, image))
+    chosen = sorted(near, key=lambda e: e[0])[: options.own_near]
+    chosen += sorted(far, key=lambda e: e[0])[: options.own_elsewhere]
+    return [(feature_map, image) for _, feature_map, image in chosen]
+
+
+def _check_own(
+    feature_map: FeatureMap,
+    image: MapImage,
+    before: Localiser,
+    after: Localiser,
+    new_ids: Sequence[str],
+    options: CanaryOptions,
+) -> CanaryCheck:
+    """Ask an image of a map of both, and of the new maps alone."""
+    features = features_of_image(feature_map, image)
+    request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
+    results = [
+        _ask(features, request, before, None),
+        _ask(features, request, after, None),
+        _ask(features, request, after, tuple(new_ids)),
+    ]
+    misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
+    verdicts = [_own_verdict(miss, options, sigmas=0.0) for miss in misses[:2]]
+    alone = _own_verdict(misses[2], options, sigmas=options.sigmas)
+    regression = _regression(verdicts[0], verdicts[1], misses[1], results[1])
+    if not regression and alone == "moved" and misses[2] is not None:
+        regression = (
+            f"the new map alone has it {misses[2].metres:.2f} m and {misses[2].degrees:.2f} degrees "
+            "from where it is"
+        )
+    return CanaryCheck(
+        name=f"{image.name} of map {feature_map.map_id}",
+        before=verdicts[0],
+        after=verdicts[1],
+        alone=alone,
+        error_before_m=_metres(misses[0]),
+        error_m=_metres(misses[1]),
+        regression=regression,
+    )
+
+
+def _ask(
+    features: Features, request: LocaliseRequest, localiser: Localiser, map_ids: tuple[str, ...] | None
+) -> LocaliseResult:
+    areas = [a for a in localiser.areas_of(map_ids) if a.area.extractor_fingerprint == features.fingerprint]
+    upright = "-upright-" in features.fingerprint
+    options = LocaliseOptions(extractor=ExtractorOptions(upright=upright))
+    return localise_features(features, request, areas, options).result
+
+
+def _regression(before: Verdict, after: Verdict, miss: _Miss | None, result: LocaliseResult) -> str:
+    if after in ("right", "not_found") or before not in ("right", "not_found"):
+        return ""
+    if after == "found":
+        return "a photo of elsewhere now finds a place"
+    if miss is None:
+        return f"no longer localised: {result.reason}: {result.detail}"
+    return f"now {miss.metres:.2f} m and {miss.degrees:.2f} degrees off"
+
+
+def _own_verdict(miss: _Miss | None, options: CanaryOptions, sigmas: float) -> Verdict:
+    if miss is None:
+        return "lost"
+    metres = max(options.tolerance_m, sigmas * miss.sigma_m)
+    return "right" if miss.metres <= metres and miss.degrees <= options.tolerance_deg else "moved"
+
+
+def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:
+    if pose is None or expected is None:
+        return None
+    where = pose.frame.enu_from_utm(expected.utm, expected.epsg)
+    cam_from_grid = matrix_from_quaternion(expected.cam_from_utm_xyzw)
+    cam_from_local = cam_from_grid @ pose.frame.grid_from_enu(where, expected.epsg)
+    return _miss(pose, where, cam_from_local)
+
+
+def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: MapImage) -> _Miss | None:
+    if pose is None:
+        return None
+    expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
+    return _miss(pose, expected.center, expected.rotation)
+
+
+def _metres(miss: _Miss | None) -> float:
+    return float("nan") if miss is None else miss.metres
+
+
+def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:
+    turn = pose.cam_from_local.rotation @ cam_from_local.T
+    return _Miss(
+        metres=float(np.linalg.norm(pose.cam_from_local.center - center)),
+        degrees=float(np.degrees(rotation_angle(turn))),
+        sigma_m=float(np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
+    )
+
+
+def _described(feature_map: FeatureMap) -> dict[int, int]:
+    """Observations with descriptors of each image."""
+    seen = feature_map.observations
+    ids, counts = np.unique(seen.image_id[seen.has_descriptor], return_counts=True)
+    return {int(i): int(n) for i, n in zip(ids, counts, strict=True)}
+
+
+def _box(feature_map: FeatureMap) -> tuple[LocalFrame, FloatArray]:
+    """Plan box (2, 2) of a map's points, without the few wild ones, and its frame."""
+    points = feature_map.points_local()[:, :2]
+    return feature_map.frame, np.percentile(points, (2, 98), axis=0)
+
+
+def _near(
+    feature_map: FeatureMap, image: MapImage, frame: LocalFrame, box: FloatArray, margin_m: float
+) -> bool:
+    center = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
+    return bool((center >= box[0] - margin_m).all() and (center <= box[1] + margin_m).all())

@@ -1,0 +1,230 @@
+"""Photos that look at a quarantined map from outside, localised in it alone: of other maps, and new ones."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.index.area import build_area
+from featuredb.index.descriptor_index import build_index
+from featuredb.maps.feature_map import FeatureMap, MapImage
+from ingest.growth.map_images import features_and_points
+from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_each
+from ingest.growth.place.overlaps import localise_image
+from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witness, independent, source_of
+from ingest.growth.values import FeaturesOf, LocalisedPhoto
+from ingest.pairs import Pair
+from ingest.photo import Photo
+from reloc.candidates import IndexedArea
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WitnessOptions:
+    """Who is asked.
+
+    Attributes:
+        max_images: of other maps, nearest to the map's own cameras first.
+        near_m: images of other maps whose camera is within the map's box and so far around it are asked.
+        min_features: observations with descriptors that an image needs.
+        sigmas, least_m: a photo whose place is known contradicts the map if the map has it further away than
+            so many standard deviations of both, and than that length.
+    """
+
+    max_images: int = 24
+    near_m: float = 50.0
+    min_features: int = 60
+    sigmas: float = 3.0
+    least_m: float = 0.5
+    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NewPhotos:
+    """New photos that may be witnesses.
+
+    Attributes:
+        rows: of `photos` that may be asked.
+        localised: those that the active maps localise, by row.
+        heard: what photos said of maps before, by the map's write and row; None where they do not see it. A
+            map is examined again whenever another one changes, and its own photos are the same.
+        overlaps: pairs of `photos` that show the same, as their matches say; None: not known. Of a map that
+            is made of `photos`, those are asked that overlap with one of its own.
+    """
+
+    photos: Sequence[Photo]
+    rows: Sequence[int]
+    features_of: FeaturesOf
+    localised: dict[int, LocalisedPhoto]
+    heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
+    overlaps: Collection[Pair] | None = None
+
+    def that_may_see(self, feature_map: FeatureMap) -> list[int]:
+        """Rows of those that may be asked about a map."""
+        if self.overlaps is None:
+            return list(self.rows)
+        names = {image.sha256 for image in feature_map.images}
+        own = {row for row, photo in enumerate(self.photos) if photo.sha256 in names}
+        if len(own) < len(names):  # whose matches with these photos nobody has looked at
+            return list(self.rows)
+        beside = {j for i, j in self.overlaps if i in own} | {i for i, j in self.overlaps if j in own}
+        return [row for row in self.rows if row in beside]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Heard:
+    """What witnesses say: those that see the map's points, and sentences on those that contradict it."""
+
+    witnesses: tuple[Witness, ...]
+    contradictions: tuple[str, ...]
+
+
+def hear_witnesses(
+    feature_map: FeatureMap,
+    others: Sequence[FeatureMap],
+    new: NewPhotos | None,
+    by: ConfirmationOptions,
+    options: WitnessOptions | None = None,
+    *,
+    write_id: str,
+) -> Heard:
+    """Localise photos of sources that are not the map's own in the map alone.
+
+    Args:
+        others: maps around it, active or quarantined.
+        write_id: of the map as it is.
+    """
+    options = options or WitnessOptions()
+    area = build_area([feature_map])
+    if not len(area.points):
+        return Heard(witnesses=(), contradictions=())
+    indexed = IndexedArea(area=area, index=build_index(area.descriptors))
+    own = {source_of(image, feature_map.camera_keys) for image in feature_map.images}
+    names = {image.sha256 for image in feature_map.images}
+    witnesses: list[Witness] = []
+    against: list[str] = []
+    for other, image in _images_around(feature_map, others, own, by, options):
+        found = localise_image(other, image, 0, [indexed], options.localise)
+        if found is None or image.sha256 in names:
+            continue
+        found = in_frame(found, feature_map.frame)
+        known = image.cam_from_local @ other.frame.enu_from(feature_map.frame)
+        apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
+        spread = _spread(found) + _center_variance(other, image)
+        what = f"{image.name} of map {other.map_id}"
+        _sort_in(found, source_of(image, other.camera_keys), what, apart, spread, options, witnesses, against)
+    if new is not None:
+        _hear_new(feature_map, write_id, indexed, new, own, names, by, options, witnesses, against)
+    return Heard(witnesses=tuple(witnesses), contradictions=tuple(against))
+
+
+def source_of_photo(photo: Photo) -> Source:
+    """Where a new photo comes from."""
+    day = None if photo.capture_time is None else photo.capture_time.date()
+    return Source(owner=photo.owner, camera=photo.camera_key, day=day)
+
+
+def _hear_new(
+    feature_map: FeatureMap,
+    write_id: str,
+    indexed: IndexedArea,
+    new: NewPhotos,
+    own: set[Source],
+    names: set[str],
+    by: ConfirmationOptions,
+    options: WitnessOptions,
+    witnesses: list[Witness],
+    against: list[str],
+) -> None:
+    sources = {row: source_of_photo(new.photos[row]) for row in new.that_may_see(feature_map)}
+    asked = [
+        row
+        for row, source in sources.items()
+        if new.photos[row].sha256 not in names and any(independent(source, s, by.independent_by) for s in own)
+    ]
+    unheard = [row for row in asked if (write_id, row) not in new.heard]
+    for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], options.localise):
+        new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
+    for row in asked:
+        found = new.heard[write_id, row]
+        if found is None:
+            continue
+        found = in_frame(found, feature_map.frame)
+        apart, spread = 0.0, _spread(found)
+        if row in new.localised:
+            there = in_frame(new.localised[row], feature_map.frame)
+            apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
+            spread += _spread(there)
+        _sort_in(found, sources[row], new.photos[row].name, apart, spread, options, witnesses, against)
+
+
+def _sort_in(
+    found: LocalisedPhoto,
+    source: Source,
+    name: str,
+    apart_m: float,
+    variance: float,
+    options: WitnessOptions,
+    witnesses: list[Witness],
+    against: list[str],
+) -> None:
+    """A witness that the map has where it is known to be speaks for it, another one against it."""
+    if apart_m > max(options.least_m, options.sigmas * float(np.sqrt(variance))):
+        against.append(f"{name} is {apart_m:.2f} m from where the map has it")
+        return
+    witnesses.append(
+        Witness(
+            name=name,
+            source=source,
+            center=found.cam_from_local.center,
+            points=np.unique(found.point_of),
+        )
+    )
+
+
+def _spread(photo: LocalisedPhoto) -> float:
+    """Largest variance of the camera's centre, with that of the maps' placements, square metres."""
+    pose = photo.result.pose
+    covariance = photo.covariance if pose is None else pose.covariance
+    return float(np.linalg.eigvalsh(covariance[3:, 3:])[-1])
+
+
+def _center_variance(other: FeatureMap, image: MapImage) -> float:
+    """Of a map image's centre on Earth, roughly: its own, and its map's placement."""
+    own = 0.0 if image.covariance is None else float(np.trace(image.covariance[3:, 3:]))
+    return own + float(np.linalg.eigvalsh(other.placement.covariance[4:, 4:])[-1])
+
+
+def _images_around(
+    feature_map: FeatureMap,
+    others: Sequence[FeatureMap],
+    own: set[Source],
+    by: ConfirmationOptions,
+    options: WitnessOptions,
+) -> list[tuple[FeatureMap, MapImage]]:
+    """Images of other maps by independent sources, nearest to the map's cameras first."""
+    centers = np.array([image.cam_from_local.center for image in feature_map.images])
+    found: list[tuple[float, str, FeatureMap, MapImage]] = []
+    for other in others:
+        if other.map_id == feature_map.map_id:
+            continue
+        here_from_other = feature_map.frame.enu_from(other.frame)
+        for image in other.images:
+            source = source_of(image, other.camera_keys)
+            if not any(independent(source, s, by.independent_by) for s in own):
+                continue
+            center = here_from_other.act(image.cam_from_local.center)
+            distance = float(np.linalg.norm(centers - center, axis=1).min())
+            if distance <= options.near_m + _reach(centers):
+                found.append((distance, f"{other.map_id} {image.name}", other, image))
+    chosen = []
+    for _, _, other, image in sorted(found, key=lambda e: e[:2]):
+        if len(features_and_points(other, image)[1]) >= options.min_features:
+            chosen.append((other, image))
+        if len(chosen) == options.max_images:
+            break
+    return chosen
+
+
+def _reach(centers: FloatArray) -> float:
+    return 0.5 * float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
