@@ -7,15 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import (
     matrix_from_quaternion,
     nearest_rotation,
     quaternion_from_matrix,
+    rotation_angle,
     skew,
     so3_exp,
+    so3_log,
 )
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 
@@ -267,3 +271,32 @@ def test_nearest_rotation_recovers_and_minimises(omega: FloatArray, seed: int) -
     for _ in range(20):
         other = so3_exp(0.02 * rng.normal(size=3)) @ best
         assert np.linalg.norm(noisy - other) >= distance - 1e-12
+
+
+@LAWS
+@given(rotation_vectors(np.pi), st.floats(0.01, 100.0))
+def test_rotations_are_those_of_scipy(omega: FloatArray, length: float) -> None:
+    theirs = Rotation.from_rotvec(omega)
+    matrix = theirs.as_matrix()
+    np.testing.assert_allclose(so3_exp(omega), matrix, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(quaternion_from_matrix(matrix), theirs.as_quat(canonical=True), atol=2e-15)
+    np.testing.assert_allclose(so3_log(matrix), Rotation.from_matrix(matrix).as_rotvec(), atol=5e-15)
+    np.testing.assert_allclose(matrix_from_quaternion(length * theirs.as_quat()), matrix, rtol=0, atol=2e-15)
+    assert rotation_angle(matrix) == pytest.approx(theirs.magnitude(), abs=5e-15)
+
+
+@pytest.mark.parametrize(
+    "axis", [*np.eye(3), *-np.eye(3), [0.6, 0.0, -0.8], [-0.6, 0.8, 0.0], [0.0, -0.6, 0.8]]
+)
+def test_half_turns_are_those_of_scipy(axis: FloatArray) -> None:
+    theirs = Rotation.from_quat([*axis, 0.0])
+    found = quaternion_from_matrix(theirs.as_matrix())
+    np.testing.assert_allclose(found, theirs.as_quat(canonical=True), atol=1e-15)
+    assert rotation_angle(theirs.as_matrix()) == pytest.approx(np.pi, abs=1e-15)
+
+
+def test_a_matrix_that_is_almost_a_rotation_counts_as_the_nearest() -> None:
+    matrix = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix() + 1e-7 * np.arange(9.0).reshape(3, 3)
+    np.testing.assert_allclose(so3_log(matrix), so3_log(nearest_rotation(matrix)), atol=1e-15)
+    with pytest.raises(InvalidValueError, match="expected a rotation matrix"):
+        quaternion_from_matrix(np.diag([1.0, 1.0, -1.0]))
