@@ -110,7 +110,7 @@ def _matrix_of_unit(x: float, y: float, z: float, w: float) -> FloatArray:
 def _unit_of_matrix(rotation: ArrayLike) -> tuple[float, float, float, float]:
     """Quaternion (x, y, z, w) of length 1, w >= 0, of the rotation nearest to a matrix that is almost one.
 
-    From the largest of the four: Shepperd, Quaternion from rotation matrix, J. Guidance and Control 1(3), 1978.
+    From the largest of the four: Shepperd, Quaternion from rotation matrix, J. Guidance and Control, 1978.
     """
     matrix = np.asarray(rotation, dtype=np.float64)
     if not determinant(matrix) > 0.0:
