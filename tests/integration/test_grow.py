@@ -40,6 +40,7 @@ from tests.support.hill_walk import (
     step_of,
     survey,
 )
+from tests.support.made_once import made_once
 
 _EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
 _AWAY_M = WEST_M + 90.0  # and there nothing of it
@@ -48,9 +49,7 @@ _AWAY_M = WEST_M + 90.0  # and there nothing of it
 @pytest.fixture(scope="module")
 def anchored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an anchored database, to be copied."""
-    folder = tmp_path_factory.mktemp("anchored")
-    anchored_database(folder)
-    return folder / "db"
+    return made_once("anchored-hills", anchored_database, tmp_path_factory) / "db"
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhot
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where features and matches of the hills are kept for the next test."""
+    """Where features and matches are kept for the next test with the same photos."""
     return tmp_path_factory.mktemp("work")
 
 
@@ -117,13 +117,13 @@ def test_two_places_become_two_maps(tmp_path: Path) -> None:
     assert east[1] - east[0] == pytest.approx(400.0, abs=10.0)
 
 
-def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
+def test_a_wrong_position_is_named_and_left_out(work: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_hill_photos(folder, gps_noise_m=0.01)
     stray = write_hill_photos(tmp_path / "stray", east_m=30.0)[4]
     (tmp_path / "stray" / stray.name).replace(folder / stray.name)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, folder, _TRUTH)
+    report = ingest_photos(database, folder, replace(_TRUTH, work=work))
     assert [m.status for m in report.maps] == ["committed"]
     unused = [p for p in report.photos if p.gps_used is False]
     assert [p.name for p in unused] == [stray.name]
@@ -136,14 +136,14 @@ def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
     assert report.maps[0].radius_m == pytest.approx(2.45 * 0.02, rel=0.3)
 
 
-def test_positions_that_agree_on_another_place_keep_their_photos_out(tmp_path: Path) -> None:
+def test_positions_that_agree_on_another_place_keep_their_photos_out(work: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_hill_photos(folder, gps_noise_m=0.01)
     strays = write_hill_photos(tmp_path / "stray", east_m=30.0)[3:5]
     for stray in strays:
         (tmp_path / "stray" / stray.name).replace(folder / stray.name)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, folder, _TRUTH)
+    report = ingest_photos(database, folder, replace(_TRUTH, work=work))
     assert [(m.status, m.photos, m.reason_code) for m in report.maps] == [
         ("committed", 7, ""),
         ("refused", 2, "ELSEWHERE"),
