@@ -16,6 +16,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 # Two tests run at a time on two cores: threads of their libraries beside them would only wait for each other.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# Some machines tell Python not to keep bytecode. Then every process compiles all that it imports,
+# for seconds, and tests start many processes.
+_ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | _ONE_THREAD
 
 
 def main() -> int:
@@ -39,7 +42,9 @@ def main() -> int:
         steps.append(("studies", [*pytest, "--evaluations"]))
     # Types take one core, and tests wait now and then: beside them they take little time of their own.
     with tempfile.TemporaryFile() as said:
-        types = subprocess.Popen([python, "-m", "mypy"], cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
+        types = subprocess.Popen(
+            [python, "-m", "mypy"], cwd=ROOT, env=_ENVIRONMENT, stdout=said, stderr=subprocess.STDOUT
+        )
         failed = [name for name, command in steps if not _passes(name, command)]
         code = types.wait()
         said.seek(0)
@@ -52,7 +57,7 @@ def main() -> int:
 def _passes(name: str, command: list[str]) -> bool:
     print(f"== {name}", flush=True)
     start = time.monotonic()
-    code = subprocess.run(command, cwd=ROOT, env=os.environ | _ONE_THREAD, check=False).returncode
+    code = subprocess.run(command, cwd=ROOT, env=_ENVIRONMENT, check=False).returncode
     print(f"== {name}: {_verdict(code)}, {time.monotonic() - start:.0f} s", flush=True)
     return code == 0
 
