@@ -16,7 +16,7 @@ from featuredb.errors import FeatureDbError
 if TYPE_CHECKING:
     from featuredb.simworld.scoring import PoseError
     from featuredb.simworld.world import World
-    from ingest.report import IngestReport
+    from ingest.report.values import IngestReport
     from reloc.client import Client
     from reloc.wire import LocaliseReply
 
@@ -128,8 +128,8 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.map_builder import MapOptions
     from ingest.pipeline import IngestOptions, ingest_photos
     from ingest.reconstruction import MapMakingOptions
-    from ingest.report_html import write_report
-    from ingest.report_plots import plan_png
+    from ingest.report.page import write_report
+    from ingest.report.plots import plan_png
 
     options = IngestOptions(
         gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,

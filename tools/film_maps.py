@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from featuredb.store import Database
-from ingest.report_html import REPORT_JSON
+from ingest.report.page import REPORT_JSON
 from tools.film_folder import FilmsTruth, FrameTruth
 from tools.film_scripts import HEIGHT, Script
 from tools.picked import Seen

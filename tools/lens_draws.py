@@ -39,14 +39,14 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
-from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
-from ingest.colmap_bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
-from ingest.extract import PhotoFeatures
+from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
+from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from ingest.placed_models import placed_by_gps
 from ingest.register.gps import GpsOptions
-from ingest.sfm import SfmOptions, mapping_settings
+from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.mapper import SfmOptions, mapping_settings
 from reloc.candidates import IndexedArea
 from reloc.localise import localise_features
 from reloc.options import LocaliseOptions

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.pairs import Pair
+from ingest.sfm.pairs import Pair
 
 # A cut that leaves less on one side is none; a photo that everybody matches has no middle.
 _LEAST_HALF = 0.1

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_bridge import Model
-from ingest.links import tied_parts
+from ingest.colmap.bridge import Model
 from ingest.register.structure.similarity import similarities
+from ingest.sfm.links import tied_parts
 
 _LOG = logging.getLogger(__name__)
 _KEYPOINTS = 1 << 32  # more than any photo has

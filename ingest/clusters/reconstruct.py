@@ -16,12 +16,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import Block, Cluster
 from ingest.clusters.join import Joined, JoinOptions, hangs_together, join
-from ingest.colmap_adjust import adjust_posed
-from ingest.colmap_bridge import Model, read_model, read_models, write_posed
+from ingest.colmap.adjust import adjust_posed
+from ingest.colmap.bridge import Model, read_model, read_models, write_posed
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.pairs import Pair
-from ingest.sfm import (
+from ingest.sfm.mapper import (
     SfmOptions,
     SfmTask,
     SfmView,
@@ -30,6 +29,7 @@ from ingest.sfm import (
     loss_scale_px,
     reconstruct,
 )
+from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace, atomic_folder
 
 _LOG = logging.getLogger(__name__)

@@ -22,7 +22,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.models_in.json_values import mapping, member, number, numbers, read_json
 from ingest.models_in.opensfm_lens import camera_from_opensfm
 from ingest.models_in.opensfm_tracks import Tracks, read_tracks

@@ -19,11 +19,11 @@ from featuredb.store.encode import content_digest
 from ingest.clusters import reconstruct
 from ingest.clusters.graph import ClusterOptions
 from ingest.clusters.join import Joined, JoinOptions
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.report import IngestReport
-from ingest.scan import ScanOptions
+from ingest.report.values import IngestReport
 from tests.support.hill_photos import FRAME, HillPhoto, write_hill_photos
 
 _OPTIONS = IngestOptions(

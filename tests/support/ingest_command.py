@@ -4,7 +4,7 @@ import argparse
 import sys
 
 from featuredb.cli.main import run_command
-from ingest.cli import register
+from ingest.cli.ingest import register
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()

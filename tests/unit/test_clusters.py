@@ -13,10 +13,10 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.clusters.graph import Block, Cluster, ClusterOptions, Graph, find_clusters
 from ingest.clusters.join import JoinOptions, common_points, hangs_together, join
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.executor import InProcessExecutor
-from ingest.pairs import Pair
-from ingest.sfm import SfmOptions, SfmTask, SfmView
+from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView
+from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace
 from tests.support.planar_map import CAMERA
 from tests.support.posed_models import model_of

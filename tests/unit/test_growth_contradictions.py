@@ -9,7 +9,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.place.similarity_fit import Fit
 from ingest.growth.values import LocalisedPhoto

@@ -13,7 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
-from ingest.map_errors import map_errors
+from ingest.colmap.map_errors import map_errors
 from reloc.lens_prior import LensPrior, seen_by_a_map
 from reloc.self_calibration import calibrate
 

@@ -15,7 +15,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.correspondences import find_correspondences
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_photo
@@ -28,7 +28,7 @@ from ingest.growth.place.similarity_fit import (
     tolerances_px,
 )
 from ingest.growth.values import LocalisedPhoto
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from reloc.candidates import IndexedArea
 
 

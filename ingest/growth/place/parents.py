@@ -12,7 +12,7 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.similarity_fit import Fit, FitOptions, fit_similarity
 from ingest.growth.values import Edge, MapAgreement, MapsPlacement

@@ -14,7 +14,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.index.area import Area
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
 from ingest.growth.map_places import at_most_places, place_sigmas_m
@@ -32,7 +32,7 @@ from ingest.growth.place.similarity_fit import (
 )
 from ingest.growth.place.visibility import ShownParts, VisibilityOptions, shown_parts
 from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

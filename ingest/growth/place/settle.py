@@ -12,8 +12,8 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_anchored import Anchored, Lenses
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored, Lenses
+from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.place.correspondences import Correspondences
@@ -37,7 +37,7 @@ from ingest.growth.place.refine import (
 )
 from ingest.growth.place.similarity_fit import Fit, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
-from ingest.links import firmness
+from ingest.sfm.links import firmness
 
 # Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
 # their own localisation has elsewhere.

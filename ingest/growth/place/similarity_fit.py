@@ -20,10 +20,10 @@ from scipy.linalg import expm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import nearest_rotation, skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import linearise
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.values import LocalisedPhoto
-from ingest.precision import linearise
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991

@@ -27,7 +27,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity
-from ingest.colmap_adjust import block_variance_px2
+from ingest.colmap.adjust import block_variance_px2
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import on_ground

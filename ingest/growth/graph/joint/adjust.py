@@ -21,8 +21,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import Anchored, FixedPoints, Lenses, adjust_anchored
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.adjusted_map import adjusted_map, precision_of
 from ingest.growth.graph.joint.joined import Joined, join_maps
 from ingest.growth.graph.joint.judge import describe, placement_sigma_m, refusal

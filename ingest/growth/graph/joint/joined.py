@@ -19,7 +19,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.links import Links
 
 

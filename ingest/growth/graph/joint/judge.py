@@ -8,8 +8,8 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import Anchored
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.adjusted_map import kept_observations
 from ingest.growth.graph.joint.joined import Joined, observed_pixels
 from ingest.growth.graph.joint.values import AdjustedMap, JointOptions
