@@ -20,7 +20,7 @@ from ingest.photos.positions import capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.register.tagged_elsewhere import Elsewhere, tagged_elsewhere
+from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.links import tied_parts
 
@@ -80,7 +80,7 @@ def place_models(
         survey: control points, which then place the maps instead of GPS.
     """
     number = itertools.count()
-    elsewhere: list[tuple[Model, Elsewhere]] = []
+    elsewhere: list[tuple[Model, TaggedElsewhere]] = []
     for whole in done.reconstruction.models():
         loose: list[int] = []
         for rows in tied_parts(whole, options.min_tie):
@@ -123,7 +123,7 @@ def placed_by_gps(
     return frame, tuple(with_gps.tolist()), placed
 
 
-def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[Elsewhere]:
+def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
     """Groups of photos whose GPS contradicts a placement that is accepted."""
     _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
     return tagged_elsewhere(model, with_gps, placed, options.elsewhere) if placed.reason is None else []

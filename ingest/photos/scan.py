@@ -24,7 +24,7 @@ from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.photos.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
 from ingest.photos.photo import Photo
-from ingest.photos.scan_cache import Examined, read_cache, write_cache
+from ingest.photos.scan_cache import ExaminedFile, read_cache, write_cache
 from ingest.photos.table import PhotoTable, TableRow, missing_reason, summary_of
 from ingest.photos.walk import FoundFile, walk
 
@@ -179,14 +179,14 @@ def _excluded(file: FoundFile, patterns: Sequence[str]) -> FoundFile:
 
 def _examine_all(
     files: Sequence[FoundFile],
-    known: dict[str, Examined],
+    known: dict[str, ExaminedFile],
     options: ScanOptions,
     progress: Progress,
     cache_file: Path | None,
     key: str,
-) -> tuple[dict[str, Examined], int]:
+) -> tuple[dict[str, ExaminedFile], int]:
     """The examined regular files by name, and how many were not in the cache."""
-    results: dict[str, Examined] = {}
+    results: dict[str, ExaminedFile] = {}
     todo: list[FoundFile] = []
     for file in files:
         if file.reason_code:
@@ -213,7 +213,7 @@ def _examine_all(
     return results, len(todo)
 
 
-def examine(file: FoundFile, limits: DecodeLimits) -> Examined:
+def examine(file: FoundFile, limits: DecodeLimits) -> ExaminedFile:
     """Read one file once: its digest, its picture and its metadata, or why it is none."""
     sha256 = ""
     try:
@@ -223,14 +223,14 @@ def examine(file: FoundFile, limits: DecodeLimits) -> Examined:
         header = probe(data, limits)
         gray = decode_gray(data, limits)
     except ImageError as error:
-        return Examined(
+        return ExaminedFile(
             size=file.size,
             mtime_ns=file.mtime_ns,
             sha256=sha256,
             reason_code=error.code,
             reason=str(error),
         )
-    return Examined(
+    return ExaminedFile(
         size=file.size,
         mtime_ns=file.mtime_ns,
         sha256=sha256,
@@ -249,7 +249,7 @@ def _check_head(path: Path) -> None:
     check_signature(head)
 
 
-def _as_photo(file: FoundFile, examined: Examined | None, options: ScanOptions) -> Photo:
+def _as_photo(file: FoundFile, examined: ExaminedFile | None, options: ScanOptions) -> Photo:
     if examined is None or examined.exif is None:
         source = examined or file
         return Photo(

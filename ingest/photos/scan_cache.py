@@ -17,7 +17,7 @@ _TIMES = ("capture_time", "gps_time")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Examined:
+class ExaminedFile:
     """One file after reading it.
 
     Attributes:
@@ -37,7 +37,7 @@ class Examined:
     exif: ExifInfo | None = None
 
 
-def write_cache(path: Path, key: str, examined: dict[str, Examined]) -> None:
+def write_cache(path: Path, key: str, examined: dict[str, ExaminedFile]) -> None:
     """Write atomically.
 
     Args:
@@ -53,7 +53,7 @@ def write_cache(path: Path, key: str, examined: dict[str, Examined]) -> None:
     write_json(path, {"key": key, "files": files})
 
 
-def read_cache(path: Path, key: str) -> dict[str, Examined]:
+def read_cache(path: Path, key: str) -> dict[str, ExaminedFile]:
     """What `write_cache` wrote under the same key; empty where there is none or it cannot be used."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -67,12 +67,12 @@ def read_cache(path: Path, key: str) -> dict[str, Examined]:
         return {}
 
 
-def _from_json(record: dict[str, Any]) -> Examined:
+def _from_json(record: dict[str, Any]) -> ExaminedFile:
     exif = record.pop("exif")
     if exif is None:
-        return Examined(**record)
+        return ExaminedFile(**record)
     for field in _TIMES:
         exif[field] = datetime.fromisoformat(exif[field]) if exif[field] else None
     exif["warnings"] = tuple(exif["warnings"])
     exif["angles"] = CameraAngles(**exif["angles"]) if exif["angles"] else None
-    return Examined(**record, exif=ExifInfo(**exif))
+    return ExaminedFile(**record, exif=ExifInfo(**exif))

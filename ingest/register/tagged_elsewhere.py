@@ -46,7 +46,7 @@ class ElsewhereOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Elsewhere:
+class TaggedElsewhere:
     """A group of photos of a model, by place among its rows, and what their positions agree on.
 
     Attributes:
@@ -59,7 +59,7 @@ class Elsewhere:
 
 def tagged_elsewhere(
     model: Model, with_gps: Sequence[int], placed: GpsPlacement, options: ElsewhereOptions
-) -> list[Elsewhere]:
+) -> list[TaggedElsewhere]:
     """Groups of photos that the positions contradict together, and photos without position that hang on them.
 
     Args:
@@ -78,7 +78,7 @@ def least_offset_m(placed: GpsPlacement, options: ElsewhereOptions) -> float:
 
 def agreeing_groups(
     model: Model, with_gps: Sequence[int], placed: GpsPlacement, options: ElsewhereOptions
-) -> list[Elsewhere]:
+) -> list[TaggedElsewhere]:
     """Groups of photos outside the placement whose positions agree, however far they are off."""
     offset_of = {k: r[:2] for k, r in zip(with_gps, placed.residuals_m, strict=True)}
     outside = [k for k, fits in zip(with_gps, placed.inliers.tolist(), strict=True) if not fits]
@@ -98,7 +98,7 @@ def agreeing_groups(
             continue
         hanging = [k for k in untagged if links[k].max() >= options.min_link and links[k].argmax() in members]
         offset_m = float(np.linalg.norm(offsets[agreeing].mean(axis=0)))
-        found.append(Elsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
+        found.append(TaggedElsewhere(photos=tuple(sorted([*members, *hanging])), offset_m=offset_m))
     return found
 
 

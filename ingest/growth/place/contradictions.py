@@ -19,7 +19,7 @@ from featuredb.geometry.rotation import so3_log
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth import gates
-from ingest.growth.place.similarity_fit import Fit
+from ingest.growth.place.similarity_fit import FittedSimilarity
 from ingest.growth.values import LocalisedPhoto
 
 # What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
@@ -53,7 +53,7 @@ def contradicting_photos(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
-    fits: Sequence[Fit],
+    fits: Sequence[FittedSimilarity],
     options: ContradictionOptions,
 ) -> dict[int, str]:
     """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.

@@ -20,7 +20,7 @@ from ingest.growth.map_images import features_and_points
 from ingest.growth.place.correspondences import find_correspondences
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_photo
 from ingest.growth.place.similarity_fit import (
-    FitOptions,
+    SimilarityFitOptions,
     agreeing_photos,
     fit_similarity,
     proposals,
@@ -48,7 +48,7 @@ class OverlapOptions:
     min_photos: int = 3
     min_points: int = 60
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
-    fit: FitOptions = field(default_factory=FitOptions)
+    fit: SimilarityFitOptions = field(default_factory=SimilarityFitOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -27,7 +27,7 @@ from ingest.growth.place.drift import (
     turning_covariance,
 )
 from ingest.growth.place.parents import edges_of
-from ingest.growth.place.placement import Held, PlacementOptions
+from ingest.growth.place.placement import PlacementOptions, SupportedPlacement
 from ingest.growth.place.refine import (
     RefineOptions,
     only_photos,
@@ -35,7 +35,7 @@ from ingest.growth.place.refine import (
     with_existing,
     without_photos,
 )
-from ingest.growth.place.similarity_fit import Fit, fit_similarity
+from ingest.growth.place.similarity_fit import FittedSimilarity, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
 from ingest.sfm.links import firmness
 
@@ -109,7 +109,7 @@ class Settled:
 
 def settle(
     model: Model,
-    held: Held,
+    held: SupportedPlacement,
     correspondences: Correspondences,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
@@ -229,7 +229,7 @@ def _with_fit(
     placement: MapsPlacement,
     adjusted: Anchored,
     correspondences: Correspondences,
-    fit: Fit,
+    fit: FittedSimilarity,
     options: PlacementOptions,
 ) -> MapsPlacement:
     """The placement with the covariances of the refined model's fit.

@@ -29,7 +29,7 @@ from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
 from ingest.register.structure.similarity import similarities
-from ingest.register.structure.surface_fit import Surface, SurfaceOptions, plane_distances, surface_near
+from ingest.register.structure.surface_fit import Surface, SurfaceFitOptions, plane_distances, surface_near
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
@@ -83,7 +83,7 @@ class AdjustLidarOptions:
     max_control_rel: float = 0.002
     max_reprojection_growth: float = 0.1
     reprojection_floor_rel: float = 0.000125
-    surface: SurfaceOptions = field(default_factory=lambda: SurfaceOptions(max_surface_points=250_000))
+    surface: SurfaceFitOptions = field(default_factory=lambda: SurfaceFitOptions(max_surface_points=250_000))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
