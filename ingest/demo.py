@@ -16,7 +16,7 @@ from featuredb.errors import FeatureDbError
 if TYPE_CHECKING:
     from featuredb.simworld.scoring import PoseError
     from featuredb.simworld.world import World
-    from ingest.report import IngestReport
+    from ingest.report.values import IngestReport
     from reloc.client import Client
     from reloc.wire import LocaliseReply
 
@@ -47,7 +47,7 @@ def register(subparsers: Any) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class DemoAnswer:
     """One query and what came of it.
 
     Attributes:
@@ -71,7 +71,7 @@ def _run(args: argparse.Namespace) -> int:
     return 0 if demo_holds(answers) else 1
 
 
-def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[Answer]:
+def run_demo(out: Path, *, size: str, seed: int, exact_gps: bool, say: Say) -> list[DemoAnswer]:
     """Everything, into `out`: world/, db/, report/ (report.html, plan.png), overlay.png. Returns all answers.
 
     Raises:
@@ -128,8 +128,8 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     from ingest.map_builder import MapOptions
     from ingest.pipeline import IngestOptions, ingest_photos
     from ingest.reconstruction import MapMakingOptions
-    from ingest.report_html import write_report
-    from ingest.report_plots import plan_png
+    from ingest.report.page import write_report
+    from ingest.report.plots import plan_png
 
     options = IngestOptions(
         gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
@@ -146,7 +146,7 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
     return report
 
 
-def ask_all(world: "World", client: "Client") -> list[Answer]:
+def ask_all(world: "World", client: "Client") -> list[DemoAnswer]:
     """Held-out drone photos, street photos and negatives, each as a client would ask."""
     answers = [_ask(world, client, "drone", path, has_truth=True) for path in world.images("queries")]
     answers += [_ask(world, client, "street", path, has_truth=True) for path in world.images("street")]
@@ -155,7 +155,7 @@ def ask_all(world: "World", client: "Client") -> list[Answer]:
     return answers
 
 
-def _ask(world: "World", client: "Client", group: str, path: Path, *, has_truth: bool) -> Answer:
+def _ask(world: "World", client: "Client", group: str, path: Path, *, has_truth: bool) -> DemoAnswer:
     from featuredb.simworld.scoring import pose_error
 
     start = time.perf_counter()
@@ -166,10 +166,10 @@ def _ask(world: "World", client: "Client", group: str, path: Path, *, has_truth:
         name = path.relative_to(world.folder).as_posix()
         place = (reply.utm.easting, reply.utm.northing, reply.utm.height)
         error = pose_error(world.truth, name, reply.utm.epsg, place, reply.utm.cam_from_utm_xyzw)
-    return Answer(group=group, name=path.name, reply=reply, error=error, wall_ms=wall_ms)
+    return DemoAnswer(group=group, name=path.name, reply=reply, error=error, wall_ms=wall_ms)
 
 
-def table(answers: Sequence[Answer]) -> str:
+def table(answers: Sequence[DemoAnswer]) -> str:
     """Errors by group, as text."""
     from featuredb.simworld.scoring import summarise
 
@@ -195,7 +195,7 @@ def table(answers: Sequence[Answer]) -> str:
     return "\n".join(lines)
 
 
-def demo_holds(answers: Sequence[Answer]) -> bool:
+def demo_holds(answers: Sequence[DemoAnswer]) -> bool:
     """Whether most drone photos were answered and nothing was answered wrongly."""
     drone = [a for a in answers if a.group == "drone"]
     found = sum(a.error is not None for a in drone)
@@ -204,7 +204,7 @@ def demo_holds(answers: Sequence[Answer]) -> bool:
     return found >= 0.8 * len(drone) and wrong == 0 and invented == 0
 
 
-def _write_overlay(path: Path, world: "World", client: "Client", answers: Sequence[Answer]) -> None:
+def _write_overlay(path: Path, world: "World", client: "Client", answers: Sequence[DemoAnswer]) -> None:
     """The first answered drone photo with the map drawn on it."""
     from reloc.overlay import write_overlay
 

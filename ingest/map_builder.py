@@ -17,13 +17,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
 from featuredb.maps.unplaced_map import NoPlace, OwnPoints, UnplacedMap
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
-from ingest.map_errors import MapErrors, map_errors
-from ingest.own_frame import own_frame_of
-from ingest.photo import Photo
-from ingest.photo_positions import center_priors
-from ingest.precision import (
+from ingest.colmap.bridge import Model
+from ingest.colmap.map_errors import MapErrors, map_errors
+from ingest.colmap.precision import (
     Linearised,
     linearise,
     point_covariances,
@@ -31,6 +27,10 @@ from ingest.precision import (
     residual_variance,
     upper_triangle,
 )
+from ingest.own_frame import own_frame_of
+from ingest.photos.photo import Photo
+from ingest.photos.positions import center_priors
+from ingest.sfm.extract import PhotoFeatures
 
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely
 

@@ -12,7 +12,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import rotation_to_up
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NOMINAL_DISTANCE, OwnFrame
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.register.position_noise import Held
 
 # What gives a map without a place its place; for people.

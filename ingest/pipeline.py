@@ -19,15 +19,15 @@ from featuredb.store import Database
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.map_builder import MapIdentity
-from ingest.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.own_frame import WAYS_TO_A_PLACE
-from ingest.photo import Photo
-from ingest.photo_table import is_table, read_table
+from ingest.photos.photo import Photo
+from ingest.photos.scan import ScanOptions, ScanResult, require_usable, scan_folder, scan_table
+from ingest.photos.table import is_table, read_table
 from ingest.placed_models import HINTS, Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, reconstruct_photos
 from ingest.register.control.model import Survey
-from ingest.report import IngestReport, MapOutcome, PhotoOutcome, StageTiming
-from ingest.scan import ScanOptions, ScanResult, require_usable, scan_folder, scan_table
+from ingest.report.outcomes import map_outcome, photo_outcomes, registered_photos
+from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, StageTiming
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
 logger = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ def ingest_photos(
     """Scan, extract, match, reconstruct, place by GPS, build and commit.
 
     Args:
-        folder: of photos, searched through, or a table of them (see ingest.photo_table).
+        folder: of photos, searched through, or a table of them (see ingest.photos.table).
 
     A killed ingest goes on where it was when it is called again with the same photos and options, and
     gives the same maps under the same ids. What was reconstructed and cannot be placed is committed as a map

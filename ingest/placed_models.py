@@ -11,19 +11,19 @@ from scipy.stats import norm
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
-from ingest.links import tied_parts
+from ingest.colmap.bridge import Model
+from ingest.colmap.picture_shear import IMPOSSIBLE, shear_words
+from ingest.colmap.submodel import keep_photos, select_photos
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
-from ingest.photo import Photo
-from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
-from ingest.picture_shear import IMPOSSIBLE, shear_words
+from ingest.photos.photo import Photo
+from ingest.photos.positions import capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.submodel import keep_photos, select_photos
-from ingest.tagged_elsewhere import Elsewhere, tagged_elsewhere
+from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
+from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.links import tied_parts
 
 _WEAKLY_TIED = (
     "fewer than {least} points tie them to any other photo of their reconstruction: buildings that look "
@@ -81,7 +81,7 @@ def place_models(
         survey: control points, which then place the maps instead of GPS.
     """
     number = itertools.count()
-    elsewhere: list[tuple[Model, Elsewhere]] = []
+    elsewhere: list[tuple[Model, TaggedElsewhere]] = []
     for whole in done.reconstruction.models():
         loose: list[int] = []
         for rows in tied_parts(whole, options.min_tie):
@@ -124,7 +124,7 @@ def placed_by_gps(
     return frame, tuple(with_gps.tolist()), placed
 
 
-def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[Elsewhere]:
+def _elsewhere(model: Model, photos: Sequence[Photo], options: MapMakingOptions) -> list[TaggedElsewhere]:
     """Groups of photos whose GPS contradicts a placement that is accepted."""
     _, with_gps, placed = placed_by_gps(model, [photos[r] for r in model.rows], options.gps)
     return tagged_elsewhere(model, with_gps, placed, options.elsewhere) if placed.reason is None else []

@@ -20,22 +20,22 @@ from featuredb.stage_clock import StageClock
 from ingest.clusters.graph import ClusterOptions, find_clusters
 from ingest.clusters.join import JoinOptions
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
-from ingest.duplicates import copies_of
 from ingest.executor import Executor, Lost, Progress, no_progress
-from ingest.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapOptions
-from ingest.matching import Matched, MatchOptions, PhotoView, match_pairs
-from ingest.pairs import Pair, PairOptions, choose_pairs, more_pairs
-from ingest.photo import Photo
-from ingest.photo_cameras import CameraSharing, photo_cameras
-from ingest.photo_positions import gps_priors, local_frame_of
+from ingest.photos.cameras import CameraSharing, photo_cameras
+from ingest.photos.duplicates import copies_of
+from ingest.photos.photo import Photo
+from ingest.photos.positions import gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions
+from ingest.register.tagged_elsewhere import ElsewhereOptions
 from ingest.retrieval.aggregate import aggregate_photos
-from ingest.sfm import SfmOptions, SfmView
-from ingest.tagged_elsewhere import ElsewhereOptions
+from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
+from ingest.sfm.mapper import SfmOptions, SfmView
+from ingest.sfm.matching import Matched, MatchOptions, PhotoView, match_pairs
+from ingest.sfm.pairs import Pair, PairOptions, choose_pairs, more_pairs
+from ingest.sfm.zoomed_lenses import zoomed_keys
 from ingest.workspace import Workspace
-from ingest.zoomed_lenses import zoomed_keys
 
 logger = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class MapMakingOptions:
     """Options of every step between photos and maps.
 
     Attributes:
-        cameras: which photos share intrinsics (ingest.photo_cameras).
+        cameras: which photos share intrinsics (ingest.photos.cameras).
         min_tie: points that two photos have in common if they tie the map together; what hangs on others by
             fewer is a map of its own, or in none. In a simulated community of 5,000 photos 58 of 70 that hung
             by fewer than 30 were wrong, 44 of 126 that hung by 30 to 49, and 324 of 4,261 others.

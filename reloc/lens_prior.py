@@ -17,7 +17,7 @@ _SAME_LENS_RATE = 1e-3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LensPrior:
+class QueryLensPrior:
     """A normal distribution over a lens's parameters, each by itself, in the order of `lens_of`.
 
     Attributes:
@@ -32,14 +32,16 @@ class LensPrior:
 
     def __post_init__(self) -> None:
         for name in ("mean", "sigma"):
-            object.__setattr__(self, name, frozen_array(f"LensPrior.{name}", getattr(self, name), (None,)))
+            object.__setattr__(
+                self, name, frozen_array(f"QueryLensPrior.{name}", getattr(self, name), (None,))
+            )
         if self.mean.shape not in ((4,), (8,)) or self.sigma.shape != self.mean.shape:
             raise InvalidValueError(
-                f"LensPrior: expected 4 or 8 means and as many sigmas, found {self.mean.shape} and "
+                f"QueryLensPrior: expected 4 or 8 means and as many sigmas, found {self.mean.shape} and "
                 f"{self.sigma.shape}"
             )
         if not (np.isfinite(self.mean).all() and (self.sigma > 0).all()):
-            raise InvalidValueError("LensPrior: expected finite means and sigmas above 0")
+            raise InvalidValueError("QueryLensPrior: expected finite means and sigmas above 0")
 
     @property
     def information(self) -> FloatArray:
@@ -75,7 +77,7 @@ class LensPriors:
     tangential: float = 0.001
     aspect: float = 0.001
 
-    def around(self, camera: Camera, focal_px: float, focal_rel: float) -> LensPrior:
+    def around(self, camera: Camera, focal_px: float, focal_rel: float) -> QueryLensPrior:
         """What is known of a lens of pictures of this camera's size, whose focal length is about this."""
         longer, count = max(camera.width, camera.height), 8 if self.whole_lens else 4
         mean = [focal_px, camera.width / 2, camera.height / 2, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -89,10 +91,10 @@ class LensPriors:
             self.tangential,
             self.tangential,
         ]
-        return LensPrior(mean=np.array(mean[:count]), sigma=np.array(sigma[:count]))
+        return QueryLensPrior(mean=np.array(mean[:count]), sigma=np.array(sigma[:count]))
 
 
-def known_within(camera: Camera, sigmas: FloatArray) -> LensPrior:
+def known_within(camera: Camera, sigmas: FloatArray) -> QueryLensPrior:
     """What is known of a calibrated lens.
 
     Args:
@@ -113,10 +115,10 @@ def known_within(camera: Camera, sigmas: FloatArray) -> LensPrior:
         # Pixels are square but for a thousandth, and both focal lengths are off together.
         aspect = min(float(np.hypot(fx, fy)) / mean[0], LensPriors().aspect)
         sigma = np.array([fx, cx, cy, k1, aspect, k2, p1, p2])
-    return LensPrior(mean=mean, sigma=np.maximum(sigma, _EXACT[: len(mean)]))
+    return QueryLensPrior(mean=mean, sigma=np.maximum(sigma, _EXACT[: len(mean)]))
 
 
-def seen_by_a_map(camera: Camera, lenses: LensUncertainty) -> tuple[Camera, LensPrior] | None:
+def seen_by_a_map(camera: Camera, lenses: LensUncertainty) -> tuple[Camera, QueryLensPrior] | None:
     """An exactly known lens as photos of a map show it, whose points are bent by its own lenses' errors.
 
     Returns:
@@ -128,7 +130,9 @@ def seen_by_a_map(camera: Camera, lenses: LensUncertainty) -> tuple[Camera, Lens
     longer, fx = max(camera.width, camera.height), whole.params[0]
     center_px, (k1, k2) = (longer * share for share in lenses.center_rel), lenses.radial
     sigma = np.array([lenses.focal_rel * fx, *center_px, k1, lenses.aspect, k2, *lenses.tangential])
-    return whole, LensPrior(mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT), dilution=lenses.dilution)
+    return whole, QueryLensPrior(
+        mean=lens_of(whole), sigma=np.maximum(sigma, _EXACT), dilution=lenses.dilution
+    )
 
 
 def is_lens_of_a_map(camera: Camera, of_map: Camera, lenses: LensUncertainty) -> bool:

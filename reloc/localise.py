@@ -22,7 +22,7 @@ from reloc.pose import PoseUncertainty, pose_uncertainty
 from reloc.prior import contradicts_prior
 from reloc.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
 from reloc.rivals import runner_up
-from reloc.search import Candidate, Search, pairs, search
+from reloc.search import PoseCandidate, Search, pairs, search
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,7 +35,7 @@ class Localised:
     """
 
     result: LocaliseResult
-    best: Candidate | None = None
+    best: PoseCandidate | None = None
     uncertainty: PoseUncertainty | None = None
 
 

@@ -17,7 +17,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import Lineage
+from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
 from reloc.candidates import IndexedArea
@@ -48,7 +48,7 @@ class Localiser:
         loaded: Sequence[_Loaded],
         options: LocaliseOptions,
         snapshot: int,
-        lineages: Mapping[str, Lineage],
+        lineages: Mapping[str, MapLineage],
         unplaced: Mapping[str, Callable[[], UnplacedMap]] | None = None,
         provisional: Mapping[str, Callable[[], FeatureMap]] | None = None,
     ) -> None:

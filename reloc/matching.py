@@ -13,7 +13,7 @@ from featuredb.geometry.view_cones import ViewCones, in_view
 from featuredb.index.area import Area
 from featuredb.index.nearest import nearest
 from reloc.candidates import Cluster
-from reloc.options import MatchOptions
+from reloc.options import PointMatchOptions
 
 # Beyond the map's own views SIFT finds most of what there is to 30 degrees, some of it to 60, on flat walls
 # and from descents: up to the first a point is missed where it is not found, up to the
@@ -45,7 +45,7 @@ class ClusterMatcher:
     The neighbours of a feature are looked for once, however often more features are asked for.
     """
 
-    def __init__(self, features: Features, cluster: Cluster, options: MatchOptions) -> None:
+    def __init__(self, features: Features, cluster: Cluster, options: PointMatchOptions) -> None:
         self.cluster = cluster
         self._features, self._options = features, options
         area = cluster.area
@@ -73,7 +73,7 @@ class _MapNeighbours:
         self._descriptors = area.descriptors[points]
         self._squared, self._row = np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int64)
 
-    def matches(self, xy: NDArray[np.float32], area: Area, options: MatchOptions) -> Matches:
+    def matches(self, xy: NDArray[np.float32], area: Area, options: PointMatchOptions) -> Matches:
         count, points = len(xy), self._points
         if count > len(self._row):
             more = self._features.descriptors[len(self._row) : count]
@@ -96,7 +96,7 @@ def guided_matches(
     points: NDArray[np.int32],
     camera: Camera,
     cam_from_local: Rigid3,
-    options: MatchOptions,
+    options: PointMatchOptions,
 ) -> Matches:
     """Matches of the points that the pose makes visible, looked for where they project.
 

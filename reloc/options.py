@@ -39,7 +39,7 @@ class CandidateOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MatchOptions:
+class PointMatchOptions:
     """2D-3D matching.
 
     Attributes:
@@ -88,6 +88,6 @@ class LocaliseOptions:
         default_factory=lambda: ExtractorOptions(max_side_px=1000, max_features=3000, oversample=1.25)
     )
     candidates: CandidateOptions = field(default_factory=CandidateOptions)
-    matching: MatchOptions = field(default_factory=MatchOptions)
+    matching: PointMatchOptions = field(default_factory=PointMatchOptions)
     pose: PoseOptions = field(default_factory=PoseOptions)
     acceptance: AcceptanceOptions = field(default_factory=AcceptanceOptions)

@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from reloc.jacobians import pixel_jacobians
-from reloc.lens_prior import LensPrior
+from reloc.lens_prior import QueryLensPrior
 from reloc.options import PoseOptions
 from reloc.self_calibration import calibrate, covariance_from_information, joint_jacobians
 
@@ -37,7 +37,7 @@ class PoseHypothesis:
     camera_source: CameraSource
     inliers: NDArray[np.bool_]
     prior_focal_px: float
-    lens_prior: LensPrior | None = None
+    lens_prior: QueryLensPrior | None = None
 
     @property
     def count(self) -> int:

@@ -14,7 +14,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.maps.unplaced_map import OwnFrame
-from reloc.lens_prior import LensPrior
+from reloc.lens_prior import QueryLensPrior
 
 Reason = Literal[
     "NO_COVERAGE",
@@ -50,7 +50,7 @@ class LocaliseRequest:
     """
 
     camera: Camera | None = None
-    camera_prior: LensPrior | None = None
+    camera_prior: QueryLensPrior | None = None
     camera_is_exact: bool = False
     camera_key: str | None = None
     film: str | None = None

@@ -7,10 +7,10 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from reloc.answer import placement_covariance
 from reloc.result import RunnerUp
-from reloc.search import Candidate
+from reloc.search import PoseCandidate
 
 
-def runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
+def runner_up(best: PoseCandidate, others: list[PoseCandidate]) -> RunnerUp | None:
     """The pose of another place with most inliers.
 
     Another place is further than 2 m or 5 degrees from the winner. Where two maps gave the poses, three
@@ -48,7 +48,7 @@ def runner_up(best: Candidate, others: list[Candidate]) -> RunnerUp | None:
     return max(found, key=lambda rival: rival.inliers, default=None)
 
 
-def _support_beside(best: Candidate, other: Candidate) -> int:
+def _support_beside(best: PoseCandidate, other: PoseCandidate) -> int:
     """Inliers of the other pose that are not inliers of the best one as well.
 
     Where a photo leaves the pose soft, as a flat place does with an unknown lens, a second estimate comes to
@@ -60,13 +60,13 @@ def _support_beside(best: Candidate, other: Candidate) -> int:
     return int(np.count_nonzero(~shared))
 
 
-def _pair_numbers(candidate: Candidate) -> NDArray[np.int64]:
+def _pair_numbers(candidate: PoseCandidate) -> NDArray[np.int64]:
     """One number for each inlier's pair of feature and point."""
     matches, rows = candidate.matches, candidate.rows
     return matches.feature[rows] * len(candidate.area.points) + matches.point[rows]
 
 
-def _in_frame_of(area: Area, candidate: Candidate) -> Rigid3:
+def _in_frame_of(area: Area, candidate: PoseCandidate) -> Rigid3:
     if candidate.area is area:
         return candidate.pose.cam_from_local
     return candidate.pose.cam_from_local @ candidate.area.frame.enu_from(area.frame)

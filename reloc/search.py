@@ -40,7 +40,7 @@ _FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer s
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Candidate:
+class PoseCandidate:
     """The best pose that one cluster gives, with its matches and the evidence for it."""
 
     area: Area
@@ -60,7 +60,7 @@ class Candidate:
 class Search:
     """What the search found: candidates, best first, and how far it came."""
 
-    candidates: list[Candidate]
+    candidates: list[PoseCandidate]
     matches: int
     reason: Reason | None
     detail: str
@@ -82,7 +82,7 @@ def search(
     if not clusters:
         return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
     tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
-    candidates: list[Candidate] = []
+    candidates: list[PoseCandidate] = []
     most = 0
     while tries:
         matcher, *tries = tries
@@ -115,7 +115,7 @@ def _try_cluster(
     request: LocaliseRequest,
     options: LocaliseOptions,
     clock: StageClock,
-) -> tuple[list[Candidate], int]:
+) -> tuple[list[PoseCandidate], int]:
     """Poses of one cluster and the number of matches behind them.
 
     The first features, which are the best spread, are matched alone; all of them only where that does not
@@ -132,7 +132,7 @@ def _try_cluster(
 
 
 def _settled(
-    candidates: list[Candidate], cluster: Cluster, rest: list[Cluster], options: LocaliseOptions
+    candidates: list[PoseCandidate], cluster: Cluster, rest: list[Cluster], options: LocaliseOptions
 ) -> bool:
     """Whether the remaining clusters need not be tried.
 
@@ -145,7 +145,7 @@ def _settled(
     return sure and all(other.score < 0.5 * cluster.score or _around(best, other) for other in rest)
 
 
-def _around(candidate: Candidate, cluster: Cluster) -> bool:
+def _around(candidate: PoseCandidate, cluster: Cluster) -> bool:
     """Whether the cluster's images look at what a camera at the candidate's pose may see."""
     if cluster.area is not candidate.area:
         return False
@@ -161,7 +161,7 @@ def _poses(
     request: LocaliseRequest,
     options: LocaliseOptions,
     clock: StageClock,
-) -> list[Candidate]:
+) -> list[PoseCandidate]:
     """The cluster's best pose, and the best one among the matches that it leaves over."""
     pose = _best_pose(
         features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
@@ -283,7 +283,7 @@ def _best_pose(
 
 def _refined(
     features: Features, cluster: Cluster, matches: Matches, pose: PoseHypothesis, options: LocaliseOptions
-) -> Candidate:
+) -> PoseCandidate:
     """Refine on matches looked for where the pose says they are; keep that only if it agrees with more."""
     area = cluster.area
     pixels, points = pairs(features, area, matches)
@@ -306,7 +306,7 @@ def _with_evidence(
     matches: Matches,
     unguided: Matches,
     options: LocaliseOptions,
-) -> Candidate:
+) -> PoseCandidate:
     """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
 
     Of those, only independent ones count, or a few places that match several times over would be believed.
@@ -332,7 +332,7 @@ def _with_evidence(
         agreement=agreement(inlier_pixels, expected_pixels, width, height),
         spread=spread(inlier_pixels, expected_pixels, width, height),
     )
-    return Candidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+    return PoseCandidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
 
 
 def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> FloatArray:

@@ -13,7 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from reloc.jacobians import chain_to_pose
-from reloc.lens_prior import LensPrior, lens_of, whole_lens, with_lens
+from reloc.lens_prior import QueryLensPrior, lens_of, whole_lens, with_lens
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,7 +29,7 @@ def calibrate(
     points: FloatArray,
     start_pose: Rigid3,
     start_camera: Camera,
-    prior: LensPrior,
+    prior: QueryLensPrior,
     noise_px: float,
 ) -> Calibrated:
     """Refine pose and lens: as many parameters as the prior has.
@@ -154,7 +154,7 @@ class LensProblem:
     points: FloatArray
     noise_px: float
     trust: float  # of a pixel: variance that noise_px stands for over the measured one
-    prior: LensPrior
+    prior: QueryLensPrior
 
     def cost(self, pose: Rigid3, camera: Camera) -> float:
         """Half the Cauchy loss in units of the noise plus half the priors' chi-square."""
@@ -192,7 +192,7 @@ class LensProblem:
         return NormalEquations(information=information, gradient=gradient)
 
 
-def prior_cost(prior: LensPrior, camera: Camera) -> float:
+def prior_cost(prior: QueryLensPrior, camera: Camera) -> float:
     """Half the chi-square of a lens under what was known of it."""
     return 0.5 * float(np.sum((lens_of(camera) - prior.mean) ** 2 * prior.information))
 

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from featuredb.adjust.block import Block, whole_camera
 from featuredb.adjust.problem import Problem
-from featuredb.adjust.terms import LensPrior as CameraPrior
-from featuredb.adjust.terms import Marks, Terms
+from featuredb.adjust.terms import LensPrior, Marks, Terms
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.lens_prior import LensPrior, LensPriors, opencv_by_lens, with_lens
+from reloc.lens_prior import LensPriors, QueryLensPrior, opencv_by_lens, with_lens
 from reloc.options import PoseOptions
 from reloc.self_calibration import LensProblem, calibrate, measured_noise_px
 from reloc.wire import CameraRequest, LocaliseReply
@@ -172,7 +171,7 @@ def shared_lens(
     return None
 
 
-def _problem(view: LensView, prior: LensPrior, noise_px: float, own_px: float) -> LensProblem:
+def _problem(view: LensView, prior: QueryLensPrior, noise_px: float, own_px: float) -> LensProblem:
     return LensProblem(
         pixels=view.pixels, points=view.points, noise_px=noise_px, trust=(noise_px / own_px) ** 2, prior=prior
     )
@@ -187,7 +186,7 @@ def _alone(problem: LensProblem, view: LensView) -> float:
 
 
 def _together(
-    views: Sequence[LensView], noise_px: Sequence[float], start: Camera, prior: LensPrior
+    views: Sequence[LensView], noise_px: Sequence[float], start: Camera, prior: QueryLensPrior
 ) -> tuple[Block, FloatArray]:
     """The poses and the lens that all pixels say together, and the lens's covariance (8, 8)."""
     count = [len(view.pixels) for view in views]
@@ -212,8 +211,8 @@ def _together(
     return problem.block(), problem.marginals().lens(0)
 
 
-def _opencv(prior: LensPrior, camera: Camera) -> CameraPrior:
+def _opencv(prior: QueryLensPrior, camera: Camera) -> LensPrior:
     """The prior as that of OPENCV's own parameters."""
     by_lens = opencv_by_lens(prior.mean)
     covariance = by_lens @ np.diag(1.0 / prior.information) @ by_lens.T
-    return CameraPrior(mean=with_lens(camera, prior.mean), covariance=covariance)
+    return LensPrior(mean=with_lens(camera, prior.mean), covariance=covariance)

@@ -33,7 +33,7 @@ from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
 from tools import scan_poses
 from tools.figures import add_json_option, write_figures
-from tools.real_photos import Row, ask_poses, error_figures, ingest, table
+from tools.real_photos import HeldOutRow, ask_poses, error_figures, ingest, table
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -111,7 +111,7 @@ def by_gps(database: Database, frame: LocalFrame, poses: Path) -> dict[str, floa
     }
 
 
-def _verdict(rows: Sequence[Row], max_m: float, max_deg: float) -> int:
+def _verdict(rows: Sequence[HeldOutRow], max_m: float, max_deg: float) -> int:
     errors = [row.error for row in rows if row.error is not None]
     metres = float(np.median([e.position_m for e in errors])) if errors else float("nan")
     degrees = float(np.median([e.angle_deg for e in errors])) if errors else float("nan")

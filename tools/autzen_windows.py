@@ -54,7 +54,7 @@ from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import VerdictOptions
 from ingest.register.frame_registration import FramePrior
 from tools.figures import add_json_option, write_figures
-from tools.ortho_place import WINDOW_PX, Floats, Place, has_structure, measured_offset, place_of
+from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
 
 _STEPS = (225, 200)  # columns, rows between windows
 _HEIGHT_M = 1000.0
@@ -64,7 +64,7 @@ _LIMIT_M, _WRONG_M, _WANTED = 1.5, 5.0, 0.8
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class WindowOutcome:
     """What became of one window."""
 
     kind: str
@@ -86,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cv2.setNumThreads(1)
     if args.given:
         rows = [row for path in args.given for row in json.loads(path.read_text())["rows"]]
-        return _report([Outcome(**row) for row in rows], args.figure, args.json)
+        return _report([WindowOutcome(**row) for row in rows], args.figure, args.json)
     with tempfile.TemporaryDirectory() as folder:
         database = Database.create(Path(folder) / "db")
         added = add_scan(database, [args.scan])
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _photos(
-    place: Place, folders: Sequence[Path], count: int | None
+    place: OrthoOverScan, folders: Sequence[Path], count: int | None
 ) -> Iterator[tuple[str, int, int, NDArray[np.uint8]]]:
     """Kind, column, row and picture of windows to be found and of those to be refused."""
     h, w = place.gray.shape
@@ -152,7 +152,7 @@ def _foreign(folders: Sequence[Path], each: int) -> list[Path]:
 
 
 def _one(
-    place: Place,
+    place: OrthoOverScan,
     cloud: PointCloud,
     kind: str,
     column: int,
@@ -160,7 +160,7 @@ def _one(
     photo: NDArray[np.uint8],
     offset: Floats,
     rng: np.random.Generator,
-) -> Outcome:
+) -> WindowOutcome:
     camera, truth = _nadir_camera(place, column, row)
     prior = _wrong_prior(truth, rng)
     start = time.process_time()
@@ -171,7 +171,7 @@ def _one(
     error = None
     if tried is not None:
         error = _ground_error(place, camera, Rigid3.from_matrix(tried), column, row, offset)
-    return Outcome(
+    return WindowOutcome(
         kind=kind,
         column=column,
         row=row,
@@ -187,7 +187,7 @@ def _one(
     )
 
 
-def _nadir_camera(place: Place, column: int, row: int) -> tuple[Camera, Rigid3]:
+def _nadir_camera(place: OrthoOverScan, column: int, row: int) -> tuple[Camera, Rigid3]:
     """The camera that would have taken the window, its heading that of the ortho image's columns."""
     middle = place.on_ground(np.array([[column + WINDOW_PX / 2, row + WINDOW_PX / 2]]))[0]
     right = np.array([place.east[0], place.north[0], 0.0])
@@ -214,7 +214,9 @@ def _wrong_prior(truth: Rigid3, rng: np.random.Generator) -> FramePrior:
     )
 
 
-def _ground_error(place: Place, camera: Camera, pose: Rigid3, column: int, row: int, offset: Floats) -> float:
+def _ground_error(
+    place: OrthoOverScan, camera: Camera, pose: Rigid3, column: int, row: int, offset: Floats
+) -> float:
     spots = np.array([(x, y) for y in (50.0, 150.0, 250.0, 350.0) for x in (50.0, 150.0, 250.0, 350.0)])
     rays = np.column_stack([camera.unproject(spots), np.ones(len(spots))]) @ pose.rotation
     found = pose.center + rays * ((place.ground_m - pose.center[2]) / rays[:, 2:])
@@ -222,7 +224,7 @@ def _ground_error(place: Place, camera: Camera, pose: Rigid3, column: int, row: 
     return float(np.sqrt(((found[:, :2] - wanted) ** 2).sum(axis=1).mean()))
 
 
-def _line(o: Outcome) -> str:
+def _line(o: WindowOutcome) -> str:
     error = "-" if o.error_m is None else f"{o.error_m:.2f}"
     return (
         f"{o.kind:9} {o.column:4} {o.row:4} structure {o.has_structure!s:5} accepted {o.accepted!s:5} "
@@ -231,13 +233,13 @@ def _line(o: Outcome) -> str:
     )
 
 
-def _report(outcomes: Sequence[Outcome], figure: Path | None, figures: Path | None) -> int:
+def _report(outcomes: Sequence[WindowOutcome], figure: Path | None, figures: Path | None) -> int:
     if figure is not None:
         _draw(outcomes, figure)
     return _summary(outcomes, figures)
 
 
-def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
+def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
     """Evidence of the pictures against the error on the ground, with the verdict's two lines."""
     chart = Figure(figsize=(7.5, 3.6), dpi=110, facecolor="white", layout="constrained")
     FigureCanvasAgg(chart)
@@ -259,7 +261,7 @@ def _draw(outcomes: Sequence[Outcome], path: Path) -> None:
     chart.savefig(path)
 
 
-def _summary(outcomes: Sequence[Outcome], figures: Path | None) -> int:
+def _summary(outcomes: Sequence[WindowOutcome], figures: Path | None) -> int:
     windows = [o for o in outcomes if o.kind == "window"]
     structured = [o for o in windows if o.has_structure]
     close = [o for o in structured if o.accepted and o.error_m is not None and o.error_m <= _LIMIT_M]

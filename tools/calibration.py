@@ -155,7 +155,7 @@ def over_placements(
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Flight:
+class MapFlight:
     """The map's photos in the order of the flight, (n, 3) each, metres.
 
     Attributes:
@@ -169,7 +169,7 @@ class Flight:
     exif_sigmas: FloatArray
 
 
-def _flight(feature_map: FeatureMap, world: World) -> Flight:
+def _flight(feature_map: FeatureMap, world: World) -> MapFlight:
     images = sorted(feature_map.images, key=lambda image: image.name)
     paths = [world.folder / "drone" / image.name for image in images]
     true = [world.truth.images[f"drone/{image.name}"].cam_from_local.center for image in images]
@@ -178,7 +178,7 @@ def _flight(feature_map: FeatureMap, world: World) -> Flight:
     if len(sigmas) != len(images):
         raise SystemExit("a drone photo of the world has no position")
     placed = np.array([image.cam_from_local.center for image in images])
-    return Flight(
+    return MapFlight(
         centers_sfm=feature_map.placement.local_from_sfm.inverse().act(placed),
         true_centers=feature_map.frame.enu_from(world.truth.frame).act(np.array(true)),
         exif_sigmas=np.array(sigmas),

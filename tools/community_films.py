@@ -23,8 +23,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.scan_file import write_scan
+from featuredb.simworld.scan_options import AirborneScanOptions
 from reloc.tracking.trajectory_read import read_trajectory_csv
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
@@ -134,7 +135,7 @@ def _scan(inputs: Path, seed: int) -> Path:
     file = inputs / "scan.laz"
     if not file.exists():
         part = file.with_name("scan.part.laz")
-        write_scan(part, scan_town(place_scene(seed), ScanOptions()))
+        write_scan(part, scan_town(place_scene(seed), AirborneScanOptions()))
         part.rename(file)
     return file
 

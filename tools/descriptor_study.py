@@ -53,10 +53,11 @@ from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
-from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.flight import FlightOptions, survey
 from featuredb.simworld.ortho import make_ortho
 from featuredb.simworld.photograph import take_photo
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.sensor import SensorOptions
 from featuredb.simworld.shot import look_pose
 from featuredb.simworld.town import make_town
@@ -291,7 +292,7 @@ def _bytes_of(raw: NDArray[np.uint16]) -> Gray:
 
 def simulated_pairs(args: argparse.Namespace, rng: np.random.Generator) -> Iterator[Pair]:
     scene = make_town(args.seed)
-    scan = scan_town(scene, ScanOptions(seed=args.seed))
+    scan = scan_town(scene, AirborneScanOptions(seed=args.seed))
     kept = ~np.isin(scan.classification, _NOISE_CLASSES)
     intensity, utm = _bytes_of(scan.intensity[kept]), scan.utm()[kept]
     with tempfile.TemporaryDirectory() as folder:

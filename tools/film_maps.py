@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from featuredb.store import Database
-from ingest.report_html import REPORT_JSON
+from ingest.report.page import REPORT_JSON
 from tools.film_folder import FilmsTruth, FrameTruth
 from tools.film_scripts import HEIGHT, Script
 from tools.picked import Seen
@@ -20,7 +20,7 @@ Shot = tuple[str, int]  # name of a film's file, number of the piece
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Keyframe:
+class MapKeyframe:
     """An image of a map, or of the report: what it shows by the truth. `reason`: why it is in no map."""
 
     image: str
@@ -38,7 +38,7 @@ class FilmMap:
     """A map and its keyframes."""
 
     map_id: str
-    keyframes: tuple[Keyframe, ...]
+    keyframes: tuple[MapKeyframe, ...]
 
     @property
     def of_place(self) -> bool:
@@ -56,7 +56,7 @@ class FilmMaps:
     """
 
     maps: tuple[FilmMap, ...]
-    left: tuple[Keyframe, ...]
+    left: tuple[MapKeyframe, ...]
     given_up: tuple[tuple[str, float, float, str], ...]
 
     @property
@@ -155,7 +155,7 @@ def keyframe_to_pick_in(one: FilmMap, stills: Path) -> tuple[Path, Seen]:
     return best[1:]
 
 
-def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> Keyframe:
+def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> MapKeyframe:
     """The film is a part of the image's path, and the last number of its name the frame."""
     path = Path(image)
     stems = {Path(film).stem: film for film in truth.films}
@@ -163,8 +163,10 @@ def _keyframe(image: str, truth: FilmsTruth, reason: str = "") -> Keyframe:
     numbers = re.findall(r"\d+", path.stem)
     if len(named) != 1 or not numbers:
         raise SystemExit(f"{image}: expected FILM/FRAME.jpg of {', '.join(truth.films)}")
-    return Keyframe(image=image, film=named[0], truth=truth.films[named[0]][int(numbers[-1])], reason=reason)
+    return MapKeyframe(
+        image=image, film=named[0], truth=truth.films[named[0]][int(numbers[-1])], reason=reason
+    )
 
 
-def _count(keyframes: Sequence[Keyframe], shot: Shot) -> int:
+def _count(keyframes: Sequence[MapKeyframe], shot: Shot) -> int:
     return sum(k.shot == shot for k in keyframes)

@@ -32,7 +32,7 @@ from ingest.growth import run
 from ingest.growth.gates import Gate
 from ingest.growth.place import component
 from ingest.growth.values import Refused
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 
 WRONG_M = 2.0  # a photo registered further off than this is wrong
 

@@ -70,7 +70,7 @@ _CANARY_M, _CANARY_DEG = 0.5, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class PoisonOutcome:
     """What a poison did.
 
     Attributes:
@@ -116,7 +116,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     sys.stdout.write(outcome_table(outcomes))
     verdicts = judge(outcomes, clean, fabricated)
     figures: dict[str, Any] = {
-        "outcomes": [{n: getattr(o, n) for n in Outcome.__dataclass_fields__} for o in outcomes],
+        "outcomes": [{n: getattr(o, n) for n in PoisonOutcome.__dataclass_fields__} for o in outcomes],
         "clean_off_share": clean,
         "fabricated": fabricated,
     }
@@ -154,7 +154,7 @@ def try_poison(
     options: GrowingOptions,
     poison: str,
     kinds: Sequence[str],
-) -> Outcome:
+) -> PoisonOutcome:
     """One poison on a copy of the honest database."""
     name = poison.replace(" ", "-")
     database = newest_copy(Path(base.url), out / f"db-{name}")
@@ -175,7 +175,7 @@ def try_poison(
         {r.map_id for r in found if r.status == "quarantined" and (r.fact.kind in kinds or r.wrong)}
     )
     forced = force_and_retire(database, album, held, fabricate=False)
-    return Outcome(
+    return PoisonOutcome(
         poison=poison,
         sent=len(sent),
         active=sum(r.fact.kind in kinds for r in active),
@@ -294,7 +294,7 @@ def answers(database: Database, album: Album) -> dict[str, str]:
     return found
 
 
-def judge(outcomes: Sequence[Outcome], clean: float, fabricated: dict[str, Any]) -> list[Verdict]:
+def judge(outcomes: Sequence[PoisonOutcome], clean: float, fabricated: dict[str, Any]) -> list[Verdict]:
     """The contract's lines."""
     limit = max(_OFF_SHARE, 2.0 * clean)
     verdicts = [
@@ -321,8 +321,8 @@ def judge(outcomes: Sequence[Outcome], clean: float, fabricated: dict[str, Any])
     return verdicts
 
 
-def outcome_table(outcomes: Sequence[Outcome]) -> str:
-    names = tuple(Outcome.__dataclass_fields__)
+def outcome_table(outcomes: Sequence[PoisonOutcome]) -> str:
+    names = tuple(PoisonOutcome.__dataclass_fields__)
     return table([[getattr(o, n) for n in names] for o in outcomes], names) + "\n"
 
 

@@ -37,7 +37,6 @@ from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
-from ingest.extract import PhotoFeatures, features_key, read_features
 from ingest.fingerprint import digest
 from ingest.growth.graph.joint.in_database import adjust_maps
 from ingest.growth.place.component import GrowOptions
@@ -46,10 +45,11 @@ from ingest.growth.place.localised import localise_photos
 from ingest.growth.place.settle import SettleOptions
 from ingest.growth.values import GrownMap
 from ingest.map_builder import MapIdentity, build_map
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
+from ingest.photos.scan import ScanOptions, require_usable, scan_folder
 from ingest.placed_models import Component, place_models
 from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.scan import ScanOptions, require_usable, scan_folder
+from ingest.sfm.extract import PhotoFeatures, features_key, read_features
 from ingest.workspace import Workspace
 from reloc.localiser import Localiser
 from tools.figures import add_json_option, write_figures

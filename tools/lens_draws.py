@@ -39,14 +39,14 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
-from ingest.colmap_adjust import AdjustOptions, Known, adjust_models
-from ingest.colmap_bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
-from ingest.extract import PhotoFeatures
+from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
+from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, verify_pair, write_database
 from ingest.map_builder import MapIdentity, MapOptions, build_map
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from ingest.placed_models import placed_by_gps
 from ingest.register.gps import GpsOptions
-from ingest.sfm import SfmOptions, mapping_settings
+from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.mapper import SfmOptions, mapping_settings
 from reloc.candidates import IndexedArea
 from reloc.localise import localise_features
 from reloc.options import LocaliseOptions
@@ -65,7 +65,7 @@ _EPSG, _ORIGIN = 32632, (456_800.0, 5_429_300.0, 120.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
+class AnswerErrors:
     """Squared errors over their covariance, of three axes each, and the pose's inliers."""
 
     position: float
@@ -74,7 +74,7 @@ class Answer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class LensDraw:
     """A draw: a town, its lens, and generator of all else.
 
     Attributes:
@@ -124,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if holds else 1
 
 
-def judged(draws: Sequence[Sequence[Answer]]) -> tuple[dict[str, float], str, bool]:
+def judged(draws: Sequence[Sequence[AnswerErrors]]) -> tuple[dict[str, float], str, bool]:
     """Figures of all draws, a table of them, and whether the bounds hold."""
     answers = [answer for draw in draws for answer in draw]
     quarter = np.quantile([a.inliers for a in answers], 0.25) if answers else 0.0
@@ -155,7 +155,7 @@ def judged(draws: Sequence[Sequence[Answer]]) -> tuple[dict[str, float], str, bo
 
 
 def _share(
-    draws: Sequence[Sequence[Answer]], kind: str, bound: float, most_inliers: float
+    draws: Sequence[Sequence[AnswerErrors]], kind: str, bound: float, most_inliers: float
 ) -> tuple[float, float]:
     """Share of the answers inside, and its standard deviation over draws (of a ratio)."""
     inside = np.array(
@@ -168,7 +168,7 @@ def _share(
     return share, float(np.sqrt(((inside - share * asked) ** 2).sum()) / asked.sum())
 
 
-def drawn(seed: int, sigma_m: float) -> list[Answer]:
+def drawn(seed: int, sigma_m: float) -> list[AnswerErrors]:
     """One draw; empty where no map is placed."""
     scene = scene_of(seed)
     frame = LocalFrame.from_utm(*_ORIGIN, _EPSG)
@@ -191,11 +191,11 @@ def drawn(seed: int, sigma_m: float) -> list[Answer]:
         turn = np.kron(np.eye(2), answer.frame.true_enu_from_enu(answer.cam_from_local.center))
         error = turn @ pose_offset(answer.cam_from_local, true)
         squares = [float(error[k] @ np.linalg.solve(answer.covariance[k, k], error[k])) for k in _PARTS]
-        answers.append(Answer(orientation=squares[0], position=squares[1], inliers=result.inliers))
+        answers.append(AnswerErrors(orientation=squares[0], position=squares[1], inliers=result.inliers))
     return answers
 
 
-def scene_of(seed: int) -> Scene:
+def scene_of(seed: int) -> LensDraw:
     """Ground with houses, and a lens."""
     rng = np.random.default_rng((seed, 26))
     ground = np.column_stack([rng.uniform(-75, 75, (2200, 2)), np.zeros(2200)])
@@ -211,7 +211,7 @@ def scene_of(seed: int) -> Scene:
     focal = _FOCAL_PX * (1.0 + 0.02 * rng.normal())
     center = np.array([_WIDTH, _HEIGHT]) / 2 + 0.01 * _WIDTH * rng.normal(size=2)
     params = (focal, focal * (1 + 3e-4 * rng.normal()), *center, *rng.normal(0, [0.03, 0.02, 1e-3, 1e-3]))
-    return Scene(
+    return LensDraw(
         xyz=xyz,
         descriptors=rootsift_8bit(rng.gamma(0.4, size=(len(xyz), 128)).astype(np.float32)),
         lens=Camera(model="OPENCV", width=_WIDTH, height=_HEIGHT, params=tuple(map(float, params))),
@@ -239,7 +239,7 @@ def flight(rng: np.random.Generator) -> list[Rigid3]:
     return poses
 
 
-def _map_of(scene: Scene, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m: float) -> FeatureMap | None:
+def _map_of(scene: LensDraw, poses: Sequence[Rigid3], frame: LocalFrame, sigma_m: float) -> FeatureMap | None:
     """What an ingest makes of the photos once their features are matched."""
     shown = [scene.seen(pose) for pose in poses]
     centers = np.array([pose.center for pose in poses])
@@ -293,7 +293,7 @@ def _photo(number: int, frame: LocalFrame, position: FloatArray, sigma_m: float)
 
 
 def _model_of(
-    scene: Scene,
+    scene: LensDraw,
     shown: Sequence[tuple[NDArray[np.int64], Features]],
     measured: FloatArray,
     sigma_m: float,

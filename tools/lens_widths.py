@@ -10,7 +10,7 @@ likely (type II maximum likelihood): a lens of which the photos say little says 
 For each width: what `AdjustOptions` has, what is measured, and between which limits it lies with 95 %
 probability (likelihood ratio, the other widths where they are most likely). Also how far photos of a camera
 disagree about its lens (`featuredb.adjust.lens_agreement`), and by how much single pictures are sheared
-(`ingest.picture_shear`). Exit code 0 if all that
+(`ingest.colmap.picture_shear`). Exit code 0 if all that
 `AdjustOptions` has lie within.
 """
 
@@ -31,12 +31,12 @@ from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import LensWidths, Terms, lens_prior
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import AdjustOptions
-from ingest.map_errors import terms_of_map
-from ingest.photo import Photo
-from ingest.picture_shear import picture_shear
+from ingest.colmap.adjust import AdjustOptions
+from ingest.colmap.map_errors import terms_of_map
+from ingest.colmap.picture_shear import picture_shear
+from ingest.photos.photo import Photo
+from ingest.photos.scan import scan_folder
 from ingest.register.block import block_of_map
-from ingest.scan import scan_folder
 from tools.figures import add_json_option, write_figures
 from tools.made_maps import all_maps, make, photo_names
 

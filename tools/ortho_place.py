@@ -23,7 +23,7 @@ _REACH = 40  # pixels of shift searched for the offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class OrthoOverScan:
     """The ortho image over the scan: grey values, the pixel grid on the ground, rasters of the scan."""
 
     gray: NDArray[np.uint8]
@@ -40,7 +40,7 @@ class Place:
         return found
 
 
-def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> Place:
+def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> OrthoOverScan:
     """The ortho image at `path` in the frame of a cloud; prints how its pixels lie."""
     with rasterio.open(path) as image:
         bands, affine, wkt = image.read(), image.transform, image.crs.to_wkt()
@@ -69,7 +69,7 @@ def place_of(path: Path, frame: LocalFrame, epsg: int, cloud: PointCloud) -> Pla
     np.maximum.at(top, cell, cloud.xyz[inside, 2].astype(np.float64))
     intensity = np.where(count > 0, total / np.maximum(count, 1), np.nan).reshape(h, w)
     high = cv2.dilate((top.reshape(h, w) > ground + _HIGH_M).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    return Place(
+    return OrthoOverScan(
         gray=gray, east=east, north=north, ground_m=ground, intensity=intensity.astype(np.float32), high=high
     )
 
@@ -84,7 +84,7 @@ def _gradients(picture: NDArray[Any], sigma: float) -> NDArray[np.float32]:
     return np.asarray(np.hypot(dx, dy), dtype=np.float32)
 
 
-def measured_offset(place: Place) -> Floats:
+def measured_offset(place: OrthoOverScan) -> Floats:
     """Where the scan has what the ortho image shows, less where the image does: (2,) metres east, north."""
     ortho, scan = _gradients(place.gray.astype(np.float32), 1.0), _gradients(place.intensity, 1.5)
     ok = ~place.high
@@ -123,7 +123,7 @@ def _best_shift(a: NDArray[Any], b: NDArray[Any], ok: NDArray[np.bool_]) -> tupl
     return np.asarray([x, y], dtype=np.float64), float(grid.max())
 
 
-def has_structure(place: Place, column: int, row: int) -> bool:
+def has_structure(place: OrthoOverScan, column: int, row: int) -> bool:
     """Whether a window counts as having structure; the program's help says what that is."""
     window = (slice(row, row + WINDOW_PX), slice(column, column + WINDOW_PX))
     if place.high[window].mean() > 0.5:

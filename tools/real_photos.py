@@ -60,7 +60,7 @@ class Ingest:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Row:
+class HeldOutRow:
     """One held-out photo: the answer against the reference."""
 
     name: str
@@ -151,7 +151,7 @@ def reference(database: Path) -> FeatureMap:
     return snapshot.load_map(max(maps, key=lambda m: m.images).map_id)
 
 
-def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[Row]:
+def ask(database: Database, photos: Path, names: Sequence[str], truth: FeatureMap) -> list[HeldOutRow]:
     """Localise the photos over Zenoh and compare with their poses in the reference map.
 
     Those that the reference map does not have are left out: nothing tells where they were taken.
@@ -170,7 +170,7 @@ def ask_poses(
     frame: LocalFrame,
     poses: Mapping[str, Rigid3],
     camera: CameraRequest | None = None,
-) -> list[Row]:
+) -> list[HeldOutRow]:
     """Localise the photos over Zenoh and compare with poses `cam_from_local` in a frame.
 
     Args:
@@ -191,13 +191,13 @@ def ask_poses(
     return rows
 
 
-def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_ms: float) -> Row:
+def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_ms: float) -> HeldOutRow:
     error, nan = None, float("nan")
     if reply.utm is not None:
         utm = (reply.utm.easting, reply.utm.northing, reply.utm.height)
         error = pose_difference(frame, pose, reply.utm.epsg, utm, reply.utm.cam_from_utm_xyzw)
     accuracy = reply.accuracy
-    return Row(
+    return HeldOutRow(
         name=name,
         reason=reply.reason or "",
         error=error,
@@ -212,7 +212,7 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_
     )
 
 
-def table(rows: Sequence[Row], max_m: float, max_deg: float) -> str:
+def table(rows: Sequence[HeldOutRow], max_m: float, max_deg: float) -> str:
     """Differences and reported radii, one line for each photo."""
     lines = [
         f"{'photo':<20}{'east m':>8}{'north m':>9}{'up m':>8}{'all m':>8}{'deg':>8}{'inliers':>9}"
@@ -242,7 +242,7 @@ def _tell(done: Ingest, what: str) -> None:
     sys.stdout.flush()
 
 
-def error_figures(rows: Sequence[Row]) -> dict[str, float]:
+def error_figures(rows: Sequence[HeldOutRow]) -> dict[str, float]:
     """How many photos were answered, and the errors of the answers."""
     errors = [row.error for row in rows if row.error is not None]
     metres = [e.position_m for e in errors] or [float("nan")]

@@ -32,7 +32,7 @@ from tools.scan_to_photo import (
     Floats,
     Frame,
     Lens,
-    Photo,
+    PosedPicture,
     adjust,
     correspond,
     first_pose,
@@ -80,7 +80,7 @@ def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | N
         pose = first_pose(gray, lens, raster, features)
         _say(f"{path.name}: {'no pose' if pose is None else 'first pose'}")
         if pose is not None:
-            photos.append(Photo(path.name, gray, pose))
+            photos.append(PosedPicture(path.name, gray, pose))
     if lens is None or len(photos) < 2:
         raise SystemExit(f"{folder}: fewer than two photos register to {scan_path}")
     for free in _ROUNDS:
@@ -91,7 +91,12 @@ def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | N
 
 
 def _plain(
-    photos: list[Photo], lens: Lens, covariance: Floats, frame: Frame, origin: Sequence[float], crs: str
+    photos: list[PosedPicture],
+    lens: Lens,
+    covariance: Floats,
+    frame: Frame,
+    origin: Sequence[float],
+    crs: str,
 ) -> dict[str, Any]:
     sigmas = np.sqrt(np.diag(covariance)[-7:])
     return {
@@ -111,7 +116,7 @@ def _plain(
     }
 
 
-def _pose(photo: Photo, lens: Lens, frame: Frame) -> dict[str, Any]:
+def _pose(photo: PosedPicture, lens: Lens, frame: Frame) -> dict[str, Any]:
     rotation = cv2.Rodrigues(photo.pose[:3])[0]
     center = -rotation.T @ photo.pose[3:]
     predicted = cv2.projectPoints(
@@ -128,7 +133,7 @@ def _pose(photo: Photo, lens: Lens, frame: Frame) -> dict[str, Any]:
     }
 
 
-def halves_of_correspondences(photos: list[Photo], lens: Lens) -> dict[str, float]:
+def halves_of_correspondences(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
     """How far poses from two disjoint halves of each photo's blocks differ, with the same lens."""
     halves = []
     for parity in (0, 1):
@@ -140,7 +145,7 @@ def halves_of_correspondences(photos: list[Photo], lens: Lens) -> dict[str, floa
     return _difference(halves[0], halves[1])
 
 
-def halves_of_photos(photos: list[Photo], lens: Lens) -> dict[str, float]:
+def halves_of_photos(photos: list[PosedPicture], lens: Lens) -> dict[str, float]:
     """How far poses with the camera of the even photos are from those with the camera of the odd ones."""
     full = tuple(range(7))
     lenses = [adjust(photos[parity::2], lens, full)[1] for parity in (0, 1)]
@@ -148,7 +153,7 @@ def halves_of_photos(photos: list[Photo], lens: Lens) -> dict[str, float]:
     return _difference(fixed[0], fixed[1]) | {"focal_px": abs(lenses[0].f - lenses[1].f)}
 
 
-def _difference(first: list[Photo], second: list[Photo]) -> dict[str, float]:
+def _difference(first: list[PosedPicture], second: list[PosedPicture]) -> dict[str, float]:
     shifts, turns = [], []
     for a, b in zip(first, second, strict=True):
         ra, rb = cv2.Rodrigues(a.pose[:3])[0], cv2.Rodrigues(b.pose[:3])[0]

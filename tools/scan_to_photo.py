@@ -22,7 +22,7 @@ RENDER_WIDTH = 1600  # px; finer than the scan's points gains nothing
 
 
 @dataclass(frozen=True, slots=True)
-class Scan:
+class ColouredScan:
     """Points in an east-north-up frame at `origin` (easting, northing, height in the file's CRS)."""
 
     xyz: Floats
@@ -63,7 +63,7 @@ class Lens:
 
 
 @dataclass(frozen=True, slots=True)
-class Photo:
+class PosedPicture:
     name: str
     gray: NDArray[np.uint8]
     pose: Floats  # (6,) rotation vector and translation, camera from scan
@@ -71,7 +71,7 @@ class Photo:
     pixels: Floats = field(default_factory=lambda: np.zeros((0, 2)))
 
 
-def read_scan(path: Path, crs: str | None) -> Scan:
+def read_scan(path: Path, crs: str | None) -> ColouredScan:
     las = laspy.read(path)
     found = las.header.parse_crs()
     if crs is None and found is None:
@@ -84,7 +84,7 @@ def read_scan(path: Path, crs: str | None) -> Scan:
     if rgb.max() > 255:
         rgb = rgb >> 8
     bgr = np.ascontiguousarray(rgb[:, ::-1].astype(np.uint8))
-    return Scan(frame.local(grid), bgr, frame, origin, projected.to_string())
+    return ColouredScan(frame.local(grid), bgr, frame, origin, projected.to_string())
 
 
 class Frame:
@@ -117,7 +117,7 @@ class Frame:
         return np.asarray(u @ vt)
 
 
-def nadir_raster(scan: Scan) -> tuple[NDArray[np.uint8], Floats, Floats]:
+def nadir_raster(scan: ColouredScan) -> tuple[NDArray[np.uint8], Floats, Floats]:
     """The scan from above, north up: picture, heights (NaN where empty) and the south-west corner."""
     low = scan.xyz.min(axis=0)
     column, row = ((scan.xyz[:, :2] - low[:2]) / RASTER_M).astype(np.int64).T
@@ -184,7 +184,9 @@ def first_pose(photo: NDArray[np.uint8], lens: Lens, raster: tuple, scan_feature
     return np.concatenate([rvec.ravel(), tvec.ravel()])
 
 
-def render(scan: Scan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
+def render(
+    scan: ColouredScan, lens: Lens, pose: Floats
+) -> tuple[NDArray[np.uint8], NDArray[np.int64], Floats]:
     """Gray picture, point index (-1 where empty) and the points' projections, by splats in order of depth."""
     rotation = cv2.Rodrigues(pose[:3])[0]
     camera_points = scan.xyz @ rotation.T + pose[3:]
@@ -222,7 +224,7 @@ def render(scan: Scan, lens: Lens, pose: Floats) -> tuple[NDArray[np.uint8], NDA
     return picture, index, projected
 
 
-def correspond(photo: Photo, lens: Lens, scan: Scan) -> Photo:
+def correspond(photo: PosedPicture, lens: Lens, scan: ColouredScan) -> PosedPicture:
     """The photo with new correspondences: places of the render tracked into the photo."""
     small = lens.scaled(RENDER_WIDTH)
     picture, index, projected = render(scan, small, photo.pose)
@@ -259,7 +261,9 @@ def _equal_contrast(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.clip(128 + 45 * (values - mean) / (deviation + 4), 0, 255).astype(np.uint8)
 
 
-def adjust(photos: list[Photo], lens: Lens, free: tuple[int, ...]) -> tuple[list[Photo], Lens, Floats]:
+def adjust(
+    photos: list[PosedPicture], lens: Lens, free: tuple[int, ...]
+) -> tuple[list[PosedPicture], Lens, Floats]:
     """Poses of all photos and the lens parameters `free` (0 f, 1 cx, 2 cy, 3 k1, 4 k2, 5 p1, 6 p2) from all
     correspondences, robustly (Geman-McClure at three times the spread); also the covariance of the lens."""
     count = len(photos)
@@ -292,7 +296,7 @@ def adjust(photos: list[Photo], lens: Lens, free: tuple[int, ...]) -> tuple[list
     return moved, Lens(lens.width, lens.height, *values.tolist()), covariance
 
 
-def _linearise(photo: Photo, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:
+def _linearise(photo: PosedPicture, pose: Floats, lens: Lens) -> tuple[Floats, Floats]:
     """Photo minus projection (n, 2), and the projection's Jacobian (2n, 13) by pose and `Lens.values`."""
     projected, j = cv2.projectPoints(photo.world, pose[:3], pose[3:], lens.matrix(), lens.distortion())
     jacobian = np.column_stack([j[:, :6], j[:, 6] + j[:, 7], j[:, 8:10], j[:, 10:14]])

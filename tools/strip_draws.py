@@ -36,7 +36,7 @@ _FLIPPED = 0.25
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Strip:
+class CameraStrip:
     """Cameras along a line, and what they say of where (n, 3) and how they are."""
 
     flight: Flight
@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if fine else 1
 
 
-def measure(kind: str, strips: Sequence[Strip], seed: int) -> dict[str, float]:
+def measure(kind: str, strips: Sequence[CameraStrip], seed: int) -> dict[str, float]:
     """How many are placed and answer, and how often their errors lie inside their bounds."""
     figures = {f"{kind}_strips": float(len(strips))}
     for name, angles in (("", True), ("without_", False)):
@@ -101,7 +101,7 @@ def measure(kind: str, strips: Sequence[Strip], seed: int) -> dict[str, float]:
     return figures
 
 
-def real_strips(poses: Path, photos: Path) -> Iterator[Strip]:
+def real_strips(poses: Path, photos: Path) -> Iterator[CameraStrip]:
     """Runs of photos, in the order of their names, that lie along a line."""
     frame, by_name = read_poses(poses)
     names = sorted(by_name)
@@ -126,12 +126,12 @@ def real_strips(poses: Path, photos: Path) -> Iterator[Strip]:
                 times_s=seconds[rows] - seconds[first],
                 cam_from_local=tuple(by_name[name] for name in names[rows]),
             )
-            yield Strip(
+            yield CameraStrip(
                 flight=flight, positions=positions[rows], angles=tuple(exif.angles for exif in told[rows])
             )
 
 
-def simulated_strip(rng: np.random.Generator) -> Strip:
+def simulated_strip(rng: np.random.Generator) -> CameraStrip:
     """Six to fifteen photos along 60 to 200 m, all turned alike, from straight down to 50 degrees down."""
     count = int(rng.integers(6, 16))
     heading = rng.uniform(0.0, 2.0 * np.pi)
@@ -174,7 +174,7 @@ def simulated_strip(rng: np.random.Generator) -> Strip:
         cam_from_local=tuple(poses),
     )
     positions = xyz + rng.normal(0.0, noise, xyz.shape) + rng.normal(0.0, 1.0, 3) * rest
-    return Strip(flight=flight, positions=positions, angles=tuple(angles))
+    return CameraStrip(flight=flight, positions=positions, angles=tuple(angles))
 
 
 if __name__ == "__main__":

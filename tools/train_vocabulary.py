@@ -24,8 +24,8 @@ from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.index.descriptor_index import use_threads
 from featuredb.index.vocabulary import Vocabulary
 from ingest.executor import InProcessExecutor, PoolExecutor
-from ingest.extract import extract_photos, features_key
-from ingest.scan import ScanOptions, scan_folder
+from ingest.photos.scan import ScanOptions, scan_folder
+from ingest.sfm.extract import extract_photos, features_key
 from ingest.workspace import Workspace, read_array
 
 _FEATURES = 3000  # the strongest of a photo, those that PairOptions aggregates

@@ -13,14 +13,14 @@ from playwright.sync_api import Page, sync_playwright
 from featuredb.store import Database
 from reloc.viewer.photos import Pictures
 from reloc.viewer.query import Queries
-from reloc.viewer.scene import Scene
+from reloc.viewer.scene import ViewerScene
 from reloc.viewer.server import HOST, create_app, listen, uvicorn_server
 
 _SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 @contextmanager
-def open_page(database: Database, scene: Scene, photos: Path | None) -> Iterator[Page]:
+def open_page(database: Database, scene: ViewerScene, photos: Path | None) -> Iterator[Page]:
     """The page of a scene, 1280 x 720, loaded."""
     chromium = shutil.which("chromium")
     if chromium is None:

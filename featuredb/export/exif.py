@@ -19,8 +19,8 @@ from featuredb.export.attribution import (
 )
 from featuredb.export.colmap_model import image_names
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.shots import Shot, altitude_of, shots_of
-from featuredb.export.tally import Tally
+from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
+from featuredb.export.tally import ExportTally
 from featuredb.features.exif_gps_write import GpsFields, with_gps
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
@@ -61,7 +61,7 @@ def write_exif(job: ExportJob, photos: Path) -> Exported:
     if not photos.is_dir():
         raise ExportError(f"--photos {photos}: expected the folder of the photos, found none")
     found = files_by_sha256(photos)
-    tally = Tally()
+    tally = ExportTally()
     files: list[_File] = []
     attribution: list[Attribution] = []
     with whole_or_nothing(job.out) as part:
@@ -99,7 +99,7 @@ def files_by_sha256(folder: Path) -> dict[str, Path]:
     return found
 
 
-def with_pose(data: bytes, shot: Shot) -> bytes:
+def with_pose(data: bytes, shot: PosedPhoto) -> bytes:
     """The JPEG file with the photo's pose in its metadata.
 
     Raises:
@@ -113,7 +113,7 @@ def with_pose(data: bytes, shot: Shot) -> bytes:
     return with_app1(data, with_gps(tiff, gps_fields(shot)), with_properties(xmp, properties(shot), _STALE))
 
 
-def gps_fields(shot: Shot) -> GpsFields:
+def gps_fields(shot: PosedPhoto) -> GpsFields:
     """The position; heights above sea level where they are, or can be converted to, such."""
     altitude, datum = altitude_of(shot)
     east, north, _ = shot.sigma_enu_m
@@ -127,7 +127,7 @@ def gps_fields(shot: Shot) -> GpsFields:
     )
 
 
-def properties(shot: Shot) -> dict[str, str]:
+def properties(shot: PosedPhoto) -> dict[str, str]:
     """XMP: angles as DJI's gimbals tell them, accuracies as Pix4D and OpenDroneMap read them, attribution."""
     heading, pitch, roll = shot.geopose.heading_pitch_roll_deg
     yaw = (heading + 180.0) % 360.0 - 180.0
@@ -149,7 +149,7 @@ def properties(shot: Shot) -> dict[str, str]:
     return told
 
 
-def _copy(part: Path, name: Path, shot: Shot, original: Path | None) -> _File:
+def _copy(part: Path, name: Path, shot: PosedPhoto, original: Path | None) -> _File:
     reason = ""
     if original is None:
         reason = "no file of these bytes in the folder"

@@ -4,8 +4,8 @@ import json
 from typing import Any
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.shots import Shot, shots_of
-from featuredb.export.tally import Tally
+from featuredb.export.shots import PosedPhoto, shots_of
+from featuredb.export.tally import ExportTally
 
 
 def write_geojson(job: ExportJob) -> Exported:
@@ -14,7 +14,7 @@ def write_geojson(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = Tally()
+    tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         with part.open("w", encoding="utf-8", newline="\n") as out:
             out.write('{"type": "FeatureCollection", "features": [')
@@ -28,7 +28,7 @@ def write_geojson(job: ExportJob) -> Exported:
         return tally.exported(part)
 
 
-def feature(shot: Shot) -> dict[str, Any]:
+def feature(shot: PosedPhoto) -> dict[str, Any]:
     """One photo.
 
     The third coordinate is the height above the ellipsoid, as the standard wants it, where the map's datum

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
 from featuredb.export.job import Exported, ExportJob, write_json
-from featuredb.export.shots import Shot, shots_of
+from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.export.tally import folder_for_each_map
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
@@ -56,13 +56,13 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
     (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
 
 
-def _time(shot: Shot) -> int:
+def _time(shot: PosedPhoto) -> int:
     if shot.unix_ms is None:
         raise ValueError(f"{shot.name}: expected a time with its zone, found {shot.capture_time}")
     return shot.unix_ms
 
 
-def _file_names(shots: Sequence[Shot]) -> list[str]:
+def _file_names(shots: Sequence[PosedPhoto]) -> list[str]:
     counts = Counter(shot.name for shot in shots)
     return [
         folder_name(shot.name if counts[shot.name] == 1 else f"{shot.number}_{shot.name}") + ".json"

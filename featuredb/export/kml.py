@@ -4,8 +4,8 @@ import math
 from xml.sax.saxutils import escape
 
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
-from featuredb.export.shots import Shot, altitude_of, shots_of
-from featuredb.export.tally import Tally
+from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
+from featuredb.export.tally import ExportTally
 from featuredb.maps.feature_map import FeatureMap
 
 _NEAR_M = 10.0  # where the picture hangs ahead of the camera
@@ -20,7 +20,7 @@ def write_kml(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    tally = Tally()
+    tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         with part.open("w", encoding="utf-8", newline="\n") as out:
             out.write(
@@ -39,7 +39,7 @@ def write_kml(job: ExportJob) -> Exported:
         return tally.exported(part)
 
 
-def overlay(shot: Shot) -> str:
+def overlay(shot: PosedPhoto) -> str:
     """One photo as a PhotoOverlay.
 
     The camera looks down at tilt 0 and to the horizon at 90. Its roll turns about the axis that points from
@@ -80,7 +80,7 @@ def overlay(shot: Shot) -> str:
     )
 
 
-def field_of_view_deg(shot: Shot) -> tuple[float, float, float, float]:
+def field_of_view_deg(shot: PosedPhoto) -> tuple[float, float, float, float]:
     """Angles from the optical axis to the left, right, bottom and top edge, as KML signs them.
 
     By the focal length alone: KML's picture has no distortion.
@@ -94,19 +94,19 @@ def field_of_view_deg(shot: Shot) -> tuple[float, float, float, float]:
     return left, right, bottom, top
 
 
-def _told(feature_map: FeatureMap, shots: list[Shot]) -> str:
+def _told(feature_map: FeatureMap, shots: list[PosedPhoto]) -> str:
     datum = altitude_of(shots[0])[1] if shots else feature_map.height_datum
     return f"map {feature_map.map_id}, {len(shots)} photos; altitudes: {datum}"
 
 
-def _credit(shot: Shot) -> str:
+def _credit(shot: PosedPhoto) -> str:
     owner, licence = shot.owner or "owner unknown", shot.licence or "licence unknown"
     horizontal = float((shot.sigma_enu_m[0] ** 2 + shot.sigma_enu_m[1] ** 2) ** 0.5)
     accuracy = f"{horizontal:.2f} m horizontally, {shot.sigma_enu_m[2]:.2f} m vertically"
     return f"{owner}; {licence}; position +- {accuracy}"
 
 
-def _when(shot: Shot) -> str:
+def _when(shot: PosedPhoto) -> str:
     """XML's time; without a zone where the photo names none."""
     assert shot.capture_time is not None
     return shot.capture_time.isoformat(timespec="seconds")

@@ -9,7 +9,7 @@ from numpy.typing import DTypeLike, NDArray
 from featuredb.export.attribution import attribution_of
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.point_files import MapList, sigma_m, zones_of
-from featuredb.export.tally import Tally
+from featuredb.export.tally import ExportTally
 from featuredb.lidar.las_stream import LasStream, offset_and_step
 
 EXTRA: dict[str, tuple[DTypeLike, str]] = {
@@ -27,7 +27,7 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
         ExportError: nothing is selected, no points, or there is something at `job.out`.
         InvalidValueError: maps of one zone too far apart for one file. MissingExtraError: no laspy.
     """
-    zones, tally, maps = zones_of(job.summaries()), Tally(), MapList()
+    zones, tally, maps = zones_of(job.summaries()), ExportTally(), MapList()
     ending = ".laz" if compressed else ".las"
     with whole_or_nothing(job.out) as part:
         part.mkdir()

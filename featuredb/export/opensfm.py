@@ -16,7 +16,7 @@ from featuredb.export.colmap_model import image_names
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob, write_json
 from featuredb.export.opensfm_camera import opensfm_camera
-from featuredb.export.shots import Shot, shots_of
+from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.export.tally import folder_for_each_map
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
@@ -119,7 +119,7 @@ def _write_tracks(out: IO[str], feature_map: FeatureMap, names: list[str]) -> No
         )
 
 
-def _odm_shot(shot: Shot, image: MapImage, feature_map: FeatureMap, name: str) -> dict[str, Any]:
+def _odm_shot(shot: PosedPhoto, image: MapImage, feature_map: FeatureMap, name: str) -> dict[str, Any]:
     """As ODM writes it: position in UTM, rotation against the grid's axes."""
     camera = opensfm_camera(shot.camera)
     center = image.cam_from_local.center

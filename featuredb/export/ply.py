@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from featuredb.export.attribution import attribution_of, folder_name
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.point_files import MapList, Zone, sigma_m, zones_of
-from featuredb.export.tally import Tally
+from featuredb.export.tally import ExportTally
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import PointColumns
 from featuredb.maps.unplaced_map import UnplacedMap
@@ -41,7 +41,7 @@ def write_ply_files(job: ExportJob) -> Exported:
         ExportError: nothing is selected, no points, or there is something at `job.out`.
     """
     placed = [m for m in job.any_summaries() if isinstance(m, MapSummary)]
-    zones, tally, maps = zones_of(placed) if placed else {}, Tally(), MapList()
+    zones, tally, maps = zones_of(placed) if placed else {}, ExportTally(), MapList()
     with whole_or_nothing(job.out) as part:
         part.mkdir()
         counts: dict[tuple[int, str], int] = {}

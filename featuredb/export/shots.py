@@ -18,7 +18,7 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Shot:
+class PosedPhoto:
     """One photo.
 
     Attributes:
@@ -53,7 +53,7 @@ class Shot:
         return None if time is None or time.tzinfo is None else round(1000.0 * time.timestamp())
 
 
-def shots_of(feature_map: FeatureMap) -> Iterator[Shot]:
+def shots_of(feature_map: FeatureMap) -> Iterator[PosedPhoto]:
     """Every photo of the map, in its order."""
     for image in feature_map.images:
         placed = geopose_from_camera(image.cam_from_local, feature_map.frame)
@@ -63,7 +63,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[Shot]:
         height = placed.height_m if converted.height_m is None else converted.height_m
         covariance = pose_covariance(feature_map, image)
         sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        yield Shot(
+        yield PosedPhoto(
             map_id=feature_map.map_id,
             number=image.image_id,
             name=image.name,
@@ -86,7 +86,7 @@ def shots_of(feature_map: FeatureMap) -> Iterator[Shot]:
         )
 
 
-def altitude_of(shot: Shot) -> tuple[float, str]:
+def altitude_of(shot: PosedPhoto) -> tuple[float, str]:
     """Altitude above sea level in metres, and what it is counted from."""
     if shot.map_height_datum != "ellipsoidal":
         return shot.map_height_m, shot.map_height_datum

@@ -10,7 +10,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap
 
 
-class Tally:
+class ExportTally:
     """Counts of the maps that went through; `exported` is their sum with the bytes on disk."""
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ _Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 
 
 def _folders(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
-    tally = Tally()
+    tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         part.mkdir()
         for feature_map in maps:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from featuredb.lidar.levels import order_by_level
 from featuredb.lidar.ortho import ColourOptions, OrthoImage, colour_by_ortho
 from featuredb.lidar.outliers import OutlierOptions, find_outliers
-from featuredb.lidar.spill import SPILLED, Block, Spill
+from featuredb.lidar.spill import SPILLED, Spill, TileBlock
 from featuredb.lidar.staged import BlockPlan
 from featuredb.store.scans import POINT_ROW
 
@@ -32,7 +32,7 @@ class Colouring:
 def clean_block(
     spill: Spill,
     plan: BlockPlan,
-    block: Block,
+    block: TileBlock,
     outliers: OutlierOptions | None,
     colouring: Colouring | None = None,
 ) -> tuple[NDArray[Any], int]:
@@ -67,7 +67,7 @@ def clean_block(
 def _without_outliers(
     spill: Spill,
     plan: BlockPlan,
-    block: Block,
+    block: TileBlock,
     outliers: OutlierOptions | None,
     colouring: Colouring | None,
 ) -> tuple[NDArray[Any], int, int]:

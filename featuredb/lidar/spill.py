@@ -1,6 +1,6 @@
 """First pass over a scan: its points in UTM, sorted by tile into temporary files, and counted.
 
-Tiles with too many points for the memory are split into quarters until each piece, a `Block`, is small
+Tiles with too many points for the memory are split into quarters until each piece, a `TileBlock`, is small
 enough. Edges of blocks are edges of the store's tiles halved again and again, and so never cut a voxel of the
 levels of detail.
 """
@@ -33,7 +33,7 @@ _SMALLEST_BLOCK_M = 1.0  # below it a block is taken as it is; no scan has a mil
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Block:
+class TileBlock:
     """A square of one tile and the file that holds its points.
 
     Attributes:
@@ -56,7 +56,7 @@ class Block:
         beside = np.abs(utm[:, :2] - (np.array([self.e0, self.n0]) + self.size_m / 2.0)) - self.size_m / 2.0
         return np.asarray(np.maximum(beside.max(axis=1, initial=0.0), 0.0), np.float64)
 
-    def near(self, other: "Block", margin_m: float) -> bool:
+    def near(self, other: "TileBlock", margin_m: float) -> bool:
         """Whether the other block reaches into this one's surroundings."""
         return (
             other.e0 <= self.e0 + self.size_m + margin_m
@@ -132,26 +132,26 @@ class Spill:
             self._append(rows)
             on_progress(counts.read)
 
-    def split(self, largest_points: int) -> list[Block]:
+    def split(self, largest_points: int) -> list[TileBlock]:
         """Split what is too large; returns all blocks, ordered by tile."""
-        blocks: list[Block] = []
+        blocks: list[TileBlock] = []
         for tile in sorted(self._tiles):
             e0, n0, e1, _ = tile_bounds(tile)
-            whole = Block(key=tile, tile=tile, e0=e0, n0=n0, size_m=e1 - e0, points=self._tiles[tile])
+            whole = TileBlock(key=tile, tile=tile, e0=e0, n0=n0, size_m=e1 - e0, points=self._tiles[tile])
             blocks += self._split(whole, largest_points)
         return blocks
 
-    def rows(self, block: Block) -> NDArray[Any]:
+    def rows(self, block: TileBlock) -> NDArray[Any]:
         """(n,) SPILLED, all points of a block."""
         return np.fromfile(self._path(block.key), SPILLED)
 
-    def chunks(self, block: Block) -> Iterator[NDArray[Any]]:
+    def chunks(self, block: TileBlock) -> Iterator[NDArray[Any]]:
         """The points of a block, piece by piece."""
         with self._path(block.key).open("rb") as stream:
             while len(rows := np.fromfile(stream, SPILLED, _CHUNK_ROWS)):
                 yield rows
 
-    def around(self, block: Block, blocks: Sequence[Block], margin_m: float) -> NDArray[Any]:
+    def around(self, block: TileBlock, blocks: Sequence[TileBlock], margin_m: float) -> NDArray[Any]:
         """(n,) SPILLED, the points of other blocks at most `margin_m` away from a block in plan."""
         found = [np.empty(0, SPILLED)]
         for other in blocks:
@@ -193,7 +193,7 @@ class Spill:
             i, j = (part["utm"][:, :2] % TILE_SIZE_M // _CELL_M).astype(np.int64).T
             cells[np.minimum(i, _CELLS - 1), np.minimum(j, _CELLS - 1)] = True
 
-    def _split(self, block: Block, largest_points: int) -> list[Block]:
+    def _split(self, block: TileBlock, largest_points: int) -> list[TileBlock]:
         half = block.size_m / 2.0
         if block.points <= largest_points or half < _SMALLEST_BLOCK_M:
             return [block]
@@ -212,12 +212,12 @@ class Spill:
                 with self._path(key).open("ab") as stream:
                     part.tofile(stream)
         self._path(block.key).unlink()
-        pieces: list[Block] = []
+        pieces: list[TileBlock] = []
         for number, key in enumerate(keys):
             if not counts[number]:
                 self._path(key).unlink()
                 continue
-            piece = Block(
+            piece = TileBlock(
                 key=key,
                 tile=block.tile,
                 e0=block.e0 + half * (number % 2),

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ScanError
 from featuredb.lidar.intensity import IntensityStretch
-from featuredb.lidar.spill import Block
+from featuredb.lidar.spill import TileBlock
 from featuredb.store.scans import TilePoints
 
 # Tiles are committed together until they have this many points: fewer, larger commits.
@@ -40,7 +40,7 @@ class BlockPlan:
     finest_level: int
     stretch: IntensityStretch | None
     colour_bits: tuple[int, ...]
-    blocks: tuple[Block, ...]
+    blocks: tuple[TileBlock, ...]
 
     def to_json(self) -> dict[str, Any]:
         """As JSON can hold it."""
@@ -55,7 +55,7 @@ class BlockPlan:
                 **value,
                 "stretch": None if stretch is None else IntensityStretch(**stretch),
                 "colour_bits": tuple(value["colour_bits"]),
-                "blocks": tuple(Block(**block) for block in value["blocks"]),
+                "blocks": tuple(TileBlock(**block) for block in value["blocks"]),
             }
         )
 
@@ -80,11 +80,11 @@ class Staged:
         self._plan = plan
         folder.mkdir(parents=True, exist_ok=True)
 
-    def has(self, block: Block) -> bool:
+    def has(self, block: TileBlock) -> bool:
         """Whether a block is finished."""
         return self._path(block, "json").is_file()
 
-    def put(self, block: Block, rows: NDArray[Any], outliers: int) -> None:
+    def put(self, block: TileBlock, rows: NDArray[Any], outliers: int) -> None:
         """Keep a finished block.
 
         Args:
@@ -138,7 +138,7 @@ class Staged:
 
     def groups(self) -> list[Callable[[], Iterator[TilePoints]]]:
         """What is to be committed, tile after tile."""
-        groups: list[list[Block]] = [[]]
+        groups: list[list[TileBlock]] = [[]]
         for _, blocks in groupby(self._plan.blocks, key=lambda block: block.tile):
             tile = list(blocks)
             if groups[-1] and sum(b.points for b in (*groups[-1], *tile)) > _POINTS_PER_COMMIT:
@@ -146,11 +146,11 @@ class Staged:
             groups[-1] += tile
         return [lambda group=group: self._points(group) for group in groups]  # type: ignore[misc]
 
-    def _points(self, blocks: list[Block]) -> Iterator[TilePoints]:
+    def _points(self, blocks: list[TileBlock]) -> Iterator[TilePoints]:
         for block in blocks:
             rows = np.load(self._path(block, "npy"))
             if len(rows):
                 yield TilePoints(tile=block.tile, rows=rows, has_intensity=self._plan.stretch is not None)
 
-    def _path(self, block: Block, suffix: str) -> Path:
+    def _path(self, block: TileBlock, suffix: str) -> Path:
         return self._folder / f"{block.key}.{suffix}"

@@ -36,7 +36,7 @@ class Described(Protocol):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Lineage:
+class MapLineage:
     """What one map stands on.
 
     Attributes:
@@ -58,7 +58,7 @@ class Lineage:
         return len(self.chain) - 1 if self.anchors else None
 
 
-def trace(map_id: str, maps: Mapping[str, Described]) -> Lineage:
+def trace(map_id: str, maps: Mapping[str, Described]) -> MapLineage:
     """The lineage of a map among the maps of a snapshot, by id.
 
     Chains lead over maps that live. Where none does (the map is retired with all that placed it), over
@@ -68,10 +68,10 @@ def trace(map_id: str, maps: Mapping[str, Described]) -> Lineage:
     chain, anchors = _to_anchors(me, {m: other for m, other in maps.items() if other.status != "retired"})
     if not anchors:
         chain, anchors = _to_anchors(me, maps)
-    return Lineage(map_id=map_id, chain=chain, anchors=anchors, drift_m=me.drift_m, budget_m=me.budget_m)
+    return MapLineage(map_id=map_id, chain=chain, anchors=anchors, drift_m=me.drift_m, budget_m=me.budget_m)
 
 
-def describe_lineage(lineage: Lineage) -> str:
+def describe_lineage(lineage: MapLineage) -> str:
     """In words: "3 steps from anchor A12, 0.31 of 0.50 m"."""
     return lineage_text(lineage.steps, lineage.anchors, lineage.drift_m, lineage.budget_m)
 

@@ -18,7 +18,7 @@ _PROBE_POINTS = 16.0  # points per probing cell: enough that its spacing is know
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LevelOptions:
+class DetailLevelOptions:
     """How points are ordered.
 
     Attributes:
@@ -39,7 +39,7 @@ def build_cloud(
     rgb: ArrayLike | None = None,
     intensity: ArrayLike | None = None,
     classification: ArrayLike | None = None,
-    options: LevelOptions | None = None,
+    options: DetailLevelOptions | None = None,
 ) -> PointCloud:
     """A cloud whose points are ordered into levels, each with half the spacing of the one before.
 
@@ -58,7 +58,7 @@ def build_cloud(
         InvalidValueError: no points, wrong shapes, coordinates that are not finite.
         MissingExtraError: numba is not installed.
     """
-    options = options or LevelOptions()
+    options = options or DetailLevelOptions()
     points = np.ascontiguousarray(xyz, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InvalidValueError(f"build_cloud: expected points (n, 3) with n >= 1, found {points.shape}")
@@ -110,7 +110,7 @@ def _bytes(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.ui
 
 
 def _order(
-    points: NDArray[np.float32], options: LevelOptions
+    points: NDArray[np.float32], options: DetailLevelOptions
 ) -> tuple[NDArray[np.int64], CloudNodes, NDArray[np.float32]]:
     """The rows in drawing order, the nodes, and the spacing around each row in that order."""
     loops = compiled_module("featuredb.render.level_loops")

@@ -12,7 +12,7 @@ from featuredb.simworld.days import another_day
 from featuredb.simworld.echoes import echoes_of, return_numbers
 from featuredb.simworld.photograph import moving_cars
 from featuredb.simworld.reflectance import scene_reflectance
-from featuredb.simworld.scan_options import ScanOptions as ScanOptions
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scene import Faces, Scene
 from featuredb.simworld.strip import Strip, answered, classes_of, objects_hit, received_light, with_outliers
 
@@ -64,9 +64,9 @@ class AirborneScan:
         return self.frame.utm_from_enu(self.xyz, self.epsg)
 
 
-def scan_town(scene: Scene, options: ScanOptions | None = None) -> AirborneScan:
+def scan_town(scene: Scene, options: AirborneScanOptions | None = None) -> AirborneScan:
     """Fly over a scene and scan it, with a margin around the town."""
-    options = options or ScanOptions()
+    options = options or AirborneScanOptions()
     rng = np.random.default_rng((scene.seed, options.seed, 51))
     heading = float(rng.uniform(0, 180)) if options.heading_deg is None else options.heading_deg
     today = another_day(scene, options.day)
@@ -88,7 +88,7 @@ def scan_town(scene: Scene, options: ScanOptions | None = None) -> AirborneScan:
 
 
 def _strips(
-    scene: Scene, options: ScanOptions, heading_deg: float
+    scene: Scene, options: AirborneScanOptions, heading_deg: float
 ) -> list[tuple[FloatArray, float, tuple[float, float]]]:
     """flight_from_local (3, 3), y of the track in those axes, and its reach along x, of strips to and fro."""
     half = 0.5 * np.asarray(scene.plan.size) + options.margin_m
@@ -109,7 +109,7 @@ def _strips(
     return [(turn, track, reach) for _, turn, track, reach in sorted(strips, key=lambda s: s[0])]
 
 
-def _beams(options: ScanOptions, reach: tuple[float, float], rng: np.random.Generator) -> Beams:
+def _beams(options: AirborneScanOptions, reach: tuple[float, float], rng: np.random.Generator) -> Beams:
     """The grid of beams of a strip over the origin's track."""
     limit = np.radians(options.max_scan_angle_deg)
     across = max(2, round(2 * options.height_m * np.tan(limit) * np.sqrt(options.density_per_m2)))

@@ -7,7 +7,7 @@ from featuredb.simworld.days import DayOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ScanOptions:
+class AirborneScanOptions:
     """An airborne scan. The same options and scene give the same points.
 
     Attributes:
@@ -55,4 +55,4 @@ class ScanOptions:
             and 0 <= self.sway_deg <= 2
             and all(0 <= s <= 1 for s in shares)
         ):
-            raise InvalidValueError(f"ScanOptions: value out of range in {self}")
+            raise InvalidValueError(f"AirborneScanOptions: value out of range in {self}")

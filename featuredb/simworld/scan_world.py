@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Literal
 
 from featuredb.extras import require
-from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.ortho import OrthoOptions, make_ortho
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scene import Scene
 from featuredb.simworld.town import make_town
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
@@ -38,7 +39,7 @@ class ScanWorldOptions:
     """
 
     world: WorldOptions = field(default_factory=WorldOptions)
-    scan: ScanOptions = field(default_factory=ScanOptions)
+    scan: AirborneScanOptions = field(default_factory=AirborneScanOptions)
     ortho: OrthoOptions = field(default_factory=OrthoOptions)
 
     def fingerprint(self) -> str:

@@ -9,7 +9,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld.beams import NOTHING, Hits
 from featuredb.simworld.echoes import Echoes
 from featuredb.simworld.reflectance import LEAVES, Reflectance
-from featuredb.simworld.scan_options import ScanOptions
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scene import TEXTURES, Faces, Scene
 from featuredb.simworld.town import BRIDGE_ID, BUILDING_ID, GROUND_ID, TREE_ID, WATER_ID
 
@@ -29,7 +29,7 @@ class Strip:
     scene: Scene
     faces: Faces
     reflectance: Reflectance
-    options: ScanOptions
+    options: AirborneScanOptions
     number: int
     shift: FloatArray
 
@@ -44,7 +44,7 @@ def answered(
 
 
 def with_outliers(
-    echoes: Echoes, hits: Hits, options: ScanOptions, rng: np.random.Generator
+    echoes: Echoes, hits: Hits, options: AirborneScanOptions, rng: np.random.Generator
 ) -> tuple[Echoes, NDArray[np.bool_]]:
     """Some beams' echoes replaced by one bird or one echo that took a detour; which rows these are."""
     draw = rng.random(hits.distance.size)

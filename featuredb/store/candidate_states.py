@@ -123,7 +123,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Standing:
+class CandidateStanding:
     """What has become of a candidate; see `Candidate`."""
 
     state: CandidateState
@@ -142,7 +142,7 @@ def event_order(event: "Row") -> tuple[datetime, str, int]:
     return event["happened_at"], event["write_id"], event["event_index"]
 
 
-def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Standing:
+def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> CandidateStanding:
     """The state that a candidate's events add up to.
 
     The latest refusal, withdrawal or opening decides, unless it was used after it: then it is used while one
@@ -163,10 +163,12 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Standing
             latest, used = event, []
     if used:
         living = tuple(m for m in dict.fromkeys(used) if m in live_maps)
-        return Standing(state="used", used_by=living) if living else Standing(state="waiting")
+        return (
+            CandidateStanding(state="used", used_by=living) if living else CandidateStanding(state="waiting")
+        )
     if latest is None or latest["event"] in (REOPENED, CONTRIBUTED):
-        return Standing(state="waiting")
-    return Standing(
+        return CandidateStanding(state="waiting")
+    return CandidateStanding(
         state="refused" if latest["event"] == REFUSED else "withdrawn",
         reason_code=latest["reason_code"] or "",
         reason=latest["reason"] or "",

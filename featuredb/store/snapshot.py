@@ -10,7 +10,7 @@ import pyarrow.dataset as ds
 
 from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
-from featuredb.maps.lineage import Lineage, drift_and_budget, trace
+from featuredb.maps.lineage import MapLineage, drift_and_budget, trace
 from featuredb.maps.unplaced_map import AnyMap, NoPlace, OwnFrame, UnplacedMap, UnplacedStatus
 from featuredb.store.changes import RETIRED
 from featuredb.store.decode import decode_map, decode_no_place, has_place
@@ -173,7 +173,7 @@ class Snapshot:
             )
         return self.get_any(found[0])
 
-    def lineages(self) -> dict[str, Lineage]:
+    def lineages(self) -> dict[str, MapLineage]:
         """What each map of the snapshot stands on, retired ones included, by id."""
         known = {m.map_id: m for m in self.maps(include_retired=True)}
         return {map_id: trace(map_id, known) for map_id in known}

@@ -55,7 +55,7 @@ _INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observati
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Problem:
+class DatabaseProblem:
     """One thing that is wrong: where (table and file, or map), and what."""
 
     where: str
@@ -81,7 +81,7 @@ class VerifyReport:
     canaries: int
     files: int
     rows: int
-    problems: tuple[Problem, ...]
+    problems: tuple[DatabaseProblem, ...]
     orphans: tuple[str, ...]
 
     @property
@@ -96,7 +96,7 @@ def verify(database: Database) -> VerifyReport:
         StoreError: the table `maps` itself, without which nothing can be said, is not readable.
     """
     snapshot = database.snapshot()
-    problems: list[Problem] = []
+    problems: list[DatabaseProblem] = []
     files = rows = 0
     scans = list_scans(database)
     lidar = LIDAR_TABLES if has_scans(database) else ()
@@ -111,7 +111,7 @@ def verify(database: Database) -> VerifyReport:
     for scan in scans:
         problems += check_scan(database, scan)
     for where, what in (*check_candidates(database), *check_canaries(database)):
-        problems.append(Problem(where=where, what=what))
+        problems.append(DatabaseProblem(where=where, what=what))
     orphans = [] if problems else _orphans(database)
     return VerifyReport(
         version=snapshot.version,
@@ -126,7 +126,7 @@ def verify(database: Database) -> VerifyReport:
     )
 
 
-def check_files(table: Table) -> Iterator[Problem]:
+def check_files(table: Table) -> Iterator[DatabaseProblem]:
     """Does every file open, and has it as many rows as the log says?"""
     expected = {file.path: file.rows for file in table.files()}
     for fragment in table.dataset().get_fragments():
@@ -134,15 +134,15 @@ def check_files(table: Table) -> Iterator[Problem]:
         try:
             found = fragment.metadata.num_rows
         except (OSError, pa.ArrowException) as error:
-            yield Problem(where=where, what=f"cannot be opened: {_one_line(error)}")
+            yield DatabaseProblem(where=where, what=f"cannot be opened: {_one_line(error)}")
             continue
         if found != expected[fragment.path]:
-            yield Problem(
+            yield DatabaseProblem(
                 where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
             )
 
 
-def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
+def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
     """Do the child rows of one map agree with its row, with each other and with what was committed?"""
     where = f"map {row['map_id']}"
     mine = ds.field("write_id") == row["write_id"]
@@ -155,7 +155,7 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
             ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
-            yield Problem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
+            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
@@ -163,19 +163,21 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[Problem]:
         *_check_references(row, tables),
         *(_check_places(row, tables) if has_place(row) else _check_no_place(tables)),
     ]
-    yield from (Problem(where=where, what=what) for what in found)
+    yield from (DatabaseProblem(where=where, what=what) for what in found)
     if found:
         return
     try:
         digest = content_digest(snapshot.load_any(row["map_id"]))
     except FeatureDbError as error:
-        yield Problem(where=where, what=f"cannot be loaded: {_one_line(error)}")
+        yield DatabaseProblem(where=where, what=f"cannot be loaded: {_one_line(error)}")
         return
     if digest != row["content_digest"]:
-        yield Problem(where=where, what="its rows are not those that were committed: content digests differ")
+        yield DatabaseProblem(
+            where=where, what="its rows are not those that were committed: content digests differ"
+        )
 
 
-def check_scan(database: Database, scan: ScanSummary) -> Iterator[Problem]:
+def check_scan(database: Database, scan: ScanSummary) -> Iterator[DatabaseProblem]:
     """Do the points of a scan agree with its row, and are they those that were committed?"""
     where = f"scan {scan.scan_id}"
     levels, coordinates = np.zeros(len(scan.level_points), np.int64), PointsChecksum()
@@ -187,23 +189,25 @@ def check_scan(database: Database, scan: ScanSummary) -> Iterator[Problem]:
             coordinates.add(utm)
             levels += np.bincount(batch["level"].to_numpy(), minlength=len(levels))[: len(levels)]
             if not np.isfinite(utm).all():
-                yield Problem(where=where, what="coordinates that are not finite")
+                yield DatabaseProblem(where=where, what="coordinates that are not finite")
                 return
             elsewhere += int((tile_of(utm) != batch["tile"].to_numpy(zero_copy_only=False)).sum())
             outside += int((~((utm >= low) & (utm <= high)).all(axis=1)).sum())
     except (OSError, pa.ArrowException) as error:
-        yield Problem(where=where, what=f"cannot read its points: {_one_line(error)}")
+        yield DatabaseProblem(where=where, what=f"cannot read its points: {_one_line(error)}")
         return
     if levels.tolist() != list(scan.level_points):
-        yield Problem(
+        yield DatabaseProblem(
             where=where, what=f"expected {list(scan.level_points)} points by level, found {levels.tolist()}"
         )
     elif coordinates.text() != scan.row["points_checksum"]:
-        yield Problem(where=where, what="its points are not those that were committed: checksums differ")
+        yield DatabaseProblem(
+            where=where, what="its points are not those that were committed: checksums differ"
+        )
     if elsewhere:
-        yield Problem(where=where, what=f"{elsewhere} points in another tile than their coordinates'")
+        yield DatabaseProblem(where=where, what=f"{elsewhere} points in another tile than their coordinates'")
     if outside:
-        yield Problem(where=where, what=f"{outside} points outside the scan's box")
+        yield DatabaseProblem(where=where, what=f"{outside} points outside the scan's box")
 
 
 def _check_counts(row: Row, tables: dict[str, pa.Table]) -> Iterator[str]:

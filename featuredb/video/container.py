@@ -14,7 +14,7 @@ from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from featuredb.errors import VideoError
-from featuredb.video.decoding import Decoder, FilmClock, Tally
+from featuredb.video.decoding import Decoder, FilmClock, ReadingTally
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
 from featuredb.video.opening import Opening, Source, coded_pixels, open_input, opening_of
 from featuredb.video.pixels import PixelReader
@@ -56,7 +56,7 @@ def _opened(container: InputContainer, opening: Opening, options: VideoOptions) 
     context.thread_type = "SLICE" if context.name == "hevc" else "AUTO"
     context.thread_count = options.threads
     context.options = {"max_pixels": str(coded_pixels(options))}
-    tally = Tally()
+    tally = ReadingTally()
     decoder = Decoder(container, stream, _clock(container, stream), tally, opening.name)
     pictures = decoder.pictures()
     first = next(pictures, None)
@@ -92,7 +92,7 @@ class ContainerVideo(Video):
         container: InputContainer,
         decoder: Decoder,
         begun: tuple[tuple[float, av.VideoFrame], Iterator[tuple[float, av.VideoFrame]]],
-        tally: Tally,
+        tally: ReadingTally,
         expected: tuple[int | None, float | None],
         options: VideoOptions,
     ) -> None:

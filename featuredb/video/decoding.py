@@ -29,7 +29,7 @@ _MAX_BACKWARD_IN_A_ROW = 250
 
 
 @dataclass(slots=True)
-class Tally:
+class ReadingTally:
     """Counts of one reading; see `VideoReport` for what they mean."""
 
     delivered: int = 0
@@ -112,7 +112,7 @@ class Decoder:
     """
 
     def __init__(
-        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: Tally, name: str
+        self, container: InputContainer, stream: VideoStream, clock: FilmClock, tally: ReadingTally, name: str
     ) -> None:
         self._container, self._stream = container, stream
         self._clock, self._tally, self._name = clock, tally, name

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.pairs import Pair
+from ingest.sfm.pairs import Pair
 
 # A cut that leaves less on one side is none; a photo that everybody matches has no middle.
 _LEAST_HALF = 0.1
@@ -39,7 +39,7 @@ class ClusterOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Block:
+class PhotoBlock:
     """Photos that are reconstructed together.
 
     Attributes:
@@ -57,10 +57,10 @@ class Block:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Cluster:
+class PhotoCluster:
     """Photos of one map to be: one block, or several that are joined."""
 
-    blocks: tuple[Block, ...]
+    blocks: tuple[PhotoBlock, ...]
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -70,7 +70,7 @@ class Cluster:
 
 def find_clusters(
     photos: int, inliers: Mapping[Pair, int], min_photos: int, options: ClusterOptions
-) -> list[Cluster]:
+) -> list[PhotoCluster]:
     """Clusters of photos that verified pairs connect, largest first.
 
     Args:
@@ -89,13 +89,13 @@ def find_clusters(
     return sorted(clusters, key=lambda c: (-len(c.rows), c.rows))
 
 
-def _cluster(graph: "Graph", rows: NDArray[np.int64], options: ClusterOptions) -> Cluster:
+def _cluster(graph: "Graph", rows: NDArray[np.int64], options: ClusterOptions) -> PhotoCluster:
     cores = graph.cut(rows, options.max_block_photos)
     if len(cores) == 1:
-        return Cluster(blocks=(Block(own=_plain(rows)),))
-    return Cluster(
+        return PhotoCluster(blocks=(PhotoBlock(own=_plain(rows)),))
+    return PhotoCluster(
         blocks=tuple(
-            Block(own=_plain(core), shared=_plain(graph.seam(core, rows, options))) for core in cores
+            PhotoBlock(own=_plain(core), shared=_plain(graph.seam(core, rows, options))) for core in cores
         )
     )
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_bridge import Model
-from ingest.links import tied_parts
+from ingest.colmap.bridge import Model
 from ingest.register.structure.similarity import similarities
+from ingest.sfm.links import tied_parts
 
 _LOG = logging.getLogger(__name__)
 _KEYPOINTS = 1 << 32  # more than any photo has
@@ -69,7 +69,7 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Joined:
+class JoinedModel:
     """Models that are one.
 
     Attributes:
@@ -81,7 +81,7 @@ class Joined:
     first_from: tuple[Sim3, ...]
 
 
-def join(models: Sequence[Model], options: JoinOptions) -> list[Joined]:
+def join(models: Sequence[Model], options: JoinOptions) -> list[JoinedModel]:
     """Groups of models that agree, largest model first. `rows` of all models number the same photos."""
     joints = []
     for a, b in itertools.combinations(range(len(models)), 2):
@@ -239,7 +239,7 @@ def _along(way: Sequence[Joint], start: int) -> Sim3:
     return total
 
 
-def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[Joined]:
+def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[JoinedModel]:
     """What the joints connect, largest group first."""
     left = sorted(range(len(models)), key=lambda k: (-len(models[k].rows), k))
     groups = []
@@ -247,7 +247,7 @@ def _groups(tree: Sequence[Joint], models: Sequence[Model]) -> list[Joined]:
         root = left[0]
         ways = {k: way for k in left if (way := _way(tree, root, k)) is not None}
         groups.append(
-            Joined(members=tuple(ways), first_from=tuple(_along(way, root) for way in ways.values()))
+            JoinedModel(members=tuple(ways), first_from=tuple(_along(way, root) for way in ways.values()))
         )
         left = [k for k in left if k not in ways]
     return sorted(groups, key=lambda g: -sum(len(models[k].rows) for k in g.members))

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.clusters.graph import Block, Cluster
-from ingest.clusters.join import Joined, JoinOptions, hangs_together, join
-from ingest.colmap_adjust import adjust_posed
-from ingest.colmap_bridge import Model, read_model, read_models, write_posed
+from ingest.clusters.graph import PhotoBlock, PhotoCluster
+from ingest.clusters.join import JoinedModel, JoinOptions, hangs_together, join
+from ingest.colmap.adjust import adjust_posed
+from ingest.colmap.bridge import Model, read_model, read_models, write_posed
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.pairs import Pair
-from ingest.sfm import (
+from ingest.sfm.mapper import (
     SfmOptions,
     SfmTask,
     SfmView,
@@ -30,6 +29,7 @@ from ingest.sfm import (
     loss_scale_px,
     reconstruct,
 )
+from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace, atomic_folder
 
 _LOG = logging.getLogger(__name__)
@@ -116,7 +116,7 @@ class _JoinTask:
 
 
 def reconstruct_clusters(
-    clusters: Sequence[Cluster],
+    clusters: Sequence[PhotoCluster],
     cameras: Sequence[tuple[Camera, bool]],
     views: Sequence[SfmView],
     matches: Mapping[Pair, Path],
@@ -165,7 +165,7 @@ def _count(tasks: Sequence[Sequence[object]]) -> int:
 
 
 def _collected(
-    clusters: Sequence[Cluster],
+    clusters: Sequence[PhotoCluster],
     block_tasks: Sequence[Sequence[_BlockTask]],
     joins: Sequence[_JoinTask],
     failed: Mapping[Path, str],
@@ -222,7 +222,7 @@ class _Tasks:
 
 
 def _join_task(
-    cluster: Cluster,
+    cluster: PhotoCluster,
     sfm: SfmTask,
     tasks: Sequence[_BlockTask],
     failed: Mapping[Path, str],
@@ -234,7 +234,7 @@ def _join_task(
     def rows(of: Sequence[int]) -> tuple[int, ...]:
         return tuple(place[row] for row in of)
 
-    good: list[tuple[Block, _BlockTask]] = [
+    good: list[tuple[PhotoBlock, _BlockTask]] = [
         (b, t) for b, t in zip(cluster.blocks, tasks, strict=True) if t.folder not in failed
     ]
     key = digest(sfm.key(), options_fingerprint(options), *(t.folder.name for _, t in good))[:24]
@@ -319,7 +319,7 @@ def _join(task: _JoinTask) -> None:
                 _LOG.info("%s: the joint of %d photos does not hold; apart again", task, len(poses))
                 shutil.rmtree(folder, ignore_errors=True)
                 groups.extendleft(
-                    Joined(members=(m,), first_from=(Sim3.identity(),)) for m in reversed(group.members)
+                    JoinedModel(members=(m,), first_from=(Sim3.identity(),)) for m in reversed(group.members)
                 )
                 continue
             taken |= {int(row) for row in kept}
@@ -336,7 +336,7 @@ def _block_models(task: _JoinTask) -> tuple[list[Model], list[frozenset[int]]]:
     return models, own
 
 
-def _poses(group: Joined, models: Sequence[Model], own: Sequence[frozenset[int]]) -> dict[int, Rigid3]:
+def _poses(group: JoinedModel, models: Sequence[Model], own: Sequence[frozenset[int]]) -> dict[int, Rigid3]:
     """Pose of every photo of the group: of the block whose own it is, where that has registered it."""
     poses: dict[int, Rigid3] = {}
     for mine in (True, False):
@@ -347,7 +347,7 @@ def _poses(group: Joined, models: Sequence[Model], own: Sequence[frozenset[int]]
     return dict(sorted(poses.items()))
 
 
-def _cameras(group: Joined, models: Sequence[Model], sfm: SfmTask) -> list[Camera]:
+def _cameras(group: JoinedModel, models: Sequence[Model], sfm: SfmTask) -> list[Camera]:
     """Cameras of the cluster, each as the member with most of its photos has it."""
     cameras = [camera for camera, _ in sfm.cameras]
     most = [0] * len(cameras)

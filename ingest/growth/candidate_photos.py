@@ -12,8 +12,8 @@ from featuredb.store import Database
 from featuredb.store.candidate_states import Candidate
 from featuredb.store.candidates import list_candidates, load_images
 from ingest.executor import Progress, no_progress
-from ingest.photo import Photo
-from ingest.scan import ScanOptions, scan_folder
+from ingest.photos.photo import Photo
+from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.workspace import atomic_file
 
 _FOLDER = "candidates"

@@ -11,7 +11,7 @@ from pathlib import Path
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.place.localised import LocaliseEachOptions
 from ingest.growth.values import FeaturesOf
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from ingest.workspace import read_json, write_json
 
 # Raised when localisation finds what it did not find before.

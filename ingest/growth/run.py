@@ -15,7 +15,8 @@ from pathlib import Path
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database, Snapshot
 from featuredb.store.candidates import mark_used
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest
 from ingest.growth.graph.budget import drift_gate, rows_within, with_drift
 from ingest.growth.graph.map_graph import placed_maps
@@ -39,7 +40,6 @@ from ingest.growth.trust.witnesses import NewPhotos
 from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
-from ingest.submodel import keep_photos
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 

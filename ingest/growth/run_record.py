@@ -6,16 +6,16 @@ from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Snapshot
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.replacing import Replacement
 from ingest.growth.growth_report import GrownEntry, PhotoFate
 from ingest.growth.map_places import growth_of
 from ingest.growth.not_found import NotFoundRows
 from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
-from ingest.pairs import Pair
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
+from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.pairs import Pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -19,8 +19,8 @@ from featuredb.maps.subset import only_images
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database, Snapshot
 from featuredb.store.snapshot import UnplacedSummary
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
+from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.graph.budget import drift_gate, rows_within, with_drift
 from ingest.growth.graph.map_graph import placed_maps
@@ -34,8 +34,8 @@ from ingest.growth.trust.examined import recall, remember
 from ingest.growth.trust.scan_check import ScanCheckOptions, scan_gate, with_gate
 from ingest.growth.values import GrownMap, Refused
 from ingest.map_builder import MapIdentity
-from ingest.photo import Photo
-from ingest.submodel import keep_photos
+from ingest.photos.photo import Photo
+from ingest.sfm.extract import PhotoFeatures
 from reloc.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)

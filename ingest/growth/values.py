@@ -14,9 +14,9 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
 from ingest.growth.gates import Gate
+from ingest.sfm.extract import PhotoFeatures
 from reloc.result import LocaliseResult
 
 FeaturesOf = Callable[[int], PhotoFeatures]

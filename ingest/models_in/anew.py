@@ -8,8 +8,8 @@ from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.describe import describe_at
 from featuredb.features.orientation import orientations_at
-from ingest.extract import PhotoFeatures
 from ingest.models_in.stored import StoredFeatures
+from ingest.sfm.extract import PhotoFeatures
 
 
 class DescribedAnew(Sequence[PhotoFeatures]):

@@ -7,7 +7,7 @@ import numpy as np
 import pycolmap
 
 from featuredb.errors import IngestError, InvalidValueError
-from ingest.colmap_bridge import Model, model_of
+from ingest.colmap.bridge import Model, model_of
 from ingest.models_in.colmap_whole import check_whole
 from ingest.models_in.stored import StoredModel
 

@@ -14,7 +14,7 @@ from featuredb.errors import IngestError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.models_in.kapture_sensors import KaptureSensors, read_sensors
 from ingest.models_in.kapture_tables import floats, table, whole
 from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel, as_rootsift, scale_and_angle

@@ -15,8 +15,7 @@ from featuredb.file_digest import file_sha256
 from featuredb.geo.datum import check_datum
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
 from ingest.models_in.anew import DescribedAnew
@@ -30,8 +29,9 @@ from ingest.models_in.place import (
     place_of_georeference,
 )
 from ingest.models_in.source import NAMES, ModelSource, open_model
-from ingest.photo import Photo
-from ingest.scan import ScanOptions, scan_folder
+from ingest.photos.photo import Photo
+from ingest.photos.scan import ScanOptions, scan_folder
+from ingest.sfm.extract import PhotoFeatures
 
 Descriptors = Literal["stored", "photos"]
 

@@ -22,10 +22,10 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.models_in.json_values import mapping, member, number, numbers, read_json
 from ingest.models_in.opensfm_lens import camera_from_opensfm
-from ingest.models_in.opensfm_tracks import Tracks, read_tracks
+from ingest.models_in.opensfm_tracks import OpensfmTracks, read_tracks
 from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel
 
 TRACKS, REFERENCE, CONFIG = "tracks.csv", "reference_lla.json", "config.yaml"
@@ -137,7 +137,7 @@ class _Parts:
     camera_of: NDArray[np.int64]
     poses: list[Rigid3]
     xyz: FloatArray
-    tracks: Tracks
+    tracks: OpensfmTracks
 
 
 def _chosen(document: Any, chosen: int | None, path: Path) -> dict[str, Any]:

@@ -19,7 +19,7 @@ _MOST = 0.5 + 1e-9  # normalised coordinates count from the middle of the image,
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracks:
+class OpensfmTracks:
     """Observations of the images and tracks that were asked for, in the order of the file.
 
     Attributes:
@@ -33,7 +33,7 @@ class Tracks:
     scale: FloatArray
 
 
-def read_tracks(path: Path, image_row: Mapping[str, int], track_row: Mapping[str, int]) -> Tracks:
+def read_tracks(path: Path, image_row: Mapping[str, int], track_row: Mapping[str, int]) -> OpensfmTracks:
     """The observations of these images that see these tracks; others are no part of the reconstruction.
 
     Raises:
@@ -55,7 +55,7 @@ def read_tracks(path: Path, image_row: Mapping[str, int], track_row: Mapping[str
     except (OSError, UnicodeDecodeError) as error:
         raise IngestError(f"{path}: expected OpenSfM's tracks, cannot be read: {error}") from error
     table = np.array(values, dtype=np.float64).reshape(-1, 3)
-    return Tracks(
+    return OpensfmTracks(
         image=np.array(images, dtype=np.int64),
         track=np.array(tracks, dtype=np.int64),
         xy=table[:, :2],

@@ -15,10 +15,10 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
-from ingest.photo import Photo
-from ingest.photo_positions import capture_seconds, gps_priors, local_frame_of
+from ingest.photos.photo import Photo
+from ingest.photos.positions import capture_seconds, gps_priors, local_frame_of
 from ingest.register.gps import GpsOptions, place_by_gps
 
 Axes = Literal["enu", "utm", "ecef"]

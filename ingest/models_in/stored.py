@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from featuredb.errors import IngestError
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
+from ingest.sfm.extract import PhotoFeatures
 
 # RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
 # `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).

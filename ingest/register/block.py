@@ -10,16 +10,16 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_epsg
 from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
-from ingest.photo import Photo
-from ingest.precision import (
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import (
     linearise,
     point_covariances,
     pose_covariances,
     residual_variance,
     upper_triangle,
 )
+from ingest.photos.photo import Photo
+from ingest.sfm.extract import PhotoFeatures
 
 
 def block_of_model(model: Model, photos: Sequence[Photo], features: Sequence[PhotoFeatures]) -> Block:

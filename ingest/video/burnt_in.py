@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
-from ingest.video.same_scene import SceneOptions, matched
+from ingest.video.same_scene import SameSceneOptions, matched
 
 Mask = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
@@ -56,7 +56,7 @@ class BurntInOptions:
     steady_levels: float = 3.0
     bar_levels: float = 32.0
     bar_share: float = 0.7
-    scene: SceneOptions = field(default_factory=SceneOptions)
+    scene: SameSceneOptions = field(default_factory=SameSceneOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -24,7 +24,7 @@ from ingest.video.film_time import (
     utc_text,
 )
 from ingest.video.lag import Lag
-from ingest.video.match import Match, MatchOptions, match_movement
+from ingest.video.match import CurveMatchOptions, Match, match_movement
 from ingest.video.motion import Motion
 
 _HALF_DAY_S = 43_200.0
@@ -57,7 +57,7 @@ class ClockOptions:
     repeat_s: float = 10.0
     spread_s: float = 1.0
     min_correlation: float = 0.5
-    match: MatchOptions = field(default_factory=lambda: MatchOptions(least_s=40.0))
+    match: CurveMatchOptions = field(default_factory=lambda: CurveMatchOptions(least_s=40.0))
     max_search_s: float = 172_800.0
 
 
@@ -115,7 +115,7 @@ def lay_on_film(
         match = None
     if film.told_s is not None:
         near = (film.told_s - options.told_s, film.told_s + options.told_s)
-        close = match_movement(motion, telemetry, near, MatchOptions())
+        close = match_movement(motion, telemetry, near, CurveMatchOptions())
         return _near_told(match, close, telemetry, film, film.told_s, options)
     if match is None:
         return _refused(

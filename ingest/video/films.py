@@ -11,9 +11,9 @@ from featuredb.errors import FeatureDbError, TelemetryError, VideoError
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest
-from ingest.report_films import FilmOutcome
+from ingest.photos.walk import walk
+from ingest.report.films import FilmOutcome
 from ingest.video.stills import Stills, StillsOptions, make_stills
-from ingest.walk import walk
 
 FILM_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".mkv", ".webm", ".avi", ".ts", ".mts", ".m2ts")
 _BESIDE = (".srt", ".gpx", ".csv")  # telemetry, looked for by each film's name

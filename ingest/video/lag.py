@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from featuredb.video.telemetry.values import Telemetry
-from ingest.video.match import MatchOptions, match_movement
+from ingest.video.match import CurveMatchOptions, match_movement
 from ingest.video.motion import Motion
 
 
@@ -52,7 +52,7 @@ class Lag:
 def estimate_lag(motion: Motion, telemetry: Telemetry, options: LagOptions | None = None) -> Lag:
     """The lag of the telemetry behind the picture."""
     options = options or LagOptions()
-    how = MatchOptions(step_s=options.step_s, smooth_s=options.smooth_s, least_s=options.least_s)
+    how = CurveMatchOptions(step_s=options.step_s, smooth_s=options.smooth_s, least_s=options.least_s)
     match = match_movement(motion, telemetry, (-options.most_s, options.most_s), how)
     if match is None:
         return Lag(late_s=None, correlation=float("nan"), message="too few samples to tell the lag")

@@ -26,7 +26,7 @@ _FEWEST = 10  # samples of a curve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MatchOptions:
+class CurveMatchOptions:
     """How curves are compared.
 
     Attributes:
@@ -88,14 +88,17 @@ class _Curve(NamedTuple):
 
 
 def match_movement(
-    motion: Motion, telemetry: Telemetry, range_s: tuple[float, float], options: MatchOptions | None = None
+    motion: Motion,
+    telemetry: Telemetry,
+    range_s: tuple[float, float],
+    options: CurveMatchOptions | None = None,
 ) -> Match | None:
     """Compare at all lags of a range; None where picture or receiver have too few samples for their speeds.
 
     Args:
         range_s: lowest and highest lag.
     """
-    options = options or MatchOptions()
+    options = options or CurveMatchOptions()
     speeds, receiver = _picture_speeds(motion), _receiver_speed(telemetry)
     if min(len(speeds[0].times_s), len(receiver.times_s)) < _FEWEST:
         return None
@@ -200,7 +203,7 @@ def _places(telemetry: Telemetry) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _slid(
-    ours: _Curve, theirs: _Curve, first: int, last: int, options: MatchOptions
+    ours: _Curve, theirs: _Curve, first: int, last: int, options: CurveMatchOptions
 ) -> tuple[FloatArray, FloatArray]:
     """Correlation and independent samples at the lags first to last, in steps; NaN and 0 where none."""
     correlation, samples = np.full(last + 1 - first, np.nan), np.zeros(last + 1 - first)
@@ -228,7 +231,7 @@ def _slid(
 
 
 def _sampled(
-    curve: _Curve, times_s: FloatArray, options: MatchOptions
+    curve: _Curve, times_s: FloatArray, options: CurveMatchOptions
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Smooth values at evenly spaced times, and which are no more than a second from a sample."""
     place = np.clip(np.searchsorted(curve.times_s, times_s), 1, len(curve.times_s) - 1)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame
-from ingest.video.same_scene import SceneOptions, same_scene
+from ingest.video.same_scene import SameSceneOptions, same_scene
 from reloc.tracking.flow import follow
 from reloc.tracking.options import FlowOptions
 
@@ -68,7 +68,7 @@ class MotionOptions:
     black_levels: float = 32.0
     title_levels: float = 60.0
     flow: FlowOptions = field(default_factory=lambda: FlowOptions(levels=3, max_back_px=1.0))
-    scene: SceneOptions = field(default_factory=SceneOptions)
+    scene: SameSceneOptions = field(default_factory=SameSceneOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SceneOptions:
+class SameSceneOptions:
     """When two frames show the same at the same focal length.
 
     Attributes:
@@ -35,9 +35,11 @@ class SceneOptions:
     max_zoom: float = 1.1
 
 
-def same_scene(one: NDArray[np.uint8], other: NDArray[np.uint8], options: SceneOptions | None = None) -> bool:
+def same_scene(
+    one: NDArray[np.uint8], other: NDArray[np.uint8], options: SameSceneOptions | None = None
+) -> bool:
     """Whether two grey frames (h, w) of one size show the same, moved and turned as may be."""
-    options = options or SceneOptions()
+    options = options or SameSceneOptions()
     a, b = (extract(gray, options.features) for gray in (one, other))
     start, end = matched(a, b, options.max_ratio)
     if len(start) < 8:
@@ -69,7 +71,9 @@ def matched(one: Features, other: Features, max_ratio: float) -> tuple[FloatArra
     return one.xy[rows].astype(np.float64), other.xy[best[rows]].astype(np.float64)
 
 
-def _cells(xy: FloatArray | NDArray[np.float32], shape: tuple[int, ...], options: SceneOptions) -> set[int]:
+def _cells(
+    xy: FloatArray | NDArray[np.float32], shape: tuple[int, ...], options: SameSceneOptions
+) -> set[int]:
     """Numbers of the cells that pixels (n, 2) lie in."""
     column = (xy[:, 0] * options.columns / shape[1]).astype(int)
     row = (xy[:, 1] * options.rows / shape[0]).astype(int)

@@ -16,7 +16,7 @@ from featuredb.video.frames import open_video
 from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.report_films import ShotOutcome
+from ingest.report.films import ShotOutcome
 from ingest.video.burnt_in import BurntIn, BurntInOptions
 from ingest.video.clocks import ClockOptions, check_overlap
 from ingest.video.film_time import FilmTime

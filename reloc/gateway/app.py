@@ -31,7 +31,7 @@ from reloc.gateway.geopose import NotLocalisedError, check_version, parse, quest
 from reloc.gateway.intake import Intake
 from reloc.gateway.link import Link
 from reloc.gateway.metrics import MEDIA_TYPE as METRICS_TYPE
-from reloc.gateway.metrics import Metrics
+from reloc.gateway.metrics import GatewayMetrics
 from reloc.gateway.multipart import LocaliseForm, read_form
 from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
@@ -58,7 +58,7 @@ class Gateway:
         self.options = options
         self.link = Link(options)
         self.intake = Intake(options)
-        self.metrics = Metrics()
+        self.metrics = GatewayMetrics()
         self._photos = ThreadPoolExecutor(options.workers, thread_name_prefix="gateway-photo")
         # Of their own, so that a server that is overrun still says how it is.
         self._figures = ThreadPoolExecutor(2, thread_name_prefix="gateway-figures")
@@ -268,7 +268,7 @@ def _json(
 class _Observed:
     """Counts what every request was answered with, and how long it took."""
 
-    def __init__(self, app: ASGIApp, metrics: Metrics, paths: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, metrics: GatewayMetrics, paths: frozenset[str]) -> None:
         self._app = app
         self._metrics = metrics
         self._paths = paths

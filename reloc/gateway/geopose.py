@@ -23,12 +23,12 @@ from reloc.gateway.protocol import (
     MEDIA_TYPE,
     CameraReading,
     GeolocationReading,
-    GeoPose,
     GeoPoseAccuracy,
+    GeoPoseBasicQuaternion,
+    GeoPosePosition,
+    GeoPoseQuaternion,
     GeoPoseReq,
     GeoPoseResp,
-    Position,
-    Quaternion,
 )
 from reloc.wire import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
 
@@ -147,9 +147,9 @@ def response_of(request: GeoPoseReq, reply: LocaliseReply) -> tuple[GeoPoseResp,
         accuracy=GeoPoseAccuracy(
             position=float(np.mean(sigmas[3:])), orientation=float(np.degrees(np.mean(sigmas[:3])))
         ),
-        geopose=GeoPose(
-            position=Position(lon=position.lon, lat=position.lat, h=height),
-            quaternion=Quaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
+        geopose=GeoPoseBasicQuaternion(
+            position=GeoPosePosition(lon=position.lon, lat=position.lat, h=height),
+            quaternion=GeoPoseQuaternion(x=turn.x, y=turn.y, z=turn.z, w=turn.w),
         ),
     )
     return response, datum

@@ -69,24 +69,24 @@ class Sensor(Message):
     type: Text
 
 
-class Position(Message):
+class GeoPosePosition(Message):
     lon: Degrees180
     lat: Degrees90
     h: float
 
 
-class Quaternion(Message):
+class GeoPoseQuaternion(Message):
     x: float
     y: float
     z: float
     w: float
 
 
-class GeoPose(Message):
+class GeoPoseBasicQuaternion(Message):
     """OGC GeoPose Basic-Quaternion: x forward, y left, z up of the camera to true east, north, up."""
 
-    position: Position
-    quaternion: Quaternion
+    position: GeoPosePosition
+    quaternion: GeoPoseQuaternion
 
 
 class GeoPoseAccuracy(Message):
@@ -101,7 +101,7 @@ class GeoPoseResp(Message):
     timestamp: Milliseconds
     accuracy: GeoPoseAccuracy
     type: Literal["geopose"] = "geopose"
-    geopose: GeoPose
+    geopose: GeoPoseBasicQuaternion
 
 
 class GeoPoseReq(Message):

@@ -19,7 +19,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.stage_clock import StageClock
-from reloc.lens_prior import LensPrior, known_within
+from reloc.lens_prior import QueryLensPrior, known_within
 from reloc.reply import reply_from_result
 from reloc.result import LocaliseRequest
 from reloc.service.source import LocaliserLike
@@ -124,7 +124,7 @@ def _camera(camera: CameraRequest, width: int, height: int) -> Camera:
         ) from error
 
 
-def _camera_prior(request: CameraRequest, camera: Camera) -> LensPrior | None:
+def _camera_prior(request: CameraRequest, camera: Camera) -> QueryLensPrior | None:
     """How well the camera, scaled to the image, is known; None: exactly."""
     if request.sigmas is None:
         return None

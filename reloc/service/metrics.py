@@ -12,7 +12,7 @@ _LATENCY_WINDOW = 1000  # latest queries; enough for a 99th percentile, forgets 
 
 
 @dataclass(slots=True)
-class Metrics:
+class ServerMetrics:
     """Counters that threads share; every method takes the lock."""
 
     _lock: threading.Lock = field(default_factory=threading.Lock)

@@ -7,7 +7,7 @@ import uuid
 
 import zenoh
 
-from reloc.service.metrics import Metrics
+from reloc.service.metrics import ServerMetrics
 from reloc.wire import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
 logger = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ class PendingQuery:
         "size",
     )
 
-    def __init__(self, query: zenoh.Query, key: str, deadline_s: float, metrics: Metrics) -> None:
+    def __init__(self, query: zenoh.Query, key: str, deadline_s: float, metrics: ServerMetrics) -> None:
         self._query = query
         self._key = key
         self._metrics = metrics

@@ -12,7 +12,7 @@ import zenoh
 
 from reloc.service.inbox import Inbox
 from reloc.service.live.sessions import LiveSessions
-from reloc.service.metrics import Metrics
+from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue
@@ -66,7 +66,7 @@ class Server:
         self._keys = Keys(database=database)
         self._area = area
         self._started = time.perf_counter()
-        self._metrics = Metrics()
+        self._metrics = ServerMetrics()
         self._reloads = 0
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)

@@ -11,7 +11,7 @@ import numpy as np
 
 from featuredb.geometry.camera import Camera
 from reloc.tracking.options import LensWalkOptions
-from reloc.tracking.pose_fit import LensUncertainty
+from reloc.tracking.pose_fit import LensSigmas
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -37,12 +37,12 @@ class LensWalk:
         return float(np.hypot(max(self.rel, self.options.floor_rel), walk))
 
     @property
-    def doubt(self) -> LensUncertainty:
+    def doubt(self) -> LensSigmas:
         """What is not known of the lens before the next frame is looked at."""
         if self.lent:
-            return LensUncertainty(focal_rel=self.before_rel)
+            return LensSigmas(focal_rel=self.before_rel)
         longer = max(self.camera.width, self.camera.height)
-        return LensUncertainty(
+        return LensSigmas(
             focal_rel=self.before_rel,
             center_px=self.options.center_rel * longer,
             radial=self.options.radial,

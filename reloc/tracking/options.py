@@ -26,7 +26,7 @@ class FlowOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitOptions:
+class PoseFitOptions:
     """The pose of a frame, at 1280 px.
 
     Attributes:
@@ -119,7 +119,7 @@ class TrackOptions:
     """
 
     flow: FlowOptions = field(default_factory=FlowOptions)
-    fit: FitOptions = field(default_factory=FitOptions)
+    fit: PoseFitOptions = field(default_factory=PoseFitOptions)
     lens: LensWalkOptions = field(default_factory=LensWalkOptions)
     landmarks: int = 220
     columns: int = 16

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.tracking.options import FitOptions
+from reloc.tracking.options import PoseFitOptions
 
 _STILL = 1e-6  # radians, and metres over distance: a thousandth of a pixel
 # Least eigenvalue of scaled normal equations that have no one solution: one or two points over and over and
@@ -39,7 +39,7 @@ class FittedPose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LensUncertainty:
+class LensSigmas:
     """Standard deviations of what is not known of a lens; all 0: it is given.
 
     Attributes:
@@ -53,7 +53,7 @@ class LensUncertainty:
     radial: float = 0.0
 
 
-GIVEN = LensUncertainty()
+GIVEN = LensSigmas()
 
 
 def fit_pose(
@@ -61,8 +61,8 @@ def fit_pose(
     pixels: FloatArray,
     points: FloatArray,
     start: Rigid3,
-    options: FitOptions,
-    doubt: LensUncertainty = GIVEN,
+    options: PoseFitOptions,
+    doubt: LensSigmas = GIVEN,
 ) -> FittedPose | None:
     """Fit the pose to pixels (n, 2) of points (n, 3); None where the points do not determine it.
 

@@ -11,7 +11,7 @@ from featuredb.extras import require
 if TYPE_CHECKING:
     from featuredb.export.selection import Selection
     from reloc.viewer.placing import PlacingPages
-    from reloc.viewer.scene import Scene
+    from reloc.viewer.scene import ViewerScene
 
 
 def register(subparsers: Any) -> None:
@@ -60,7 +60,7 @@ def _run(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database, progress_of_maps
     from reloc.tracking.trajectory_read import read_trajectory_csv
     from reloc.viewer.photos import Pictures
-    from reloc.viewer.scene import DEFAULT_POINTS, SceneOptions, build_scene
+    from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene
     from reloc.viewer.static_page import DEFAULT_POINTS as STATIC_POINTS
     from reloc.viewer.static_page import write_static_page
 
@@ -71,7 +71,7 @@ def _run(args: argparse.Namespace) -> int:
     tracks = [read_trajectory_csv(path) for path in args.trajectory]
     pictures = Pictures(args.photos)
     usual = DEFAULT_POINTS if args.static is None else STATIC_POINTS
-    options = SceneOptions(
+    options = ViewerSceneOptions(
         selection=_selection(args),
         points=usual if args.points is None else args.points,
         photos=None if args.photos is None else args.photos.absolute(),
@@ -97,7 +97,7 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _placing_pages(scene: "Scene", url: str, args: argparse.Namespace) -> "PlacingPages | None":
+def _placing_pages(scene: "ViewerScene", url: str, args: argparse.Namespace) -> "PlacingPages | None":
     """Where maps without a place can be placed from the page: the newest ones, by photos that are there."""
     from reloc.viewer.placing import PlacingPages, anchor_command
 
@@ -118,7 +118,7 @@ def _selection(args: argparse.Namespace) -> "Selection":
     from dataclasses import replace
 
     from featuredb.cli.export import selection_of
-    from reloc.viewer.scene import SceneOptions
+    from reloc.viewer.scene import ViewerSceneOptions
 
     chosen = selection_of(args)
-    return chosen if args.status else replace(chosen, statuses=SceneOptions().selection.statuses)
+    return chosen if args.status else replace(chosen, statuses=ViewerSceneOptions().selection.statuses)

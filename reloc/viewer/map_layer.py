@@ -12,7 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import Lineage, describe_lineage
+from featuredb.maps.lineage import MapLineage, describe_lineage
 from featuredb.store import MapSummary
 from reloc.viewer.places import Spot
 from reloc.viewer.points import DrawnPoints
@@ -22,7 +22,7 @@ _CELLS = 60  # along the longer side of the drawn points; smaller cells would fa
 _LEAST_POINTS = 2  # in a cell that counts as covered; a single one is often wrong
 
 
-def describe_map(summary: MapSummary, lineage: Lineage, drawn_under: str | None) -> dict[str, Any]:
+def describe_map(summary: MapSummary, lineage: MapLineage, drawn_under: str | None) -> dict[str, Any]:
     """What the store knows of a map, without loading it.
 
     Args:

@@ -19,7 +19,7 @@ from reloc.overlay import draw_overlay, map_points_in_view
 from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, jpeg_of
 from reloc.viewer.poses import drawn_pose, worded_sigmas
-from reloc.viewer.scene import Scene
+from reloc.viewer.scene import ViewerScene
 from reloc.wire import LocaliseReply, LocaliseWireRequest, RequestOptions
 
 LIMITS = DecodeLimits()
@@ -31,7 +31,7 @@ class Queries:
     The maps are indexed with the first photo.
     """
 
-    def __init__(self, database: Database, scene: Scene) -> None:
+    def __init__(self, database: Database, scene: ViewerScene) -> None:
         self._database = database
         self._scene = scene
         self._lock = threading.Lock()

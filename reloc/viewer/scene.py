@@ -1,7 +1,8 @@
 """A snapshot as the page's values: places with maps, photos, scans and tracks, and the points to draw.
 
 `build_scene` reads everything once; after it the database is needed for queries only. What is in
-`Scene.document` goes into JSON as it is; coordinates are metres east, north, up in the frame of their place.
+`ViewerScene.document` goes into JSON as it is; coordinates are metres east, north, up in the frame of their
+place.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +29,7 @@ DEFAULT_POINTS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SceneOptions:
+class ViewerSceneOptions:
     """What is shown.
 
     Attributes:
@@ -49,7 +50,7 @@ class SceneOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class ViewerScene:
     """Everything that the page shows.
 
     Attributes:
@@ -71,15 +72,15 @@ def build_scene(
     database: Database,
     snapshot: Snapshot,
     trajectories: Sequence[Trajectory] = (),
-    options: SceneOptions | None = None,
-) -> Scene:
+    options: ViewerSceneOptions | None = None,
+) -> ViewerScene:
     """Read what is shown of a snapshot, and the scans of the newest version.
 
     Raises:
         ExportError: nothing is selected of a database that has maps. InvalidValueError: a track without a
             single pose. StoreError, MapNotFoundError: as `Snapshot`.
     """
-    return _Builder(database, snapshot, trajectories, options or SceneOptions()).build()
+    return _Builder(database, snapshot, trajectories, options or ViewerSceneOptions()).build()
 
 
 class _Builder:
@@ -90,7 +91,7 @@ class _Builder:
         database: Database,
         snapshot: Snapshot,
         trajectories: Sequence[Trajectory],
-        options: SceneOptions,
+        options: ViewerSceneOptions,
     ) -> None:
         self._database, self._snapshot = database, snapshot
         self._trajectories, self._options = trajectories, options
@@ -104,7 +105,7 @@ class _Builder:
         self._place_of_map: dict[str, int] = {}
         self._read = 0
 
-    def build(self) -> Scene:
+    def build(self) -> ViewerScene:
         maps, scans, tracks = self._maps, self._scans(), self._trajectories
         spots = [self._spot(m) for m in maps] + [spot_of(s.box, s.epsg) for s in scans]
         spots += [_known_spot(t) for t in tracks]
@@ -133,7 +134,7 @@ class _Builder:
             "points_limit": self._options.points,
             "places": places,
         }
-        return Scene(
+        return ViewerScene(
             document=document,
             points=tuple(points),
             images=self._images,

@@ -26,7 +26,7 @@ from reloc.viewer.page import assets, content_policy, page
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import LIMITS, Queries
-from reloc.viewer.scene import Scene
+from reloc.viewer.scene import ViewerScene
 from reloc.wire import ErrorCode
 
 HOST = "127.0.0.1"
@@ -47,7 +47,7 @@ class ViewerStartError(FeatureDbError):
 
 
 def create_app(
-    scene: Scene, pictures: Pictures, queries: Queries, pages: PlacingPages | None = None
+    scene: ViewerScene, pictures: Pictures, queries: Queries, pages: PlacingPages | None = None
 ) -> FastAPI:
     """The application.
 
@@ -174,7 +174,7 @@ def _check_type(request: Request) -> None:
         raise HTTPException(415, f"Content-Type: expected {PHOTO_TYPE}, found {found[:100]!r}")
 
 
-def _where(scene: Scene, place: int, east: float, north: float, up: float) -> dict[str, Any]:
+def _where(scene: ViewerScene, place: int, east: float, north: float, up: float) -> dict[str, Any]:
     """UTM and geographic coordinates of a spot in a place's frame.
 
     Raises:

@@ -8,13 +8,13 @@ from featuredb.export.job import whole_or_nothing
 from reloc.viewer.page import page_in_one
 from reloc.viewer.photos import THUMBNAIL_PX, Pictures
 from reloc.viewer.query import data_url
-from reloc.viewer.scene import Scene
+from reloc.viewer.scene import ViewerScene
 
 # A third of a megabyte of JPEG is a lot to send, and ten thousand photos are many of those.
 DEFAULT_POINTS = 250_000
 
 
-def write_static_page(out: Path, scene: Scene, pictures: Pictures) -> int:
+def write_static_page(out: Path, scene: ViewerScene, pictures: Pictures) -> int:
     """Write the page to a new file; returns its size in bytes.
 
     Raises:

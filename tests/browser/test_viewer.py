@@ -19,7 +19,7 @@ from featuredb.store import Database
 from reloc.tracking.trajectory_read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
 from reloc.viewer.placing import PlacingPages
-from reloc.viewer.scene import SceneOptions, build_scene
+from reloc.viewer.scene import ViewerSceneOptions, build_scene
 from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database
 from tests.support.maps import random_map, random_unplaced_map
@@ -384,7 +384,7 @@ def test_a_map_without_a_place_is_shown_in_its_own_frame_and_says_how_to_place_i
     database = Database.create(tmp_path / "maps.db")
     unplaced = random_unplaced_map(1)
     database.commit_maps([random_map(2), unplaced])
-    options = SceneOptions(photos=tmp_path / "my photos")
+    options = ViewerSceneOptions(photos=tmp_path / "my photos")
     scene = build_scene(database, database.snapshot(), options=options)
     said = "print('http://127.0.0.1:9/token/; stop with Ctrl-C', flush=True); import time; time.sleep(60)"
     pages = PlacingPages({"map-1": [sys.executable, "-c", said]})

@@ -12,7 +12,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from ingest.precision import linearise
+from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.adjustment import (
     AdjustLidarOptions,

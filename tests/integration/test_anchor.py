@@ -20,8 +20,8 @@ from featuredb.lidar.add import add_scan
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
-from ingest.anchor_cli import summary
 from ingest.anchoring import AnchorRequest, anchor
+from ingest.cli.anchor import summary
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from ingest.register.anchor.frames import FramesOptions

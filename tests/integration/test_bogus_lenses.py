@@ -8,8 +8,8 @@ import pytest
 
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_adjust import _drop_bogus_lenses
-from ingest.colmap_bridge import SfmPhoto, read_models, write_posed
+from ingest.colmap.adjust import _drop_bogus_lenses
+from ingest.colmap.bridge import SfmPhoto, read_models, write_posed
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(900.0, 500.0, 400.0, 0.01))
 

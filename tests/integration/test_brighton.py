@@ -7,8 +7,8 @@ import pytest
 
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
+from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
-from ingest.scan import ScanOptions
 from tools.real_photos import Ingest, ingest
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]

@@ -19,12 +19,12 @@ from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from ingest.clusters import reconstruct
 from ingest.clusters.graph import ClusterOptions
-from ingest.clusters.join import Joined, JoinOptions
-from ingest.colmap_bridge import Model
+from ingest.clusters.join import JoinedModel, JoinOptions
+from ingest.colmap.bridge import Model
+from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.report import IngestReport
-from ingest.scan import ScanOptions
+from ingest.report.values import IngestReport
 from tests.support.hill_photos import FRAME, HillPhoto, write_hill_photos
 
 _OPTIONS = IngestOptions(
@@ -91,10 +91,10 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
 ) -> None:
     """Blocks laid on top of each other at random: no match fits, yet no block is lost for it."""
 
-    def at_random(models: Sequence[Model], options: JoinOptions) -> list[Joined]:
+    def at_random(models: Sequence[Model], options: JoinOptions) -> list[JoinedModel]:
         rng = np.random.default_rng(1)
         turned = [Sim3.exp(np.append(rng.normal(0, 1, 4), rng.normal(0, 5, 3))) for _ in models]
-        return [Joined(members=tuple(range(len(models))), first_from=tuple(turned))]
+        return [JoinedModel(members=tuple(range(len(models))), first_from=tuple(turned))]
 
     monkeypatch.setattr(reconstruct, "join", at_random)
     for done in ("features", "matches"):

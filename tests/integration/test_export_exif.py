@@ -24,7 +24,7 @@ from featuredb.errors import ExportError, InvalidValueError
 from featuredb.export.exif import with_pose, write_exif
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
-from featuredb.export.shots import Shot, shots_of
+from featuredb.export.shots import PosedPhoto, shots_of
 from featuredb.features.exif import parse_exif, read_exif
 from featuredb.features.exif_gps_write import GpsFields, with_gps
 from featuredb.features.image_header import read_header
@@ -83,7 +83,7 @@ PHOTOS = {
 
 
 @pytest.fixture
-def shot() -> Shot:
+def shot() -> PosedPhoto:
     return next(iter(shots_of(photo_map())))
 
 
@@ -170,7 +170,7 @@ def test_photos_that_are_not_there_are_named(tmp_path: Path) -> None:
     assert not (tmp_path / "none").exists()
 
 
-def test_what_else_the_photo_says_stays(shot: Shot) -> None:
+def test_what_else_the_photo_says_stays(shot: PosedPhoto) -> None:
     data = with_pose(PHOTOS["gps.jpg"], shot)
     header = read_header(data)
     assert header.exif is not None
@@ -198,7 +198,7 @@ def test_what_else_the_photo_says_stays(shot: Shot) -> None:
     assert "Bob &lt;bob@example.org&gt;" in text
 
 
-def test_twice_is_as_once_but_for_length(shot: Shot) -> None:
+def test_twice_is_as_once_but_for_length(shot: PosedPhoto) -> None:
     """A photo that has been exported before gets one position and one set of angles, not two."""
     once = with_pose(PHOTOS["exif.jpg"], shot)
     twice = with_pose(once, shot)
@@ -233,7 +233,7 @@ def test_both_byte_orders_and_every_quadrant(order: str, has_gps: bool) -> None:
         assert found.warnings == ()
 
 
-def test_metadata_that_fits_nowhere_is_a_reason(shot: Shot) -> None:
+def test_metadata_that_fits_nowhere_is_a_reason(shot: PosedPhoto) -> None:
     long = XMP.replace(b'tiff:Make="DJI"', b'tiff:Make="' + b"x" * 64_600 + b'"')
     with pytest.raises(InvalidValueError, match="does not fit"):
         with_pose(photo(5, xmp=long), shot)
@@ -254,7 +254,7 @@ def test_a_broken_packet_is_replaced() -> None:
 
 
 @pytest.mark.real_data
-def test_a_drones_photo_keeps_its_makers_note_and_picture(shared_data: Path, shot: Shot) -> None:
+def test_a_drones_photo_keeps_its_makers_note_and_picture(shared_data: Path, shot: PosedPhoto) -> None:
     original = (shared_data / "brighton" / "images" / "DJI_0026.JPG").read_bytes()
     data = with_pose(original, shot)
     assert scans(data) == scans(original)

@@ -16,7 +16,7 @@ from featuredb.errors import ImageError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb
 from featuredb.features.exif import read_exif
 from featuredb.features.image_header import IMAGE_ERROR_CODES
-from ingest.scan import ScanOptions, scan_folder
+from ingest.photos.scan import ScanOptions, scan_folder
 
 LIMITS = DecodeLimits(max_bytes=4 << 20, max_pixels=4_000_000, min_side_px=64)
 CASES_PER_KIND = 60

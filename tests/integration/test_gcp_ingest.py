@@ -8,7 +8,7 @@ import pytest
 
 from featuredb.cli.main import run_command
 from featuredb.store import Database
-from ingest.cli import register
+from ingest.cli.ingest import register
 from tests.support.hill_photos import CAMERA, FRAME, HillPhoto, hill_height, write_hill_photos
 from tests.support.scenes import pixels_inside
 

@@ -9,8 +9,8 @@ import pytest
 
 from featuredb.cli.main import run_command
 from featuredb.store import Database
-from ingest.cli import register as register_ingest
-from ingest.cli_register import register as register_register
+from ingest.cli.ingest import register as register_ingest
+from ingest.cli.register import register as register_register
 
 
 def _run(*arguments: str | Path) -> int:

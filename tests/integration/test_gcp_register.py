@@ -12,7 +12,7 @@ from featuredb.cli.main import run_command
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
-from ingest.cli_register import register
+from ingest.cli.register import register
 from ingest.register.block import block_of_map, map_of_block
 from tests.support.control import FRAME, SurveyedBlock, control_text, moved_mark, surveyed_block
 from tests.support.maps import without_place

@@ -22,7 +22,7 @@ from featuredb.store.candidates import contribute, list_candidates
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from reloc.candidates import IndexedArea
 from reloc.localiser import Localiser
 from reloc.result import LocaliseRequest

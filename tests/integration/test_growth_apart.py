@@ -12,7 +12,7 @@ import ingest.growth.run as grow_module
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.store import Database
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.place.component import AT_SEVERAL_PLACES
 from ingest.growth.run import GrowthOptions, grow

@@ -8,8 +8,8 @@ import pytest
 
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.move import move_map
-from ingest.colmap_anchored import with_observations
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import with_observations
+from ingest.colmap.bridge import Model
 from ingest.growth.place.component import grow_component
 from ingest.growth.place.grow_photos import grow_photos
 from ingest.growth.place.localised import (

@@ -11,7 +11,7 @@ from featuredb.store import Database
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.sfm import SfmOptions
+from ingest.sfm.mapper import SfmOptions
 from tests.support.hill_photos import FRAME, HillPhoto, hill_height, write_hill_photos
 
 _EXTRACTOR = ExtractorOptions(max_features=1500)

@@ -9,7 +9,7 @@ import pytest
 
 from featuredb.cli.main import main, run_command
 from featuredb.store import Database
-from ingest.cli import register
+from ingest.cli.ingest import register
 from tests.conftest import REPOSITORY
 from tests.support.hill_photos import write_hill_photos
 

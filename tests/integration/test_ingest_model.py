@@ -152,7 +152,7 @@ def test_a_map_without_a_place_comes_back_without_one(
 ) -> None:
     unplaced = without_place(field_map)
     write_map(tmp_path / "field", unplaced)
-    with only_command(monkeypatch, "ingest", "ingest.cli:register"):
+    with only_command(monkeypatch, "ingest", "ingest.cli.ingest:register"):
         assert main(["ingest", "model", str(tmp_path / "db"), str(tmp_path / "field")]) == 0
     assert "committed, without a place, 9 photos" in capsys.readouterr().out
     (summary,) = Database.open(tmp_path / "db").snapshot().unplaced_maps()
@@ -316,7 +316,7 @@ class TestRefusals:
 class TestCommand:
     @pytest.fixture(autouse=True)
     def _only_this(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-        with only_command(monkeypatch, "ingest", "ingest.cli:register"):
+        with only_command(monkeypatch, "ingest", "ingest.cli.ingest:register"):
             yield
 
     def test_commits_once(

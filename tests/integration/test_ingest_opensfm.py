@@ -399,7 +399,7 @@ class TestRefusals:
 class TestCommand:
     @pytest.fixture(autouse=True)
     def _only_this(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-        with only_command(monkeypatch, "ingest", "ingest.cli:register"):
+        with only_command(monkeypatch, "ingest", "ingest.cli.ingest:register"):
             yield
 
     def test_a_project_with_its_images(

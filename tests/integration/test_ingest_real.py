@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from ingest.executor import InProcessExecutor
+from ingest.photos.scan import ScanOptions, require_usable, scan_folder
 from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.scan import ScanOptions, require_usable, scan_folder
-from ingest.sfm import SfmOptions
+from ingest.sfm.mapper import SfmOptions
 from ingest.workspace import Workspace
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]

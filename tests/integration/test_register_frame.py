@@ -14,8 +14,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.photograph import render_view
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.town import make_town
 from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.options import FrameOptions
@@ -40,7 +41,7 @@ class Place:
 def place() -> Place:
     """A photo from 55 m, 30 degrees off the nadir; colours from one exact nadir view."""
     scene = make_town(5, size_m=(160.0, 150.0), texel_m=0.1)
-    scan = scan_town(scene, ScanOptions(seed=5, margin_m=0.0, density_per_m2=6.0))
+    scan = scan_town(scene, AirborneScanOptions(seed=5, margin_m=0.0, density_per_m2=6.0))
     keep = ~scan.outlier
     xyz, raw = scan.xyz[keep], scan.intensity[keep].astype(np.float64)
     low, high = np.percentile(raw, (1, 99))

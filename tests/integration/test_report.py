@@ -14,7 +14,10 @@ import pytest
 from PIL import Image
 
 from featuredb.errors import InvalidValueError
-from ingest.report import (
+from ingest.plot_parts import nice_length, residual_exaggeration
+from ingest.report.page import write_report
+from ingest.report.plots import histograms_png, plan_png
+from ingest.report.values import (
     CameraOutcome,
     IngestReport,
     MapOutcome,
@@ -23,8 +26,6 @@ from ingest.report import (
     StageTiming,
     report_json,
 )
-from ingest.report_html import write_report
-from ingest.report_plots import histograms_png, nice_length, plan_png, residual_exaggeration
 
 SCHEMA = json.loads(
     (Path(__file__).resolve().parents[2] / "schemas" / "ingest" / "report.json").read_text(encoding="utf-8")

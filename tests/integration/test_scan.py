@@ -14,8 +14,8 @@ from PIL import Image
 
 from featuredb.errors import IngestError
 from featuredb.features.decode import DecodeLimits
-from ingest.photo import Photo
-from ingest.scan import ScanOptions, require_usable, scan_folder
+from ingest.photos.photo import Photo
+from ingest.photos.scan import ScanOptions, require_usable, scan_folder
 
 
 def scene(seed: int, size: tuple[int, int] = (640, 480)) -> Image.Image:

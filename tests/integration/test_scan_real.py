@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from featuredb.features.decode import decode_gray
-from ingest.duplicates import DuplicateOptions, hash_bits, hash_distances, picture_hash
-from ingest.scan import scan_folder
+from ingest.photos.duplicates import DuplicateOptions, hash_bits, hash_distances, picture_hash
+from ingest.photos.scan import scan_folder
 
 pytestmark = pytest.mark.real_data
 

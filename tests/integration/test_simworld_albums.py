@@ -15,7 +15,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.photograph import render_view
 from featuredb.simworld.truth import read_truth
-from ingest.photo_table import read_table
+from ingest.photos.table import read_table
 from tools.worlds.album_files import TABLE_FILES, read_facts
 from tools.worlds.community import CommunityOptions, write_community
 from tools.worlds.poison_world import POISONS, PoisonOptions, plan_poison, poison_places

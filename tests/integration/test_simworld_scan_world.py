@@ -19,12 +19,13 @@ from featuredb.geo.wkt import utm_wkt
 from featuredb.lidar.geotiff import write_geotiff
 from featuredb.lidar.las_writer import write_las
 from featuredb.simworld import scan_world
-from featuredb.simworld.airborne import ScanOptions, scan_town
+from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.days import DayOptions
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.ground import paint_ground
 from featuredb.simworld.ortho import Ortho, OrthoOptions, make_ortho
 from featuredb.simworld.scan_file import write_scan
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scan_world import (
     ScanWorld,
     ScanWorldOptions,
@@ -47,7 +48,7 @@ OPTIONS = ScanWorldOptions(
         negatives_per_kind=0,
         workers=1,
     ),
-    scan=ScanOptions(density_per_m2=1.0, margin_m=5.0),
+    scan=AirborneScanOptions(density_per_m2=1.0, margin_m=5.0),
     ortho=OrthoOptions(pixel_m=0.5, margin_m=5.0),
 )
 

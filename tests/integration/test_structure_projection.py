@@ -12,9 +12,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.register.frame_registration import FrameRegistration
-from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import PointPairOptions, RegisteredImage, structure_pairs
 from ingest.register.structure.projection import StructureOptions, placed_map, project_structure
-from ingest.register.structure.surface_fit import SurfaceOptions
+from ingest.register.structure.surface_fit import SurfaceFitOptions
 from tests.support.scanned_map import FRAME, ScannedMap, plain_cloud, scanned_map
 
 pytest.importorskip("numba")
@@ -22,7 +22,8 @@ pytest.importorskip("small_gicp")
 
 # Small pictures and surfaces: seconds, and the same answers.
 _WITHOUT_GICP = StructureOptions(
-    pairs=PairOptions(render_width_px=500), surface=SurfaceOptions(gicp=False, max_surface_points=4000)
+    pairs=PointPairOptions(render_width_px=500),
+    surface=SurfaceFitOptions(gicp=False, max_surface_points=4000),
 )
 
 
@@ -113,7 +114,7 @@ def test_pairs_move_with_their_frame_as_the_jacobian_says(world: ScannedMap) -> 
     both = []
     for error in (-0.5 * step, 0.5 * step):
         frame = world.registered(4, error=error)
-        both.append(structure_pairs(world.feature_map, source, [frame], world.cloud, PairOptions()))
+        both.append(structure_pairs(world.feature_map, source, [frame], world.cloud, PointPairOptions()))
     common, first, second = np.intersect1d(both[0].point_index, both[1].point_index, return_indices=True)
     assert len(common) > 100
     moved = both[1].target[second] - both[0].target[first]

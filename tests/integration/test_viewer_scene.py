@@ -17,7 +17,7 @@ from featuredb.store import Database
 from reloc.tracking.trajectory_files import write_trajectory
 from reloc.tracking.trajectory_read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
-from reloc.viewer.scene import Scene, SceneOptions, build_scene
+from reloc.viewer.scene import ViewerScene, ViewerSceneOptions, build_scene
 from reloc.viewer.server import listen
 from reloc.viewer.static_page import write_static_page
 from tests.support.datasets import varied_database, varied_maps
@@ -40,11 +40,11 @@ def varied(tmp_path_factory: pytest.TempPathFactory) -> Database:
     return varied_database(tmp_path_factory.mktemp("varied") / "maps.db")
 
 
-def scene_of(database: Database, **options: object) -> Scene:
-    return build_scene(database, database.snapshot(), options=SceneOptions(**options))  # type: ignore[arg-type]
+def scene_of(database: Database, **options: object) -> ViewerScene:
+    return build_scene(database, database.snapshot(), options=ViewerSceneOptions(**options))  # type: ignore[arg-type]
 
 
-def maps_of(scene: Scene) -> dict[str, dict[str, object]]:
+def maps_of(scene: ViewerScene) -> dict[str, dict[str, object]]:
     return {m["id"]: m for place in scene.document["places"] for m in place["maps"]}
 
 
@@ -121,7 +121,7 @@ def scanned(tmp_path_factory: pytest.TempPathFactory) -> Database:
     return database
 
 
-def points_of(scene: Scene, buffer: dict[str, object]) -> tuple[np.ndarray, np.ndarray]:
+def points_of(scene: ViewerScene, buffer: dict[str, object]) -> tuple[np.ndarray, np.ndarray]:
     n, start = int(buffer["count"]), int(buffer["offset"])  # type: ignore[call-overload]
     data = scene.points[0]
     xyz = np.frombuffer(data, "<f4", 3 * n, start).reshape(n, 3).astype(np.float64) + buffer["origin"]

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.render.levels import LevelOptions, build_cloud, point_spacing
+from featuredb.render.levels import DetailLevelOptions, build_cloud, point_spacing
 
 FRAME = LocalFrame(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0)
-SMALL = LevelOptions(coarsest_points=20)
+SMALL = DetailLevelOptions(coarsest_points=20)
 
 
 @settings(deadline=None, max_examples=40)
@@ -53,7 +53,7 @@ def test_each_level_halves_the_spacing() -> None:
         FRAME,
         "unknown",
         np.column_stack([xy, np.sin(xy[:, 0] / 5)]),
-        options=LevelOptions(coarsest_points=100),
+        options=DetailLevelOptions(coarsest_points=100),
     )
     nodes = cloud.nodes
     level = np.repeat(nodes.level, nodes.count)

@@ -23,9 +23,10 @@ import numpy as np
 from PIL import Image
 
 from featuredb.cli.main import main
-from featuredb.simworld.airborne import AirborneScan, ScanOptions, scan_town
+from featuredb.simworld.airborne import AirborneScan, scan_town
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.scan_file import write_scan
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.world import World, WorldOptions, town_of, write_world
 from featuredb.store import Database
@@ -80,7 +81,7 @@ def make_folder(folder: Path) -> Path:
     names = _take_photos(town, park)
     _write_table(park.parent / "table.csv", town.truth, names)
     shutil.copy(town.images("queries")[0], folder / "photo.jpg")
-    scan = scan_town(town_of(_TOWN), ScanOptions(density_per_m2=4.0))
+    scan = scan_town(town_of(_TOWN), AirborneScanOptions(density_per_m2=4.0))
     write_scan(folder / "scan.laz", scan)
     _write_tiles(folder)
     (folder / "gcp_list.txt").write_text(_control(town.truth, names, scan))

@@ -5,7 +5,7 @@ import sys
 
 from featuredb.cli.main import run_command
 from featuredb.extras import leave_out_pandas
-from ingest.cli import register
+from ingest.cli.ingest import register
 
 if __name__ == "__main__":
     leave_out_pandas()

@@ -14,10 +14,10 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
+from ingest.colmap.bridge import Model
 from ingest.map_builder import MapIdentity
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
+from ingest.sfm.extract import PhotoFeatures
 from tests.support.scenes import CAMERA, pixels_inside, query_features
 
 FINGERPRINT = ExtractorOptions().fingerprint

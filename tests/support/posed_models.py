@@ -3,7 +3,7 @@
 import numpy as np
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from tests.support.scenes import CAMERA
 
 

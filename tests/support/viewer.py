@@ -21,7 +21,7 @@ from reloc.tracking.trajectory_files import write_trajectory
 from reloc.viewer.photos import Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import Queries
-from reloc.viewer.scene import Scene, build_scene
+from reloc.viewer.scene import ViewerScene, build_scene
 from reloc.viewer.server import create_app, listen, uvicorn_server
 from tests.support.maps import random_map
 from tests.support.planar_map import EPSG, field_texture, planar_map, render, view
@@ -114,7 +114,7 @@ def track_over(field: FeatureMap) -> Trajectory:
 @contextmanager
 def running_viewer(
     database: Database,
-    scene: Scene | None = None,
+    scene: ViewerScene | None = None,
     photos: Path | None = None,
     pages: PlacingPages | None = None,
 ) -> Iterator[str]:

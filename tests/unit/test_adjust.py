@@ -22,7 +22,7 @@ from featuredb.adjust.terms import (
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.precision import linearise
+from ingest.colmap.precision import linearise
 
 WIDTHS = LensWidths(focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.05, tangential=0.003)
 TRUE = Camera(

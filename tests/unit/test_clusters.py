@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-from ingest.clusters.graph import Block, Cluster, ClusterOptions, Graph, find_clusters
+from ingest.clusters.graph import ClusterOptions, Graph, PhotoBlock, PhotoCluster, find_clusters
 from ingest.clusters.join import JoinOptions, common_points, hangs_together, join
 from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.executor import InProcessExecutor
-from ingest.pairs import Pair
-from ingest.sfm import SfmOptions, SfmTask, SfmView
+from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView
+from ingest.sfm.pairs import Pair
 from ingest.workspace import Workspace
 from tests.support.planar_map import CAMERA
 from tests.support.posed_models import model_of
@@ -230,7 +230,7 @@ def test_a_full_disk_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 def _two_towns(work: Path) -> Reconstruction:
     """Two clusters of two photos each."""
-    clusters = [Cluster(blocks=(Block(own=rows),)) for rows in ((0, 1), (2, 3))]
+    clusters = [PhotoCluster(blocks=(PhotoBlock(own=rows),)) for rows in ((0, 1), (2, 3))]
     views = [SfmView(name=name, camera_row=0, features=work / "features" / name) for name in "abcd"]
     return reconstruct_clusters(
         clusters,

@@ -10,7 +10,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.colmap_anchored import (
+from ingest.colmap.anchored import (
     AnchoredOptions,
     FixedPoints,
     Lenses,
@@ -18,7 +18,7 @@ from ingest.colmap_anchored import (
     triangulate_posed,
     with_observations,
 )
-from ingest.colmap_bridge import Model, SfmPhoto, TwoView
+from ingest.colmap.bridge import Model, SfmPhoto, TwoView
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors, ring
 

@@ -6,7 +6,7 @@ import pytest
 from pyproj import Transformer
 
 from featuredb.errors import IngestError
-from ingest.photo_table import is_table, read_table
+from ingest.photos.table import is_table, read_table
 
 
 def table(folder: Path, text: str) -> Path:

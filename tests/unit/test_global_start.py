@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from featuredb.geometry.camera import Camera
-from ingest import sfm
-from ingest.global_start import is_usual
-from ingest.sfm import SfmOptions, SfmTask, SfmView
+from ingest.sfm import mapper as sfm
+from ingest.sfm.global_start import is_usual
+from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView
 
 _LENS = Camera.from_focal(854, 480, 577.0, "SIMPLE_RADIAL")
 

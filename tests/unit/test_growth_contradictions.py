@@ -9,9 +9,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
-from ingest.growth.place.similarity_fit import Fit
+from ingest.growth.place.similarity_fit import FittedSimilarity
 from ingest.growth.values import LocalisedPhoto
 from tests.support.localised_photos import localised_photo
 from tests.support.posed_models import model_of
@@ -21,8 +21,8 @@ LOCALISED = np.diag([1e-3] * 3 + [0.05, 0.1, 0.2]) ** 2
 REFINED = np.diag([5e-4] * 3 + [0.02, 0.08, 0.05]) ** 2
 
 
-def fit_of(spread: float = 1.0, neighbours_factor: float = 1.0) -> Fit:
-    return Fit(
+def fit_of(spread: float = 1.0, neighbours_factor: float = 1.0) -> FittedSimilarity:
+    return FittedSimilarity(
         local_from_sfm=Sim3.identity(),
         covariance=np.eye(7) * 1e-8,
         errors_px=np.zeros(0),
@@ -51,7 +51,7 @@ def drawn(rng: np.random.Generator, row: int, pose: Rigid3, scale: float = 1.0) 
     return localised_photo(row, at, covariance=LOCALISED)
 
 
-def found(scale: float, fit: Fit, spread: FloatArray | None = None) -> float:
+def found(scale: float, fit: FittedSimilarity, spread: FloatArray | None = None) -> float:
     """Share of 600 photos that contradict."""
     model, poses = posed(600)
     rng = np.random.default_rng(7)

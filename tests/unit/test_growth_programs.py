@@ -11,7 +11,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.simworld.truth import Truth
 from tools import growth_community, growth_poison, growth_walk
 from tools.growth_common import Album, Registered, Verdict
-from tools.growth_poison import Outcome
+from tools.growth_poison import PoisonOutcome
 from tools.growth_walk import Probe, Step, worst_map
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.walk_world import WalkOptions
@@ -123,7 +123,7 @@ def test_the_worst_map_is_the_one_nearest_to_its_bound_on_earth() -> None:
 
 
 def test_poison_that_gets_in_fails() -> None:
-    clean = Outcome(poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0)
+    clean = PoisonOutcome(poison="mirrored", sent=10, active=0, quarantined=0, wrong=0, off_share=0.0)
     good = {"changed": True, "restored": True}
     assert all(holding(growth_poison.judge([clean], 0.01, good)).values())
     for bad in (replace(clean, wrong=1), replace(clean, off_share=0.03)):

@@ -9,7 +9,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.similarity_fit import (
-    FitOptions,
+    SimilarityFitOptions,
     agreeing_photos,
     correspondence_errors,
     fit_similarity,
@@ -21,7 +21,7 @@ from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import box_points, random_descriptors, ring
 
 TRUTH = SFM_FROM_LOCAL.inverse()
-OPTIONS = FitOptions()
+OPTIONS = SimilarityFitOptions()
 
 
 def world(seed: int, noise_px: float = 0.5, photos: int = 5) -> tuple[NewPhotos, FloatArray]:

@@ -10,7 +10,8 @@ import pytest
 
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.submodel import keep_photos
 from ingest.growth.graph.budget import drift_gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, place_of, solve_with_new
 from ingest.growth.graph.new_overlaps import overlaps_to_measure
@@ -23,7 +24,6 @@ from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witnes
 from ingest.growth.trust.promotion import Promotion, canary_gate, contradiction_gate, points_gate
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
 from ingest.growth.trust.witnesses import Heard
-from ingest.submodel import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, strip_map
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])

@@ -13,8 +13,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
-from ingest.map_errors import map_errors
-from reloc.lens_prior import LensPrior, seen_by_a_map
+from ingest.colmap.map_errors import map_errors
+from reloc.lens_prior import QueryLensPrior, seen_by_a_map
 from reloc.self_calibration import calibrate
 
 _LENS = Camera(
@@ -86,7 +86,7 @@ def test_points_bent_by_another_aspect_no_longer_move_a_photo_whose_lens_is_told
     seen = seen_by_a_map(told, uncertainty)
     assert seen is not None
     by_doubt = calibrate(pixels, bent, Rigid3.identity(), *seen, 1.0).cam_from_local
-    exact = LensPrior(mean=seen[1].mean, sigma=np.full(8, 1e-7))
+    exact = QueryLensPrior(mean=seen[1].mean, sigma=np.full(8, 1e-7))
     as_told = calibrate(pixels, bent, Rigid3.identity(), seen[0], exact, 1.0).cam_from_local
     assert np.linalg.norm(by_doubt.center) < 0.5 * np.linalg.norm(as_told.center)
 

@@ -9,8 +9,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.shot import look_pose
 from reloc.tracking.lens_walk import LensWalk
-from reloc.tracking.options import FitOptions, LensWalkOptions
-from reloc.tracking.pose_fit import FittedPose, LensUncertainty, fit_pose
+from reloc.tracking.options import LensWalkOptions, PoseFitOptions
+from reloc.tracking.pose_fit import FittedPose, LensSigmas, fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
 POSE = look_pose([3.0, -2.0, 50.0], 40.0, -55.0)
@@ -23,10 +23,10 @@ def points_in_view(rng: np.random.Generator, count: int = 150) -> np.ndarray:
     return POSE.inverse().act(rays * rng.uniform(35, 70, (count, 1)))
 
 
-def fitted(camera: Camera, start: Camera, rng: np.random.Generator, doubt: LensUncertainty) -> FittedPose:
+def fitted(camera: Camera, start: Camera, rng: np.random.Generator, doubt: LensSigmas) -> FittedPose:
     points = points_in_view(np.random.default_rng(7))
     pixels = camera.project(POSE.act(points)) + rng.normal(0, 0.4, (len(points), 2))
-    found = fit_pose(start, pixels, points, POSE, FitOptions(), doubt)
+    found = fit_pose(start, pixels, points, POSE, PoseFitOptions(), doubt)
     assert found is not None
     return found
 
@@ -34,7 +34,7 @@ def fitted(camera: Camera, start: Camera, rng: np.random.Generator, doubt: LensU
 def test_the_covariance_is_that_of_many_runs_with_lenses_that_are_not_known() -> None:
     """Focal length fitted along; principal point and distortion are only allowed for."""
     rng = np.random.default_rng(1)
-    doubt = LensUncertainty(focal_rel=0.1, center_px=5.0, radial=0.02)
+    doubt = LensSigmas(focal_rel=0.1, center_px=5.0, radial=0.02)
     squares, focals = [], []
     for _ in range(200):
         off = rng.normal(0, (0.02, doubt.center_px, doubt.center_px, doubt.radial))
@@ -50,7 +50,7 @@ def test_the_covariance_is_that_of_many_runs_with_lenses_that_are_not_known() ->
 
 
 def test_a_given_lens_is_left_as_it_is() -> None:
-    found = fitted(CAMERA, CAMERA, np.random.default_rng(2), LensUncertainty())
+    found = fitted(CAMERA, CAMERA, np.random.default_rng(2), LensSigmas())
     assert found.focal_px == CAMERA.focal_px
     assert found.focal_rel == 0.0
 

@@ -7,7 +7,7 @@ import pytest
 
 from featuredb.adjust.terms import LensWidths, lens_prior
 from featuredb.geometry.camera import Camera
-from ingest.colmap_adjust import AdjustOptions
+from ingest.colmap.adjust import AdjustOptions
 from tools.lens_widths import WIDTHS, Told, assumed_widths, limits_of, measured_widths
 
 TRUE = LensWidths(focal_rel=0.01, aspect_rel=0.0005, center_rel=0.004, radial=0.03, tangential=0.001)

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.component import taken_apart
-from ingest.links import firm_parts, firmness
+from ingest.sfm.links import firm_parts, firmness
 from tests.support.posed_models import model_of
 
 

@@ -17,7 +17,7 @@ from reloc.matching import (
     guided_matches,
     visible_points,
 )
-from reloc.options import MatchOptions
+from reloc.options import PointMatchOptions
 from tests.support.scenes import (
     CAMERA,
     box_points,
@@ -30,10 +30,10 @@ from tests.support.scenes import (
     scene_map,
 )
 
-OPTIONS = MatchOptions()
+OPTIONS = PointMatchOptions()
 
 
-def match_cluster(features: Features, cluster: Cluster, options: MatchOptions) -> Matches:
+def match_cluster(features: Features, cluster: Cluster, options: PointMatchOptions) -> Matches:
     return ClusterMatcher(features, cluster, options).matches(len(features))
 
 

@@ -8,10 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.maps.feature_map import GeoPrior
-from ingest.duplicates import DuplicateOptions, copies_of, near_duplicates
-from ingest.matching import Matched
-from ingest.overlays import OverlayOptions, is_copy, without_overlay
-from ingest.photo import Photo
+from ingest.photos.duplicates import DuplicateOptions, copies_of, near_duplicates
+from ingest.photos.photo import Photo
+from ingest.sfm.matching import Matched
+from ingest.sfm.overlays import OverlayOptions, is_copy, without_overlay
 
 _SIZE = (1600, 1200)
 _OPTIONS = OverlayOptions()

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import GeoPrior
-from ingest.pairs import PairOptions, choose_pairs, more_pairs
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
+from ingest.sfm.pairs import PairOptions, choose_pairs, more_pairs
 from tools.train_vocabulary import train_vocabulary
 
 _FRAME = LocalFrame(latitude_deg=48.99, longitude_deg=8.41, height_m=100.0)

@@ -10,8 +10,8 @@ import pytest
 from PIL import Image
 
 from featuredb.errors import IngestError
-from ingest.photo_table import is_table, read_table, summary_of
-from ingest.scan import ScanOptions, scan_table
+from ingest.photos.scan import ScanOptions, scan_table
+from ingest.photos.table import is_table, read_table, summary_of
 
 _ROWS = [
     {"path": "a/one.jpg", "lat": 48.99, "lon": 8.41, "accuracy": 25.0, "time": "2026-03-01T12:00:00+00:00",

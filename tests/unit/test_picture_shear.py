@@ -8,7 +8,7 @@ import pytest
 from featuredb.adjust.block import Block
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.picture_shear import picture_shear
+from ingest.colmap.picture_shear import picture_shear
 
 _PHOTOS, _POINTS = 6, 400
 

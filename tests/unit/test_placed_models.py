@@ -8,12 +8,12 @@ import pytest
 
 from featuredb.geometry.camera import Camera
 from ingest.clusters.reconstruct import Reconstruction
-from ingest.colmap_bridge import Model
-from ingest.extract import FeatureFiles
+from ingest.colmap.bridge import Model
 from ingest.map_builder import MapIdentity
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from ingest.placed_models import Component, impossible_lens, impossible_shear, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed
+from ingest.sfm.extract import FeatureFiles
 from tests.support.growth_box import existing
 from tests.support.posed_models import model_of
 

@@ -7,7 +7,7 @@ from scipy.optimize import least_squares
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
-from ingest.precision import (
+from ingest.colmap.precision import (
     Linearised,
     linearise,
     point_covariances,

@@ -11,13 +11,13 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
-from ingest.colmap_bridge import Model, without_impossible
+from ingest.colmap.bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.photo import Photo
-from ingest.photo_cameras import photo_cameras
-from ingest.photo_positions import center_priors, local_frame_of
+from ingest.photos.cameras import photo_cameras
+from ingest.photos.photo import Photo
+from ingest.photos.positions import center_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions
-from ingest.sfm import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
+from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA
 
 _PHOTO = Photo(

@@ -11,7 +11,7 @@ from tools.scoreboard.catalogue import ROWS
 from tools.scoreboard.report import MOST_IN_README, PAGE, README, page, readme_table, with_table
 from tools.scoreboard.results import Result, newest, read_results, write_results
 from tools.scoreboard.row import Limit, Row
-from tools.scoreboard.run import Places, run
+from tools.scoreboard.run import Folders, run
 
 _TOOL = "import json, pathlib, sys; pathlib.Path(sys.argv[1]).write_text(json.dumps({'a': {'m': 0.25}}))"
 
@@ -39,7 +39,7 @@ def result(commit: str, m: float, failure: str = "") -> Result:
 
 
 def test_a_row_is_run_and_its_figures_read(tmp_path: Path) -> None:
-    places = Places(data=tmp_path, work=tmp_path / "work")
+    places = Folders(data=tmp_path, work=tmp_path / "work")
     assert places.missing(row()) == [tmp_path / "set"]
     places.work.mkdir()
     code = _TOOL.replace("{", "{{").replace("}", "}}")
@@ -54,7 +54,7 @@ def test_a_row_is_run_and_its_figures_read(tmp_path: Path) -> None:
 
 
 def test_a_stopped_row_goes_on_where_it_was_at_the_same_commit_alone(tmp_path: Path) -> None:
-    places = Places(data=tmp_path, work=tmp_path)
+    places = Folders(data=tmp_path, work=tmp_path)
     code = "import os; print(os.listdir(os.path.dirname(sys.argv[1]))); os._exit(3)"
     for resumes, commit, kept in ((True, "abc", True), (True, "abc+", False), (False, "abc", False)):
         folder = tmp_path / "tiny" / commit

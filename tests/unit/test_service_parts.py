@@ -13,7 +13,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from reloc.reply import reply_from_result
 from reloc.result import REASONS
-from reloc.service.metrics import Metrics
+from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.session import Keys, bind_free_port
 from reloc.service.threads import capped_process
@@ -86,7 +86,7 @@ def test_stages_sum_to_the_total_and_to_the_wall_time():
 
 
 def test_percentiles_of_the_latency():
-    metrics = Metrics()
+    metrics = ServerMetrics()
     for ms in range(1, 101):
         metrics.answered(None if ms % 2 else "AMBIGUOUS", float(ms))
     latency = metrics.latency()

@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.simworld import strip as classes
-from featuredb.simworld.airborne import AirborneScan, ScanOptions, scan_town
+from featuredb.simworld.airborne import AirborneScan, scan_town
 from featuredb.simworld.days import DayOptions, another_day
 from featuredb.simworld.echoes import RANGE_RESOLUTION_M
 from featuredb.simworld.reflectance import scene_reflectance
+from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scene import Faces, Scene, texture_index
 from featuredb.simworld.town import BUILDING_ID, TREE_ID, make_town
 
-OPTIONS = ScanOptions(
+OPTIONS = AirborneScanOptions(
     seed=3, height_m=300.0, max_scan_angle_deg=14.0, margin_m=5.0, birds=1e-3, multipath=1e-3
 )
 CLEAN = replace(
@@ -254,5 +255,5 @@ def test_cars_differ_from_day_to_day_and_the_rest_does_not(town: Scene) -> None:
 
 def test_options_are_checked() -> None:
     for wrong in ({"max_scan_angle_deg": 60.0}, {"density_per_m2": 0.0}, {"overlap": 0.95}, {"birds": 2.0}):
-        with pytest.raises(InvalidValueError, match="ScanOptions"):
-            ScanOptions(**wrong)
+        with pytest.raises(InvalidValueError, match="AirborneScanOptions"):
+            AirborneScanOptions(**wrong)

@@ -8,7 +8,7 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from ingest.register.structure.surface_fit import (
     Surface,
-    SurfaceOptions,
+    SurfaceFitOptions,
     guarded_gicp,
     plane_distances,
     reach_of,
@@ -18,7 +18,7 @@ from tests.support.scanned_map import ground_points, height, plain_cloud, scan
 
 pytest.importorskip("small_gicp")
 
-_OPTIONS = SurfaceOptions()
+_OPTIONS = SurfaceFitOptions()
 _LOOSE = np.diag([1e-6] + [1e-6] * 3 + [0.1**2] * 3)
 _TIGHT = np.diag([1e-12] * 4 + [1e-4**2] * 3)
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
-from ingest.tagged_elsewhere import ElsewhereOptions, tagged_elsewhere
+from ingest.register.tagged_elsewhere import ElsewhereOptions, tagged_elsewhere
 from tests.support.posed_models import model_of
 
 _TWIN = (11, 12, 13)  # photos of a twin of the house that 10 shows

@@ -11,12 +11,12 @@ from featuredb.geometry.rotation import so3_log
 from featuredb.simworld.shot import look_pose
 from reloc.tracking.flow import follow
 from reloc.tracking.landmarks import Landmarks
-from reloc.tracking.options import FitOptions, FlowOptions, TrackOptions
+from reloc.tracking.options import FlowOptions, PoseFitOptions, TrackOptions
 from reloc.tracking.pose_fit import fit_pose
 
 CAMERA = Camera(model="RADIAL", width=1280, height=720, params=(970.0, 641.0, 359.0, -0.03, 0.01))
 POSE = look_pose([3.0, -2.0, 50.0], 40.0, -60.0)
-FLOW, FIT = FlowOptions(), FitOptions()
+FLOW, FIT = FlowOptions(), PoseFitOptions()
 
 
 def scene(rng: np.random.Generator, count: int = 200) -> tuple[np.ndarray, np.ndarray]:

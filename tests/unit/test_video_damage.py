@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import VideoError
-from featuredb.video.decoding import Decoder, FilmClock, Tally
+from featuredb.video.decoding import Decoder, FilmClock, ReadingTally
 from featuredb.video.film import VideoOptions, VideoReport
 from featuredb.video.frames import open_video
 from tests.support.films import (
@@ -239,7 +239,7 @@ def _times(stamps: list[Any], interval_s: float | None = 0.04) -> tuple[list[flo
         time_base=Fraction(1, 100), origin_s=Fraction(0), interval_s=interval_s, decoding_order=False
     )
     stream = type("Stream", (), {"codec_context": type("Context", (), {"reorder_depth": 0})})
-    tally = Tally()
+    tally = ReadingTally()
     decoder = Decoder(_Container(stamps), stream, clock, tally, "film.mp4")  # type: ignore[arg-type]
     return [time_s for time_s, _ in decoder.pictures()], tally.report(None, None)
 

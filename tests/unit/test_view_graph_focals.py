@@ -11,9 +11,9 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from ingest.colmap_bridge import SfmPhoto, TwoView, read_models, verify_pair, write_database
-from ingest.sfm import SfmOptions, SfmTask, SfmView, reconstruct
-from ingest.view_graph_focals import calibrate_focals, start_from
+from ingest.colmap.bridge import SfmPhoto, TwoView, read_models, verify_pair, write_database
+from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView, reconstruct
+from ingest.sfm.view_graph_focals import calibrate_focals, start_from
 from ingest.workspace import write_arrays
 from tests.support.scenes import looking_at
 

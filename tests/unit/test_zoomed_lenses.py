@@ -12,10 +12,10 @@ from featuredb.adjust.problem import Problem
 from featuredb.adjust.terms import Terms
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_adjust import AdjustOptions, lens_prior_of
-from ingest.colmap_bridge import Model
-from ingest.photo import Photo
-from ingest.zoomed_lenses import focal_runs, zoomed_keys
+from ingest.colmap.adjust import AdjustOptions, lens_prior_of
+from ingest.colmap.bridge import Model
+from ingest.photos.photo import Photo
+from ingest.sfm.zoomed_lenses import focal_runs, zoomed_keys
 from tests.support.scenes import box_points, looking_at
 
 ZOOM = [800.0] * 5 + [860.0, 940.0, 1010.0] + [1040.0] * 4

@@ -19,7 +19,7 @@ from tools.scoreboard.catalogue import ROWS
 from tools.scoreboard.report import PAGE, README, page, readme_table, with_table
 from tools.scoreboard.results import ROOT, Result, code_commit, newest, read_results, write_results
 from tools.scoreboard.row import Row
-from tools.scoreboard.run import Places, run
+from tools.scoreboard.run import Folders, run
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,7 +57,7 @@ def _chosen(names: Sequence[str], full: bool) -> list[Row]:
 
 def _run_all(rows: Sequence[Row], args: argparse.Namespace, commit: str) -> None:
     """Run what has no result yet; each result is kept at once, so that an interrupted run goes on."""
-    places = Places(data=args.data, work=args.work)
+    places = Folders(data=args.data, work=args.work)
     places.work.mkdir(parents=True, exist_ok=True)
     for row in rows:
         known = next((r for r in read_results() if (r.row, r.commit) == (row.name, commit)), None)

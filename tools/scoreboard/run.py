@@ -19,7 +19,7 @@ _LAST_LINES = 3  # of a command that failed, in its result
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Places:
+class Folders:
     """Folders: of the real sets, and for work."""
 
     data: Path
@@ -30,7 +30,7 @@ class Places:
         return [self.data / name for name in row.needs if not (self.data / name).exists()]
 
 
-def run(row: Row, places: Places, commit: str) -> Result:
+def run(row: Row, places: Folders, commit: str) -> Result:
     """Measure a row. A command that fails leaves a result that says so; its output stays in `row.log`."""
     work = places.work / row.name / commit
     goes_on = row.resumes and not commit.endswith("+")

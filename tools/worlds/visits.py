@@ -26,7 +26,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Look:
+class Viewpoint:
     """Where one photo is taken from and of what, town axes; `turn_deg` is heading, pitch, roll on top."""
 
     eye: FloatArray
@@ -34,7 +34,7 @@ class Look:
     turn_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
-DroneMode = Callable[[Person, Sight, Surroundings, int, np.random.Generator], list[Look]]
+DroneMode = Callable[[Person, Sight, Surroundings, int, np.random.Generator], list[Viewpoint]]
 
 
 def ground_visit(
@@ -58,7 +58,7 @@ def ground_visit(
             upright = person.upright != "never" and rng.random() < 0.5
             device, roll, orientation = _held(device, person, upright)
             wobble = rng.normal(0, [3.0, 2.0, 0.8 + 3.0 * careless])
-            look = Look(eye=eye, target=aim, turn_deg=(wobble[0], wobble[1], wobble[2] + roll))
+            look = Viewpoint(eye=eye, target=aim, turn_deg=(wobble[0], wobble[1], wobble[2] + roll))
             view = _view(around, look, device, orientation, "ground", _NEAREST_GROUND_M)
             if view is not None:
                 views.append(view)
@@ -90,7 +90,7 @@ def drone_visit(
         turn = (look.turn_deg[0] + wobble[0], look.turn_deg[1] + wobble[1], look.turn_deg[2] + wobble[2])
         view = _view(
             around,
-            Look(eye=look.eye, target=look.target, turn_deg=turn),
+            Viewpoint(eye=look.eye, target=look.target, turn_deg=turn),
             person.drone,
             1,
             mode,
@@ -102,7 +102,7 @@ def drone_visit(
 
 
 def _view(
-    around: Surroundings, look: Look, device: Device, orientation: int, mode: str, nearest_m: float
+    around: Surroundings, look: Viewpoint, device: Device, orientation: int, mode: str, nearest_m: float
 ) -> View | None:
     """The view, or None where nobody would take it or the camera would stand in something."""
     inside = np.abs(look.eye[:2]) < 0.5 * np.asarray(around.scene.plan.size) + 20.0
@@ -121,7 +121,7 @@ def _height(person: Person, rng: np.random.Generator) -> float:
 
 def _orbit(
     person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Look]:
+) -> list[Viewpoint]:
     """A part of a circle, 8 to 20 degrees between photos; the town lies behind the sight or under it."""
     above = _height(person, rng)
     radius = sight.radius + above * float(rng.uniform(0.5, 1.6))
@@ -132,13 +132,13 @@ def _orbit(
         a = np.radians(start + step * i)
         eye = target + radius * np.array([np.cos(a), np.sin(a), 0.0]) + rng.normal(0, 0.8, 3)
         eye[2] = around.ground(float(target[1])) + above
-        looks.append(Look(eye=eye, target=target))
+        looks.append(Viewpoint(eye=eye, target=target))
     return looks
 
 
 def _climb(
     person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Look]:
+) -> list[Viewpoint]:
     """Take-off before the sight: from the height of a person's head up, camera lowered as it rises."""
     x, y, eye_z = sight.stands[int(rng.integers(len(sight.stands)))]
     top = max(_height(person, rng), 12.0)
@@ -148,13 +148,13 @@ def _climb(
     for height in 2.0 * (top / 2.0) ** np.linspace(0.0, 1.0, max(count, 2)):
         back = 0.35 * height * away + rng.normal(0, 0.4, 2)
         eye = np.array([x + back[0], y + back[1], eye_z - 1.6 + height])
-        looks.append(Look(eye=eye, target=np.asarray(sight.target)))
+        looks.append(Viewpoint(eye=eye, target=np.asarray(sight.target)))
     return looks[:count]
 
 
 def _along(
     person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Look]:
+) -> list[Viewpoint]:
     """Forward over the town towards and past the sight, camera 20 to 45 degrees down."""
     above = min(_height(person, rng), 45.0)
     heading = float(rng.choice([0.0, 90.0, 180.0, 270.0]) + rng.normal(0, 8))
@@ -166,13 +166,13 @@ def _along(
         eye = target + ahead * step * (i - 0.7 * count)
         eye[2] = around.ground(float(eye[1])) + above
         reach = above / np.tan(np.radians(down))
-        looks.append(Look(eye=eye, target=eye + ahead * reach - [0, 0, above]))
+        looks.append(Viewpoint(eye=eye, target=eye + ahead * reach - [0, 0, above]))
     return looks
 
 
 def _down(
     person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Look]:
+) -> list[Viewpoint]:
     """Straight down in hops of a quarter to a half of the height, some with the camera a little forward."""
     above = max(_height(person, rng), 30.0)
     heading = float(rng.uniform(0, 360))
@@ -183,13 +183,13 @@ def _down(
     for i in range(count):
         eye = np.asarray(sight.target) + ahead * step * (i - 0.5 * count)
         eye[2] = around.ground(float(eye[1])) + above
-        looks.append(Look(eye=eye, target=eye + ahead * lean * above - [0, 0, above]))
+        looks.append(Viewpoint(eye=eye, target=eye + ahead * lean * above - [0, 0, above]))
     return looks
 
 
 def _overview(
     person: Person, sight: Sight, around: Surroundings, count: int, rng: np.random.Generator
-) -> list[Look]:
+) -> list[Viewpoint]:
     """The town from above its rim, or panned from one place: high, 15 to 45 degrees down."""
     above = float(rng.uniform(max(60.0, person.heights_m[0]), max(75.0, person.heights_m[1])))
     angle, down = float(rng.uniform(0, 360)), float(rng.uniform(15, 45))
@@ -204,7 +204,7 @@ def _overview(
         offset = i - 0.5 * (min(count, 5) - 1)
         here = eye + side * hop * offset + rng.normal(0, 0.7, 3)
         aim = np.asarray(sight.target) + side * hop * offset
-        looks.append(Look(eye=here, target=aim, turn_deg=(pan * offset, 0.0, 0.0)))
+        looks.append(Viewpoint(eye=here, target=aim, turn_deg=(pan * offset, 0.0, 0.0)))
     return looks
 
 

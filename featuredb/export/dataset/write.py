@@ -35,7 +35,7 @@ from featuredb.export.dataset.stac import check_stac, write_catalogue
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import Lineage
+from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store.encode import encode_map
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
@@ -183,7 +183,7 @@ def _camera_rows(feature_map: FeatureMap) -> list[dict[str, Any]]:
     ]
 
 
-def _lineage_json(lineage: Lineage) -> str:
+def _lineage_json(lineage: MapLineage) -> str:
     document = {
         "chain": list(lineage.chain),
         "anchors": list(lineage.anchors),

@@ -15,7 +15,7 @@ from featuredb.video.telemetry.srt import read_srt, telemetry_of_blocks
 from featuredb.video.telemetry.srt_blocks import has_times
 from featuredb.video.telemetry.srt_fields import looks_like_telemetry
 from featuredb.video.telemetry.text import decode_text, read_bytes
-from featuredb.video.telemetry.tracks import Tracks, read_tracks
+from featuredb.video.telemetry.tracks import TelemetryTracks, read_tracks
 from featuredb.video.telemetry.values import Telemetry
 
 logger = logging.getLogger(__name__)
@@ -107,7 +107,7 @@ def telemetry_of_video(path: Path) -> Telemetry | None:
     return _first_readable(path.name, candidates, refused, damage)
 
 
-def _embedded(tracks: Tracks, name: str) -> list[_Candidate]:
+def _embedded(tracks: TelemetryTracks, name: str) -> list[_Candidate]:
     """Readers of the tracks that hold telemetry, best first."""
     found = []
     for index, packets in tracks.gpmf.items():

@@ -21,7 +21,7 @@ from featuredb.video.telemetry.assemble import (
     resolution_of_decimals,
 )
 from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
-from featuredb.video.telemetry.srt_blocks import Block, is_cut_off, lacks_words, split_blocks
+from featuredb.video.telemetry.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
 from featuredb.video.telemetry.srt_fields import BlockFields, looks_like_telemetry, parse_block
 from featuredb.video.telemetry.text import decode_text, parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
@@ -46,7 +46,7 @@ def read_srt(data: bytes, origin: str = "subtitles") -> Telemetry:
     return telemetry_of_blocks(split_blocks(decode_text(data)), origin)
 
 
-def telemetry_of_blocks(blocks: Sequence[Block], origin: str) -> Telemetry:
+def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
     """The telemetry of subtitles that were read already; arguments and errors as for `read_srt`."""
     check_count(len(blocks), origin)
     if not any(looks_like_telemetry(block.text) for block in blocks):
@@ -85,12 +85,12 @@ def telemetry_of_blocks(blocks: Sequence[Block], origin: str) -> Telemetry:
     return assemble(table, about)
 
 
-def _sample_of(blocks: Sequence[Block]) -> str:
+def _sample_of(blocks: Sequence[Subtitle]) -> str:
     text = next((block.text for block in blocks if block.text), "")
     return f"; the first says {text[:60]!r}" if text else ""
 
 
-def _whole_blocks(blocks: Sequence[Block], parsed: list[BlockFields], warnings: list[str]) -> list[int]:
+def _whole_blocks(blocks: Sequence[Subtitle], parsed: list[BlockFields], warnings: list[str]) -> list[int]:
     """Rows of the blocks without a cut-off last one. Damaged ones before it stay, without what they lost."""
     rows = list(range(len(blocks)))
     last = blocks[-1].text
@@ -108,13 +108,13 @@ def _whole_blocks(blocks: Sequence[Block], parsed: list[BlockFields], warnings: 
     return rows
 
 
-def _clocks(blocks: Sequence[Block]) -> list[float]:
+def _clocks(blocks: Sequence[Subtitle]) -> list[float]:
     found = [parse_wall_clock(block.text) for block in blocks]
     return [clock.seconds if clock else math.nan for clock in found]
 
 
 def _times(
-    blocks: Sequence[Block], clocks: list[float], origin: str, warnings: list[str]
+    blocks: Sequence[Subtitle], clocks: list[float], origin: str, warnings: list[str]
 ) -> tuple[list[float], bool]:
     """Seconds of the video, or of the clock in files without such times; and which of them it is."""
     times = [block.start_s for block in blocks]

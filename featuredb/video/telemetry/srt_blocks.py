@@ -16,7 +16,7 @@ _COMPARED = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class Subtitle:
     """One subtitle.
 
     Attributes:
@@ -28,7 +28,7 @@ class Block:
     text: str
 
 
-def split_blocks(text: str) -> list[Block]:
+def split_blocks(text: str) -> list[Subtitle]:
     """The blocks of a SubRip text, in their order.
 
     A block begins at its line of times. Where a file has none (it happens), a line with nothing but a number
@@ -40,7 +40,7 @@ def split_blocks(text: str) -> list[Block]:
         numbered = [row for row, line in enumerate(lines) if _NUMBER_LINE.match(line)]
         ends = [*numbered, len(lines)][1:]
         return [
-            Block(float("nan"), plain_text(lines[row + 1 : end]))
+            Subtitle(float("nan"), plain_text(lines[row + 1 : end]))
             for row, end in zip(numbered, ends, strict=True)
         ]
     blocks = []
@@ -48,7 +48,7 @@ def split_blocks(text: str) -> list[Block]:
     for (row, match), end in zip(starts, ends, strict=True):
         hours, minutes, seconds = (float(match[part]) for part in (1, 2, 3))
         start = 3600.0 * hours + 60.0 * minutes + seconds + float(f"0.{match[4]}")
-        blocks.append(Block(start, plain_text(_without_number(lines[row + 1 : end]))))
+        blocks.append(Subtitle(start, plain_text(_without_number(lines[row + 1 : end]))))
     return blocks
 
 

@@ -14,7 +14,7 @@ from featuredb.video.film import VideoOptions
 from featuredb.video.opening import open_input, opening_of
 from featuredb.video.telemetry.assemble import check_count
 from featuredb.video.telemetry.gpmf import TimedPacket
-from featuredb.video.telemetry.srt_blocks import Block, plain_text
+from featuredb.video.telemetry.srt_blocks import Subtitle, plain_text
 from featuredb.video.telemetry.text import decode_text
 
 # GPMF is some 10 to 30 kB a second: five hours and more.
@@ -24,7 +24,7 @@ _DJI_NAMES = ("dji meta", "cam meta", "djmd")
 
 
 @dataclass(slots=True)
-class Tracks:
+class TelemetryTracks:
     """What a video holds beside pictures and sound.
 
     Attributes:
@@ -35,12 +35,12 @@ class Tracks:
     """
 
     gpmf: dict[int, list[TimedPacket]] = field(default_factory=dict)
-    subtitles: dict[int, list[Block]] = field(default_factory=dict)
+    subtitles: dict[int, list[Subtitle]] = field(default_factory=dict)
     damage: list[str] = field(default_factory=list)
     hints: list[str] = field(default_factory=list)
 
 
-def read_tracks(path: Path) -> Tracks:
+def read_tracks(path: Path) -> TelemetryTracks:
     """The tracks of a video that may hold telemetry; times are those of the container, as its frames' are.
 
     Raises:
@@ -55,8 +55,8 @@ def read_tracks(path: Path) -> Tracks:
         return _read(container, path.name)
 
 
-def _read(container: InputContainer, name: str) -> Tracks:
-    tracks = Tracks()
+def _read(container: InputContainer, name: str) -> TelemetryTracks:
+    tracks = TelemetryTracks()
     wanted: list[Stream] = []
     for stream in container.streams:
         if stream.type in ("data", "subtitle") and stream.time_base:
@@ -92,7 +92,7 @@ def _read(container: InputContainer, name: str) -> Tracks:
     return tracks
 
 
-def _sort_out(stream: Stream, packets: "list[Packet[Stream]]", tracks: Tracks) -> None:
+def _sort_out(stream: Stream, packets: "list[Packet[Stream]]", tracks: TelemetryTracks) -> None:
     if not packets:
         return
     if stream.type == "data":
@@ -109,7 +109,7 @@ def _sort_out(stream: Stream, packets: "list[Packet[Stream]]", tracks: Tracks) -
             data = data[2 : 2 + int.from_bytes(data[:2], "big")]
         text = plain_text(decode_text(data).splitlines())
         if text:
-            blocks.append(Block(start, text))
+            blocks.append(Subtitle(start, text))
     if blocks:
         tracks.subtitles[stream.index] = blocks
 

@@ -20,7 +20,7 @@ from scipy.stats import chi2, norm
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.graph.pose_graph_fit import Fit, GraphEdge, GraphNode
+from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode, PoseGraphFit
 
 _NAMED = 8  # overlaps that a message names
 
@@ -109,7 +109,7 @@ def solve_pose_graph(
         reached = _anchored(nodes, remaining)
         if not reached:
             return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
-        fitted = Fit.of([n for n in nodes if n.map_id in reached], remaining)
+        fitted = PoseGraphFit.of([n for n in nodes if n.map_id in reached], remaining)
         fits = _edge_fits(fitted)
         worst = _contradicting(fitted, fits, options)
         if worst is None or _anchored(nodes, [e for e in remaining if e is not worst.edge]) != anchored_first:
@@ -119,7 +119,7 @@ def solve_pose_graph(
     return _solution(fitted, (*fits, *left_out), options)
 
 
-def _solution(fitted: "Fit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions) -> GraphSolution:
+def _solution(fitted: "PoseGraphFit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions) -> GraphSolution:
     factor = 1.0
     unlikely = fitted.degrees > 0 and chi2.sf(fitted.chi_square, fitted.degrees) < options.contradiction_p
     if unlikely:
@@ -150,7 +150,7 @@ def _solution(fitted: "Fit", fits: tuple[EdgeFit, ...], options: PoseGraphOption
     )
 
 
-def _edge_fits(fitted: Fit) -> tuple[EdgeFit, ...]:
+def _edge_fits(fitted: PoseGraphFit) -> tuple[EdgeFit, ...]:
     fits = []
     for edge, (statistic, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True):
         a, b = fitted.corrections[edge.a], fitted.corrections[edge.b]
@@ -167,7 +167,9 @@ def _edge_fits(fitted: Fit) -> tuple[EdgeFit, ...]:
     return tuple(fits)
 
 
-def _contradicting(fitted: "Fit", fits: Sequence[EdgeFit], options: PoseGraphOptions) -> EdgeFit | None:
+def _contradicting(
+    fitted: "PoseGraphFit", fits: Sequence[EdgeFit], options: PoseGraphOptions
+) -> EdgeFit | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
     if fitted.degrees == 0 or chi2.sf(fitted.chi_square, fitted.degrees) >= options.contradiction_p:
         return None

@@ -60,7 +60,7 @@ class GraphEdge:
         return f"{self.a} - {self.b}"
 
 
-class Fit:
+class PoseGraphFit:
     """A graph solved by least squares, with what is needed to judge it.
 
     Attributes:
@@ -88,7 +88,7 @@ class Fit:
         self._blocks = _inverse_blocks(jacobian, wanted)
 
     @classmethod
-    def of(cls, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> "Fit":
+    def of(cls, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> "PoseGraphFit":
         rows = {node.map_id: i for i, node in enumerate(nodes)}
         held = [e for e in edges if e.a in rows and e.b in rows]
         problem = _Problem(nodes, held, rows)

@@ -14,19 +14,19 @@ from featuredb.index.area import Area
 from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.submodel import keep_photos
 from ingest.growth.map_places import drift_m, places_of
 from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, with_lens
 from ingest.growth.place.parents import drift_covariance, map_agreements
-from ingest.growth.place.placement import Held, PlacementOptions, place_by_maps
+from ingest.growth.place.placement import PlacementOptions, SupportedPlacement, place_by_maps
 from ingest.growth.place.refine import adopt_lenses
 from ingest.growth.place.settle import SettleOptions, settle
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
-from ingest.links import firm_parts
 from ingest.map_builder import MapIdentity, MapOptions, build_map
-from ingest.photo import Photo
-from ingest.submodel import keep_photos
+from ingest.photos.photo import Photo
+from ingest.sfm.links import firm_parts
 from reloc.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
@@ -137,7 +137,7 @@ def _placed(
     areas: Sequence[Area],
     frame: LocalFrame,
     options: GrowOptions,
-) -> tuple[dict[int, LocalisedPhoto], Correspondences, Held]:
+) -> tuple[dict[int, LocalisedPhoto], Correspondences, SupportedPlacement]:
     """The photos' own poses by the model's lenses, all correspondences, and the placement."""
     rows = model.rows.tolist()
     camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
@@ -175,7 +175,7 @@ def _meeting_place(
 def assemble(
     model: Model,
     placement: MapsPlacement,
-    held: Held,
+    held: SupportedPlacement,
     photos: Sequence[Photo],
     features_of: FeaturesOf,
     areas: Sequence[Area],

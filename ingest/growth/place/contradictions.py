@@ -16,11 +16,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import linearise
 from ingest.growth import gates
-from ingest.growth.place.similarity_fit import Fit
+from ingest.growth.place.similarity_fit import FittedSimilarity
 from ingest.growth.values import LocalisedPhoto
-from ingest.precision import linearise
 
 # What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
 # corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
@@ -53,7 +53,7 @@ def contradicting_photos(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
-    fits: Sequence[Fit],
+    fits: Sequence[FittedSimilarity],
     options: ContradictionOptions,
 ) -> dict[int, str]:
     """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.values import LocalisedPhoto
 
 

@@ -18,16 +18,16 @@ from featuredb.adjust.terms import Marks, Terms
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
-from ingest.colmap_adjust import longest_side, residuals_of
-from ingest.colmap_anchored import (
+from ingest.colmap.adjust import longest_side, residuals_of
+from ingest.colmap.anchored import (
     AnchoredOptions,
     FixedPoints,
     Lenses,
     block_and_marks,
     with_observations,
 )
-from ingest.colmap_bridge import Model
-from ingest.precision import design_effect
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import design_effect
 
 _LEAST_FREEDOM = 0.1
 _PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks

@@ -16,17 +16,17 @@ from scipy.sparse.csgraph import connected_components
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap_anchored import (
+from ingest.colmap.anchored import (
     AnchoredOptions,
     FixedPoints,
     Lenses,
     adjust_anchored,
     triangulate_posed,
 )
-from ingest.colmap_bridge import Model, SfmPhoto, TwoView, verify_pair
+from ingest.colmap.bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.place.localised import in_frame
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
-from ingest.matching import MatchOptions, mutual_matches
+from ingest.sfm.matching import MatchOptions, mutual_matches
 
 _REFERENCE_SIDE_PX = 1600.0
 

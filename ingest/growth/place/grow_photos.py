@@ -3,14 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.component import GrowOptions, grow_component
 from ingest.growth.place.groups import GroupOptions, lone_groups
 from ingest.growth.place.localised import with_shared_lenses
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
-from ingest.photo import Photo
-from ingest.photo_cameras import shared_key
+from ingest.photos.cameras import shared_key
+from ingest.photos.photo import Photo
 from reloc.candidates import IndexedArea
 
 

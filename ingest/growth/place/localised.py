@@ -15,7 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.index.descriptor_index import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from reloc.acceptance import AcceptanceOptions, agreement
 from reloc.candidates import IndexedArea
 from reloc.lens_prior import LensPriors
@@ -325,7 +325,7 @@ def with_shared_lenses(
     A photo that this lens does not fit keeps its own (`with_lens`).
 
     Args:
-        keys: of the cameras, by row (`ingest.photo_cameras.shared_key`).
+        keys: of the cameras, by row (`ingest.photos.cameras.shared_key`).
     """
     found = dict(localised)
     cameras: dict[str, list[int]] = {}

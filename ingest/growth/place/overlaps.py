@@ -15,12 +15,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.correspondences import find_correspondences
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_photo
 from ingest.growth.place.similarity_fit import (
-    FitOptions,
+    SimilarityFitOptions,
     agreeing_photos,
     fit_similarity,
     proposals,
@@ -28,7 +28,7 @@ from ingest.growth.place.similarity_fit import (
     tolerances_px,
 )
 from ingest.growth.values import LocalisedPhoto
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 from reloc.candidates import IndexedArea
 
 
@@ -48,7 +48,7 @@ class OverlapOptions:
     min_photos: int = 3
     min_points: int = 60
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
-    fit: FitOptions = field(default_factory=FitOptions)
+    fit: SimilarityFitOptions = field(default_factory=SimilarityFitOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

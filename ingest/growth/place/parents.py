@@ -12,9 +12,9 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
-from ingest.growth.place.similarity_fit import Fit, FitOptions, fit_similarity
+from ingest.growth.place.similarity_fit import FittedSimilarity, SimilarityFitOptions, fit_similarity
 from ingest.growth.values import Edge, MapAgreement, MapsPlacement
 
 
@@ -33,11 +33,11 @@ class ParentOptions:
 
 def edges_of(
     model: Model,
-    fit: Fit,
+    fit: FittedSimilarity,
     correspondences: Correspondences,
     used: NDArray[np.bool_],
     options: ParentOptions,
-    fitting: FitOptions,
+    fitting: SimilarityFitOptions,
 ) -> tuple[Edge, ...]:
     """How each existing map holds the model, by its own points alone where they suffice."""
     found: list[Edge] = []

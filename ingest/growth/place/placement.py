@@ -14,7 +14,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.index.area import Area
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
 from ingest.growth.map_places import at_most_places, place_sigmas_m
@@ -22,8 +22,8 @@ from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.parents import ParentOptions, edges_of, parents_covariance
 from ingest.growth.place.similarity_fit import (
-    Fit,
-    FitOptions,
+    FittedSimilarity,
+    SimilarityFitOptions,
     agreeing_photos,
     fit_similarity,
     proposals,
@@ -32,7 +32,7 @@ from ingest.growth.place.similarity_fit import (
 )
 from ingest.growth.place.visibility import ShownParts, VisibilityOptions, shown_parts
 from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +59,7 @@ class PlacementOptions:
         parents: when an existing map is one of them.
     """
 
-    fit: FitOptions = field(default_factory=FitOptions)
+    fit: SimilarityFitOptions = field(default_factory=SimilarityFitOptions)
     min_agreeing: int = 2
     max_disagreeing: float = 0.34
     min_shared_points: int = 30
@@ -74,7 +74,7 @@ class PlacementOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Held:
+class SupportedPlacement:
     """A placement with what it rests on.
 
     Attributes:
@@ -84,7 +84,7 @@ class Held:
 
     placement: MapsPlacement
     correspondences: Correspondences
-    fit: Fit | None
+    fit: FittedSimilarity | None
     used: NDArray[np.bool_]
 
 
@@ -96,7 +96,7 @@ def place_by_maps(
     areas: Sequence[Area],
     frame: LocalFrame,
     options: PlacementOptions,
-) -> Held:
+) -> SupportedPlacement:
     """Place a model by the localisations of its photos.
 
     Args:
@@ -122,7 +122,7 @@ def place_by_maps(
             disagreeing=tuple(localised_rows(model, own)),
             gates=(gate,),
         )
-        return Held(
+        return SupportedPlacement(
             placement=placement,
             correspondences=correspondences,
             fit=None,
@@ -155,7 +155,7 @@ def place_by_maps(
         residual_rms_m=_rms(_center_offsets(model, fit.local_from_sfm, own, agree)),
         gates=asked,
     )
-    return Held(placement=placement, correspondences=correspondences, fit=fit, used=used)
+    return SupportedPlacement(placement=placement, correspondences=correspondences, fit=fit, used=used)
 
 
 def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: VisibilityOptions) -> set[int]:
@@ -176,7 +176,7 @@ def _settled(
     own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
     options: PlacementOptions,
-) -> tuple[Fit, set[int]] | None:
+) -> tuple[FittedSimilarity, set[int]] | None:
     """The fit to the photos that agree with it, and these; None where no photo does."""
     tolerance = tolerances_px(model, correspondences, options.fit.tolerance_rel)
     chosen: set[int] = {int(k) for k in agree}
@@ -211,7 +211,7 @@ def _center_offsets(
 
 def _ask(
     model: Model,
-    fit: Fit,
+    fit: FittedSimilarity,
     agree: set[int],
     own: Mapping[int, LocalisedPhoto],
     held: Correspondences,
@@ -244,7 +244,7 @@ def _ask(
     )
 
 
-def _rim_sigma_m(model: Model, fit: Fit, reach_m: float) -> float:
+def _rim_sigma_m(model: Model, fit: FittedSimilarity, reach_m: float) -> float:
     """How well the model's points and cameras are held; what lies further off than the reach, as seen there.
 
     A tower on the horizon may be off by its share of its distance, as a house is by that of its own.

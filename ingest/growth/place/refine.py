@@ -10,7 +10,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
-from ingest.colmap_anchored import (
+from ingest.colmap.anchored import (
     Anchored,
     AnchoredOptions,
     FixedPoints,
@@ -18,10 +18,10 @@ from ingest.colmap_anchored import (
     adjust_anchored,
     with_observations,
 )
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.values import LocalisedPhoto
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,8 +12,8 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.colmap_anchored import Anchored, Lenses
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored, Lenses
+from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
 from ingest.growth.place.correspondences import Correspondences
@@ -27,7 +27,7 @@ from ingest.growth.place.drift import (
     turning_covariance,
 )
 from ingest.growth.place.parents import edges_of
-from ingest.growth.place.placement import Held, PlacementOptions
+from ingest.growth.place.placement import PlacementOptions, SupportedPlacement
 from ingest.growth.place.refine import (
     RefineOptions,
     only_photos,
@@ -35,9 +35,9 @@ from ingest.growth.place.refine import (
     with_existing,
     without_photos,
 )
-from ingest.growth.place.similarity_fit import Fit, fit_similarity
+from ingest.growth.place.similarity_fit import FittedSimilarity, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
-from ingest.links import firmness
+from ingest.sfm.links import firmness
 
 # Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
 # their own localisation has elsewhere.
@@ -109,7 +109,7 @@ class Settled:
 
 def settle(
     model: Model,
-    held: Held,
+    held: SupportedPlacement,
     correspondences: Correspondences,
     localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
@@ -229,7 +229,7 @@ def _with_fit(
     placement: MapsPlacement,
     adjusted: Anchored,
     correspondences: Correspondences,
-    fit: Fit,
+    fit: FittedSimilarity,
     options: PlacementOptions,
 ) -> MapsPlacement:
     """The placement with the covariances of the refined model's fit.

@@ -20,10 +20,10 @@ from scipy.linalg import expm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import nearest_rotation, skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import linearise
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.values import LocalisedPhoto
-from ingest.precision import linearise
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991
@@ -31,7 +31,7 @@ _OPEN = np.array([10.0] * 4 + [1e4] * 3)  # log scale, radians, metres: what not
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitOptions:
+class SimilarityFitOptions:
     """How the similarity is found.
 
     Attributes:
@@ -58,7 +58,7 @@ class FitOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
+class FittedSimilarity:
     """A fitted similarity.
 
     Attributes:
@@ -82,7 +82,7 @@ def proposals(
     model: Model,
     localised: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
-    options: FitOptions,
+    options: SimilarityFitOptions,
 ) -> list[Sim3]:
     """Similarities that single photos (pose and depth of shared points) and pairs of photos propose."""
     at = {k: localised[int(r)] for k, r in enumerate(model.rows.tolist()) if int(r) in localised}
@@ -100,7 +100,7 @@ def proposals(
     return found
 
 
-def _photo_pairs(count: int, options: FitOptions) -> list[tuple[int, int]]:
+def _photo_pairs(count: int, options: SimilarityFitOptions) -> list[tuple[int, int]]:
     every = [(i, j) for i in range(count) for j in range(i + 1, count)]
     if len(every) <= options.pair_samples:
         return every
@@ -184,7 +184,7 @@ def agreeing_photos(
 
 
 def rank_proposals(
-    model: Model, sims: Sequence[Sim3], correspondences: Correspondences, options: FitOptions
+    model: Model, sims: Sequence[Sim3], correspondences: Correspondences, options: SimilarityFitOptions
 ) -> list[tuple[Sim3, NDArray[np.int64]]]:
     """Proposals with the photos that agree, most photos first, then by truncated squared errors."""
     scored = _thinned(correspondences, options)
@@ -199,7 +199,7 @@ def rank_proposals(
     return [(sim, agree) for sim, agree, _ in ranked]
 
 
-def _thinned(correspondences: Correspondences, options: FitOptions) -> Correspondences:
+def _thinned(correspondences: Correspondences, options: SimilarityFitOptions) -> Correspondences:
     """Own correspondences, at most so many, of each photo the same share."""
     own = np.flatnonzero(~correspondences.carried)
     if len(own) <= options.max_scored:
@@ -209,8 +209,12 @@ def _thinned(correspondences: Correspondences, options: FitOptions) -> Correspon
 
 
 def fit_similarity(
-    model: Model, start: Sim3, correspondences: Correspondences, use: NDArray[np.bool_], options: FitOptions
-) -> Fit:
+    model: Model,
+    start: Sim3,
+    correspondences: Correspondences,
+    use: NDArray[np.bool_],
+    options: SimilarityFitOptions,
+) -> FittedSimilarity:
     """Robust least squares over the pixels of the correspondences in `use` (m,), Gauss-Newton on SIM(3).
 
     Geman-McClure weights at the residuals' robust spread. The covariance is the inverse of the normal
@@ -238,7 +242,7 @@ def fit_similarity(
             break
     every = np.zeros(len(correspondences))
     every[np.flatnonzero(use)] = weights
-    return Fit(
+    return FittedSimilarity(
         local_from_sfm=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
         errors_px=correspondence_errors(model, sim, correspondences),

@@ -16,7 +16,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
 from reloc.acceptance import agreement
 from reloc.matching import EXPECTED_DEG, visible_points

@@ -44,7 +44,7 @@ class PromotionOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Examined:
+class ExaminedMap:
     """What others say of a map; `feature_map` has descriptors where they confirm it."""
 
     feature_map: FeatureMap
@@ -58,7 +58,7 @@ class _Ready:
 
     map_id: str
     write_id: str
-    found: Examined
+    found: ExaminedMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +167,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
 
 def examine(
     feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
-) -> Examined:
+) -> ExaminedMap:
     """How far others confirm a map: by its own photos alone if they do, else with photos from outside."""
     confirmation = confirm(feature_map, options.confirmation)
     heard = hear_witnesses(
@@ -189,7 +189,7 @@ def examine(
         points_gate(part, options.min_points),
         contradiction_gate(heard, options.max_contradictions),
     )
-    return Examined(feature_map=part, confirmation=confirmation, gates=gates)
+    return ExaminedMap(feature_map=part, confirmation=confirmation, gates=gates)
 
 
 def points_gate(feature_map: FeatureMap, least: int) -> Gate:
@@ -277,7 +277,7 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: Examined) -> _Ready:
+def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> _Ready:
     """The map with the descriptors that it will answer with, still in quarantine; the same place."""
     seen, described = found.feature_map.observations, summary.descriptors
     if int(seen.has_descriptor.sum()) == described:

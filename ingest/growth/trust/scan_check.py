@@ -26,7 +26,7 @@ from ingest.growth.gates import Gate, sigmas_limit
 from ingest.growth.map_places import growth_of
 from ingest.register.structure.surface_fit import (
     Surface,
-    SurfaceOptions,
+    SurfaceFitOptions,
     plane_distances,
     reach_of,
     surface_near,
@@ -59,7 +59,7 @@ class ScanCheckOptions:
         margin_m: of scan around the map. max_points: of the map; more say nothing new.
     """
 
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+    surface: SurfaceFitOptions = field(default_factory=SurfaceFitOptions)
     min_views: int = 3
     min_points: int = 100
     max_sigmas: float = 3.0

@@ -14,8 +14,8 @@ from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localis
 from ingest.growth.place.overlaps import localise_image
 from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witness, independent, source_of
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
-from ingest.pairs import Pair
-from ingest.photo import Photo
+from ingest.photos.photo import Photo
+from ingest.sfm.pairs import Pair
 from reloc.candidates import IndexedArea
 
 

@@ -14,8 +14,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
+from ingest.plot_parts import png_bytes
 from ingest.register.anchor.proposals import small_camera
-from ingest.report_plots import png_bytes
 
 _WIDTH_PX = 1280  # of overlays: a screen's width; more only makes the page heavy
 _DEPTH_STEP = 0.015  # share of the depth by which it jumps at an edge: 1 m seen from 70 m

@@ -27,7 +27,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.geometry.similarity import refined_similarity
-from ingest.colmap_adjust import block_variance_px2
+from ingest.colmap.adjust import block_variance_px2
 from ingest.register.control.fit import Vertical
 from ingest.register.control.marks import Control
 from ingest.register.control.rays import on_ground
@@ -43,7 +43,7 @@ _RADIUS = 1e9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AdjustOptions:
+class ControlAdjustOptions:
     """How the block is adjusted.
 
     Attributes:
@@ -130,7 +130,7 @@ class Task:
     vertical: Vertical | None
     keypoint_px: float
     weight_px: float
-    options: AdjustOptions
+    options: ControlAdjustOptions
 
 
 def task_of(
@@ -138,7 +138,7 @@ def task_of(
     control: Control,
     control_xyz: FloatArray,
     vertical: Vertical | None,
-    options: AdjustOptions,
+    options: ControlAdjustOptions,
 ) -> Task:
     """For a block in metres in the local frame, in place but for small changes."""
     chosen = _sample(placed, options.points_per_photo)
@@ -253,7 +253,7 @@ def _sample(block: Block, per_photo: int) -> Block:
     )
 
 
-def _lens_prior(camera: Camera, options: AdjustOptions) -> LensPrior | None:
+def _lens_prior(camera: Camera, options: ControlAdjustOptions) -> LensPrior | None:
     return None if options.keep_lens else lens_prior(camera, options.lens)
 
 

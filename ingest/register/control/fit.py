@@ -106,7 +106,7 @@ class ControlFit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FitOptions:
+class ControlFitOptions:
     """Robust fit.
 
     Attributes:
@@ -127,7 +127,7 @@ class FitOptions:
     seed: int = 0
 
 
-def hypotheses(block: Block, control: Control, options: FitOptions) -> list[Hypothesis]:
+def hypotheses(block: Block, control: Control, options: ControlFitOptions) -> list[Hypothesis]:
     """Every place that the marks of a point, or some of them, point to."""
     found: list[Hypothesis] = []
     for point in range(len(control.names)):
@@ -146,7 +146,7 @@ def hypotheses(block: Block, control: Control, options: FitOptions) -> list[Hypo
 
 
 def _consensus(
-    block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int], options: FitOptions
+    block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int], options: ControlFitOptions
 ) -> tuple[FloatArray, tuple[int, ...]] | None:
     """The intersection of all marks that agree with a pair; None where the pair does not agree itself."""
     chosen = np.array(pair)
@@ -166,7 +166,7 @@ def _consensus(
 
 
 def fit_similarity(
-    found: Sequence[Hypothesis], surveyed: FloatArray, vertical: Vertical | None, options: FitOptions
+    found: Sequence[Hypothesis], surveyed: FloatArray, vertical: Vertical | None, options: ControlFitOptions
 ) -> ControlFit | None:
     """The similarity that most points agree on, or None where no sample gives one.
 
@@ -218,7 +218,7 @@ def _least_trimmed(
     point: NDArray[np.int64],
     surveyed: FloatArray,
     vertical: Vertical | None,
-    options: FitOptions,
+    options: ControlFitOptions,
 ) -> Sim3 | None:
     """Of similarities through few hypotheses, the one whose better half of points fits best."""
     size = 3 if vertical is None else 2
@@ -242,7 +242,7 @@ def _least_trimmed(
 
 
 def _samples(
-    usable: NDArray[np.int64], point: NDArray[np.int64], size: int, options: FitOptions
+    usable: NDArray[np.int64], point: NDArray[np.int64], size: int, options: ControlFitOptions
 ) -> list[NDArray[np.int64]]:
     """Sets of hypotheses of different points: all of them, or random ones where there are too many."""
     generator = np.random.default_rng(options.seed)
@@ -279,7 +279,7 @@ def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3
 
 
 def _sigma(
-    lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None, options: FitOptions
+    lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None, options: ControlFitOptions
 ) -> float:
     """Robust standard deviation of one coordinate, with the degrees of freedom of the fit."""
     axes = 3 if np.isfinite(surveyed[:, 2]).all() else 2

@@ -10,7 +10,7 @@ from ingest.register.control.fit import Vertical
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LevelOptions:
+class LevelGroundOptions:
     """The assumption of level ground.
 
     Attributes:
@@ -29,7 +29,7 @@ class LevelOptions:
     kept_share: float = 0.9
 
 
-def level_ground(block: Block, anchor_block: FloatArray, options: LevelOptions) -> Vertical:
+def level_ground(block: Block, anchor_block: FloatArray, options: LevelGroundOptions) -> Vertical:
     """The vertical as the normal of the plane through the block's points, on the cameras' side.
 
     Args:

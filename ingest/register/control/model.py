@@ -7,9 +7,8 @@ from typing import Any
 from featuredb.adjust.block import Block
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import Placement
-from ingest.colmap_bridge import Model
-from ingest.extract import PhotoFeatures
-from ingest.photo import Photo
+from ingest.colmap.bridge import Model
+from ingest.photos.photo import Photo
 from ingest.register.block import block_of_model, model_of_block
 from ingest.register.control.control_file import ControlFile
 from ingest.register.control.evidence import gcp_evidence
@@ -17,6 +16,7 @@ from ingest.register.control.marks import Control, control_frame, meet
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
 from ingest.register.control.registered_map import datum_of, gps_in, vertical_of
 from ingest.register.gps import GpsPlacement
+from ingest.sfm.extract import PhotoFeatures
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -18,17 +18,24 @@ import numpy as np
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.adjust import Adjusted, AdjustOptions, Task, adjust, task_of, with_all_points
+from ingest.register.control.adjust import (
+    Adjusted,
+    ControlAdjustOptions,
+    Task,
+    adjust,
+    task_of,
+    with_all_points,
+)
 from ingest.register.control.fit import (
     ControlFit,
-    FitOptions,
+    ControlFitOptions,
     Hypothesis,
     Vertical,
     fit_similarity,
     hypotheses,
 )
 from ingest.register.control.gps_offset import gps_offset
-from ingest.register.control.level import LevelOptions, level_ground
+from ingest.register.control.level import LevelGroundOptions, level_ground
 from ingest.register.control.marks import Control
 from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
 from ingest.register.control.snooping import Outcome, TestOptions, improve, initial_weights
@@ -71,10 +78,10 @@ class GcpOptions:
     min_line_ratio: float = 0.02
     max_gps_offset_m: float = 150.0
     sigma_m: tuple[float, float] | None = None
-    fit: FitOptions = field(default_factory=FitOptions)
+    fit: ControlFitOptions = field(default_factory=ControlFitOptions)
     test: TestOptions = field(default_factory=TestOptions)
-    adjust: AdjustOptions = field(default_factory=AdjustOptions)
-    level: LevelOptions = field(default_factory=LevelOptions)
+    adjust: ControlAdjustOptions = field(default_factory=ControlAdjustOptions)
+    level: LevelGroundOptions = field(default_factory=LevelGroundOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from featuredb.adjust.block import Block
 from featuredb.geometry.arrays import FloatArray
-from ingest.precision import linearise
+from ingest.colmap.precision import linearise
 from ingest.register.control.marks import Control
 
 _NEIGHBOURS = 12  # observations around a mark: enough for a plane, few enough to be near

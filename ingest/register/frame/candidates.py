@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
-from ingest.register.frame.confirmation import Confirmation
+from ingest.register.frame.confirmation import PictureConfirmation
 from ingest.register.frame.dense import (
     confirmed,
     dense_fitted,
@@ -36,7 +36,7 @@ class Judged:
     """A fitted pose with what the pictures say of it."""
 
     found: FrameHypothesis
-    confirmation: Confirmation
+    confirmation: PictureConfirmation
 
 
 def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> Judged | None:

@@ -81,7 +81,7 @@ class ConfirmOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Confirmation:
+class PictureConfirmation:
     """Whether the pictures confirm a pose, and the figures behind it.
 
     Attributes:
@@ -112,7 +112,7 @@ def confirm_pose(
     cloud: PointCloud,
     source: RenderSource = "intensity",
     options: ConfirmOptions = ConfirmOptions(),
-) -> Confirmation:
+) -> PictureConfirmation:
     """Asks the photo's pieces where they belong, at a pose that somebody else found.
 
     Args:
@@ -123,7 +123,7 @@ def confirm_pose(
     maps = _maps(view, cam_from_local, cloud, source, options)
     n = len(maps)
     if n < options.min_pieces:
-        return Confirmation(
+        return PictureConfirmation(
             confirmed=False,
             pieces=n,
             agreeing=0,
@@ -143,7 +143,7 @@ def confirm_pose(
     cells = len(np.unique(np.clip((pixels * 4).astype(int), 0, 3) @ (4, 1)))
     layers = _layers(maps.points_local[:, 2], near)
     message = _objection(agreeing / n, log_nfa, cells, layers, options)
-    return Confirmation(
+    return PictureConfirmation(
         confirmed=not message,
         pieces=n,
         agreeing=agreeing,

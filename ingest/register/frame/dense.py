@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ingest.register.frame.confirmation import Confirmation, confirm_pose
+from ingest.register.frame.confirmation import PictureConfirmation, confirm_pose
 from ingest.register.frame.dense_fit import DenseFitOptions, near_places
 from ingest.register.frame.dense_search import register_dense, searched_near
 from ingest.register.frame.matching import joined
@@ -117,7 +117,7 @@ def dense_side_px(views: FrameViews, spacing_px: float) -> int:
     return int(np.clip(wanted, min(views.options.min_side_px, side), min(_MAX_SIDE_PX, side)))
 
 
-def confirmed(views: FrameViews, found: FrameHypothesis) -> Confirmation:
+def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:
     """What the pictures say of a pose."""
     return confirm_pose(
         views.gray,

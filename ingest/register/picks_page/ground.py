@@ -17,7 +17,7 @@ _REACH_PX = 4  # a pick in a gap takes the nearest point within
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Ground:
+class GroundPicture:
     """A picture of a scan, north up.
 
     Attributes:
@@ -54,7 +54,7 @@ class Ground:
         return np.array([self.west + x * self.pixel_m, self.north - y * self.pixel_m, up])
 
 
-def ground_of(cloud: PointCloud, spacing_m: float) -> Ground:
+def ground_of(cloud: PointCloud, spacing_m: float) -> GroundPicture:
     """The highest point of each pixel.
 
     Args:
@@ -77,7 +77,7 @@ def ground_of(cloud: PointCloud, spacing_m: float) -> Ground:
     else:
         rgb = _shaded(height, pixel_m)
     rgb[empty] = 0
-    return Ground(
+    return GroundPicture(
         rgb=_gaps_closed(rgb, empty), height=height, west=float(low[0]), north=float(high[1]), pixel_m=pixel_m
     )
 

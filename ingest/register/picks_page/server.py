@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 
 from featuredb.errors import FeatureDbError
-from ingest.register.picks_page.session import PickSession, Spot
+from ingest.register.picks_page.session import PickedSpot, PickSession
 from reloc.viewer.server import HOST
 
 _MEDIA_TYPES = {"js": "text/javascript", "css": "text/css"}
@@ -41,8 +41,8 @@ class _Picks(BaseModel):
     image: int
     picks: list[_Pick] = Field(max_length=40)
 
-    def spots(self) -> list[Spot]:
-        return [Spot(**pick.model_dump()) for pick in self.picks]
+    def spots(self) -> list[PickedSpot]:
+        return [PickedSpot(**pick.model_dump()) for pick in self.picks]
 
 
 def new_token() -> str:

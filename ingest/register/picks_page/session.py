@@ -25,14 +25,14 @@ from ingest.register.anchor.pick_fit import PickFit, PickFitOptions, fit_picks
 from ingest.register.anchor.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start import StartOptions
-from ingest.register.picks_page.ground import Ground, ground_of
+from ingest.register.picks_page.ground import GroundPicture, ground_of
 
 _PHOTO_PX = 4096
 PICKS_FILE = "picks.csv"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spot:
+class PickedSpot:
     """One pick: full-size pixel of the photo, and a place in the picture of the ground."""
 
     x: float
@@ -51,7 +51,7 @@ class PickSession:
         self.scan_ids = tuple(scan.scan_id for scan in scans)
         self.epsg = scans[0].epsg
         self.cloud: PointCloud = load_cloud(database, scan_frame(scans[0]), scan_ids=self.scan_ids)
-        self.ground: Ground = ground_of(self.cloud, min(scan.spacing_m for scan in scans))
+        self.ground: GroundPicture = ground_of(self.cloud, min(scan.spacing_m for scan in scans))
         self.out = request.out or Path(f"anchor-{loaded.map_id}")
         self._work, self._fits = Lock(), dict[int, PickFit]()
         self._proposed: Anchoring | None = None
@@ -107,7 +107,7 @@ class PickSession:
     def ground_png(self) -> bytes:
         return png(self.ground.rgb)
 
-    def spots(self, spots: Sequence[Spot]) -> tuple[FloatArray, FloatArray]:
+    def spots(self, spots: Sequence[PickedSpot]) -> tuple[FloatArray, FloatArray]:
         """Pixels (n, 2), and points (n, 3) in the cloud's frame.
 
         Raises:
@@ -116,7 +116,7 @@ class PickSession:
         pixels = np.array([[s.x, s.y] for s in spots]).reshape(-1, 2)
         return pixels, np.array([self.ground.spot(s.ground_x, s.ground_y) for s in spots]).reshape(-1, 3)
 
-    def solve(self, image_id: int, spots: Sequence[Spot]) -> dict[str, Any]:
+    def solve(self, image_id: int, spots: Sequence[PickedSpot]) -> dict[str, Any]:
         """The pose by the picks so far, the residual of each, and what is missing or wrong."""
         image = self.image(image_id)
         camera, focal_rel = self._camera(image), focal_sigma_rel(self.map, image)
@@ -190,7 +190,7 @@ class PickSession:
             raise InvalidValueError("the picks give no pose yet")
         return png(edge_layer(scan_view(self.cloud, fit.camera, fit.cam_from_local)))
 
-    def refine(self, image_id: int, spots: Sequence[Spot]) -> dict[str, Any]:
+    def refine(self, image_id: int, spots: Sequence[PickedSpot]) -> dict[str, Any]:
         """Register the photo to the scan from its picks, and others from where the map then has them."""
         image = self.image(image_id)
         with self._work:
@@ -245,7 +245,7 @@ class PickSession:
             storage_options=self.request.storage_options,
         )
 
-    def _write_picks(self, image: MapImage, spots: Sequence[Spot]) -> None:
+    def _write_picks(self, image: MapImage, spots: Sequence[PickedSpot]) -> None:
         pixels, points = self.spots(spots)
         utm = self.cloud.frame.utm_from_enu(points, self.epsg)
         self.out.mkdir(parents=True, exist_ok=True)

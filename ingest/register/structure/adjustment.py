@@ -23,13 +23,13 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
-from ingest.colmap_adjust import AdjustOptions
-from ingest.precision import design_effect, linearise
+from ingest.colmap.adjust import AdjustOptions
+from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
 from ingest.register.structure.similarity import similarities
-from ingest.register.structure.surface_fit import Surface, SurfaceOptions, plane_distances, surface_near
+from ingest.register.structure.surface_fit import Surface, SurfaceFitOptions, plane_distances, surface_near
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
@@ -54,7 +54,7 @@ class AdjustLidarOptions:
         aspect_rel: of the ratio of the two focal lengths: pixels are square.
         radial, tangential: of a coefficient's.
         lens_dilution: what lenses leave open counts so many times in the poses' covariances
-            (`ingest.colmap_adjust.AdjustOptions.dilution`, measured there).
+            (`ingest.colmap.adjust.AdjustOptions.dilution`, measured there).
         rounds: of looking up the scan's planes; it ends earlier when points move by less than `settled_m`.
         steps: of the solver in each round.
         settled_m: see above; far below a scan's noise.
@@ -83,7 +83,7 @@ class AdjustLidarOptions:
     max_control_rel: float = 0.002
     max_reprojection_growth: float = 0.1
     reprojection_floor_rel: float = 0.000125
-    surface: SurfaceOptions = field(default_factory=lambda: SurfaceOptions(max_surface_points=250_000))
+    surface: SurfaceFitOptions = field(default_factory=lambda: SurfaceFitOptions(max_surface_points=250_000))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

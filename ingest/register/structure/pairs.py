@@ -20,7 +20,7 @@ from ingest.register.structure.similarity import Pairs
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PairOptions:
+class PointPairOptions:
     """How pairs are made.
 
     Attributes:
@@ -70,7 +70,7 @@ def structure_pairs(
     source: FloatArray,
     registered: Sequence[RegisteredImage],
     cloud: PointCloud,
-    options: PairOptions,
+    options: PointPairOptions,
 ) -> Pairs:
     """Pairs of all frames.
 
@@ -107,7 +107,7 @@ def _pairs_of_frame(
     registered: RegisteredImage,
     row: int,
     cloud: PointCloud,
-    options: PairOptions,
+    options: PointPairOptions,
 ) -> Pairs:
     pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
     assert pose is not None
@@ -155,7 +155,7 @@ def _no_larger(covariance: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
 
 
 def _errors(
-    hits: SurfaceHits, pose: Rigid3, camera: Camera, options: PairOptions
+    hits: SurfaceHits, pose: Rigid3, camera: Camera, options: PointPairOptions
 ) -> tuple[FloatArray, FloatArray]:
     """Covariance (n, 3, 3) of each hit by its own errors, and derivative (n, 3, 6) by the frame's pose.
 

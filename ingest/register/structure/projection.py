@@ -18,7 +18,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import PairOptions, RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import PointPairOptions, RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,
     SimilarityFit,
@@ -28,7 +28,7 @@ from ingest.register.structure.similarity import (
 )
 from ingest.register.structure.surface_fit import (
     GicpOutcome,
-    SurfaceOptions,
+    SurfaceFitOptions,
     guarded_gicp,
     moved,
     plane_distances,
@@ -68,9 +68,9 @@ class StructureOptions:
     max_residual_rel: float = 0.01
     max_scale_change: float = 0.05
     scale_sigmas: float = 4.0
-    pairs: PairOptions = field(default_factory=PairOptions)
+    pairs: PointPairOptions = field(default_factory=PointPairOptions)
     similarity: SimilarityOptions = field(default_factory=SimilarityOptions)
-    surface: SurfaceOptions = field(default_factory=SurfaceOptions)
+    surface: SurfaceFitOptions = field(default_factory=SurfaceFitOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

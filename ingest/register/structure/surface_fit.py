@@ -14,7 +14,7 @@ from featuredb.render.cloud import PointCloud
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SurfaceOptions:
+class SurfaceFitOptions:
     """The scan's surface as the comparison sees it, and what GICP may do.
 
     Attributes:
@@ -86,7 +86,7 @@ class GicpOutcome:
     figures: dict[str, Any]
 
 
-def surface_near(cloud: PointCloud, points: FloatArray, options: SurfaceOptions) -> Surface | None:
+def surface_near(cloud: PointCloud, points: FloatArray, options: SurfaceFitOptions) -> Surface | None:
     """The scan around points (n, 3), thinned by its levels of detail; None where there is none."""
     low, high = points.min(axis=0) - options.margin_m, points.max(axis=0) + options.margin_m
     rows = _rows_inside(cloud, low, high, options.max_surface_points)
@@ -145,7 +145,7 @@ def plane_distances(surface: Surface, points: FloatArray, reach_m: float) -> Flo
     return np.where(np.asarray(squared) <= reach_m**2, distance, np.nan)
 
 
-def reach_of(surface: Surface, options: SurfaceOptions) -> float:
+def reach_of(surface: Surface, options: SurfaceFitOptions) -> float:
     """How far from the scan a point may be to be compared with it, metres."""
     return max(options.min_reach_m, options.reach_spacings * surface.spacing_m)
 
@@ -156,7 +156,7 @@ def guarded_gicp(
     distances: FloatArray,
     evidence: FloatArray,
     covariance: FloatArray,
-    options: SurfaceOptions,
+    options: SurfaceFitOptions,
 ) -> GicpOutcome:
     """GICP of the placed points (n, 3) against the surface, if it keeps to the evidence.
 
@@ -199,7 +199,7 @@ def guarded_gicp(
     return GicpOutcome(accepted=True, move=move, message="", figures=figures)
 
 
-def _align(surface: Surface, points: FloatArray, reach_m: float, options: SurfaceOptions) -> Rigid3:
+def _align(surface: Surface, points: FloatArray, reach_m: float, options: SurfaceFitOptions) -> Rigid3:
     """The motion that small_gicp's GICP finds."""
     gicp = _small_gicp()
     source = gicp.PointCloud(points - surface.middle)

@@ -21,10 +21,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import Anchored, FixedPoints, Lenses, adjust_anchored
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.adjusted_map import adjusted_map, precision_of
-from ingest.growth.graph.joint.joined import Joined, join_maps
+from ingest.growth.graph.joint.joined import JoinedMaps, join_maps
 from ingest.growth.graph.joint.judge import describe, placement_sigma_m, refusal
 from ingest.growth.graph.joint.links import find_links
 from ingest.growth.graph.joint.values import JointAdjustment, JointOptions
@@ -91,7 +91,7 @@ def adjust_together(
     return _judged(maps, held, free, joined, result, frame, shared, links.elsewhere, options)
 
 
-def _photos_of(joined: Joined, maps: Sequence[int]) -> NDArray[np.int64]:
+def _photos_of(joined: JoinedMaps, maps: Sequence[int]) -> NDArray[np.int64]:
     """Rows of the photos of some maps."""
     return np.unique(np.concatenate([np.zeros(0, np.int64), *(joined.maps[a].photos for a in maps)]))
 
@@ -118,7 +118,7 @@ def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64], least: i
     return [m.map_id for m, group in zip(maps, label.tolist(), strict=True) if group != largest]
 
 
-def _back(maps: Sequence[FeatureMap], joined: Joined, adjusted: Model) -> Sim3:
+def _back(maps: Sequence[FeatureMap], joined: JoinedMaps, adjusted: Model) -> Sim3:
     """The similarity that takes the photos of the surest anchors back to their places as a whole.
 
     Robust: the photo that the adjustment moved against the others is not what should hold them.
@@ -154,7 +154,7 @@ def _judged(
     maps: Sequence[FeatureMap],
     held: Collection[str],
     free: Collection[str],
-    joined: Joined,
+    joined: JoinedMaps,
     result: Anchored,
     frame: LocalFrame,
     shared: int,

@@ -12,11 +12,11 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints
 from featuredb.maps.subset import take_observations
-from ingest.colmap_anchored import Anchored
-from ingest.colmap_bridge import Model
-from ingest.growth.graph.joint.joined import Joined, MapRows, observed_pixels
+from ingest.colmap.anchored import Anchored
+from ingest.colmap.bridge import Model
+from ingest.colmap.precision import linearise, point_covariances, residual_variance, upper_triangle
+from ingest.growth.graph.joint.joined import JoinedMaps, MapRows, observed_pixels
 from ingest.growth.graph.joint.values import JOINT, AdjustedMap
-from ingest.precision import linearise, point_covariances, residual_variance, upper_triangle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -27,7 +27,7 @@ class Precision:
     error_px: FloatArray
 
 
-def precision_of(joined: Joined, model: Model) -> Precision:
+def precision_of(joined: JoinedMaps, model: Model) -> Precision:
     """Of the points of an adjusted model."""
     linear = linearise(
         model.cameras,

@@ -19,7 +19,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
-from ingest.colmap_bridge import Model
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.links import Links
 
 
@@ -39,7 +39,7 @@ class MapRows:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Joined:
+class JoinedMaps:
     """The maps as one model, in metres, in one local frame.
 
     Attributes:
@@ -57,7 +57,7 @@ class Joined:
     shared: NDArray[np.int64]
 
 
-def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Joined:
+def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> JoinedMaps:
     """The maps as one reconstruction; photos, lenses and joined points are as the first map has them.
 
     Cameras with one EXIF key that tells a focal length, and those of one photo, are one.
@@ -102,7 +102,7 @@ def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Jo
     has = np.zeros((len(model.xyz), len(maps)), dtype=np.int64)
     for a, part in enumerate(rows):
         has[part.point_of, a] = 1
-    return Joined(
+    return JoinedMaps(
         model=model,
         keypoints=keypoints,
         known_focal_px=photos.known_focal_px(),
@@ -245,7 +245,7 @@ def _of_one_keypoint(
     return point[rows], point[rows + 1]
 
 
-def observed_pixels(joined: Joined, model: Model) -> FloatArray:
+def observed_pixels(joined: JoinedMaps, model: Model) -> FloatArray:
     """(m, 2) of the model's observations."""
     pixels = np.zeros((len(model.point_of), 2))
     for k, keypoints in enumerate(joined.keypoints):

@@ -8,10 +8,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import Anchored
-from ingest.colmap_bridge import Model
+from ingest.colmap.anchored import Anchored
+from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.adjusted_map import kept_observations
-from ingest.growth.graph.joint.joined import Joined, observed_pixels
+from ingest.growth.graph.joint.joined import JoinedMaps, observed_pixels
 from ingest.growth.graph.joint.values import AdjustedMap, JointOptions
 from ingest.growth.map_places import place_sigmas_m
 
@@ -19,7 +19,7 @@ from ingest.growth.map_places import place_sigmas_m
 def describe(
     maps: Sequence[FeatureMap],
     held: Collection[str],
-    joined: Joined,
+    joined: JoinedMaps,
     result: Anchored,
     frame: LocalFrame,
 ) -> list[AdjustedMap]:
@@ -54,7 +54,7 @@ def describe(
 def refusal(
     maps: Sequence[FeatureMap],
     free: Collection[str],
-    joined: Joined,
+    joined: JoinedMaps,
     adjusted: Model,
     reports: Sequence[AdjustedMap],
     options: JointOptions,
@@ -115,7 +115,7 @@ def _sigma_px(off: FloatArray) -> float:
     return 1.4826 * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else 0.0
 
 
-def _sigmas_px(joined: Joined, model: Model) -> list[float]:
+def _sigmas_px(joined: JoinedMaps, model: Model) -> list[float]:
     """The same of the photos of each map in the model."""
     off = observed_pixels(joined, model)
     for k, pose in enumerate(model.cam_from_sfm):

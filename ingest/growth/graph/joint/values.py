@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap_anchored import AnchoredOptions
+from ingest.colmap.anchored import AnchoredOptions
 from ingest.growth.graph.joint.links import LinkOptions
 
 JOINT = "joint"  # key of Placement.evidence

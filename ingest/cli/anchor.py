@@ -1,0 +1,172 @@
+"""`featuredb anchor DB MAP`: arguments in; proposals, pictures, a report, a placed map out."""
+
+import argparse
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from featuredb.store import Database
+    from ingest.anchoring import Anchoring, AnchorRequest
+
+_EPILOG = """\
+Without --auto and --confirm nothing is changed: the frames that register best are shown, with the command
+that confirms them. A rough pose is JSON: {"image": "A.JPG", "easting": ..., "northing": ..., "height": ...,
+"yaw_deg": ..., "pitch_deg": -90} or "look_at": [e, n, h] for the angles. Picks are CSV lines of
+x, y, easting, northing, height: full-size pixels and metres. See docs/anchoring.md."""
+
+
+def register(subparsers: Any) -> None:
+    """Add `anchor` to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    anchor = subparsers.add_parser(
+        "anchor",
+        help="place a map by a LiDAR scan",
+        description="Register frames of a map to a scan of the database, and place the map by them. The old "
+        "placement stays reachable: `featuredb rollback`.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add_database_argument(anchor)
+    anchor.add_argument("map_id", metavar="MAP", help="id of the map; its first letters are enough")
+    anchor.add_argument(
+        "--photos", type=Path, required=True, metavar="FOLDER", help="the photos that the map was made of"
+    )
+    anchor.add_argument(
+        "--scan", action="append", default=[], metavar="ID", help="default: all scans around the map"
+    )
+    anchor.add_argument(
+        "--out", type=Path, default=None, metavar="DIR", help="pictures and report; default: ./anchor-MAP"
+    )
+    anchor.add_argument("--frames", type=int, default=None, metavar="N", help="to register; default: 3")
+    deciding = anchor.add_argument_group("who decides")
+    deciding.add_argument(
+        "--auto", action="store_true", help="place the map without a person if every gate is passed"
+    )
+    deciding.add_argument(
+        "--confirm",
+        action="append",
+        default=[],
+        metavar="IMAGE",
+        help="place the map by this frame as it was proposed; may be repeated",
+    )
+    helping = anchor.add_argument_group("where a registration starts, instead of the map's placement")
+    helping.add_argument("--pose", type=Path, default=None, metavar="FILE", help="a rough pose, JSON")
+    helping.add_argument("--picks", type=Path, default=None, metavar="FILE", help="picked points, CSV")
+    helping.add_argument("--image", default=None, metavar="NAME", help="photo of --pose or --picks")
+    page = anchor.add_argument_group("picking in a page")
+    page.add_argument(
+        "--page",
+        action="store_true",
+        help="open a page on this machine: click the same spots in photo and scan",
+    )
+    page.add_argument("--port", type=int, default=0, help="of the page; default: a free one")
+    page.add_argument("--no-browser", action="store_true", help="print the address only")
+    anchor.add_argument("--quiet", action="store_true", help="no progress bars")
+    anchor.set_defaults(run=run_anchor)
+
+
+def run_anchor(args: argparse.Namespace) -> int:
+    """Anchor; 0 if the map was placed or frames were proposed, 1 if not, with the reason."""
+    from featuredb.cli.common import open_database
+    from ingest.anchoring import anchor
+    from ingest.cli.progress_bars import progress_bars
+
+    request = _request(args)
+    database = open_database(args)
+    if args.page:
+        return _page(database, request, args)
+    with progress_bars(args.quiet) as progress:
+        done = anchor(database, request, progress)
+    sys.stdout.write(summary(done, args))
+    return 0 if done.placed or done.proposed else 1
+
+
+def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespace) -> int:
+    """Serve the page of picks until it is stopped; 0."""
+    from featuredb.extras import require
+    from ingest.register.picks_page.server import create_app, new_token
+    from ingest.register.picks_page.session import PickSession
+    from reloc.viewer.serve import serve
+
+    require("http", "The page of picks", "fastapi", "uvicorn")
+    snapshot = database.snapshot()
+    loaded = snapshot.load_any(snapshot.find(request.map_id).map_id)
+    token = new_token()
+    serve(
+        create_app(PickSession(database, request, loaded), token),
+        args.port,
+        browser=not args.no_browser,
+        path=f"{token}/",
+    )
+    return 0
+
+
+def _request(args: argparse.Namespace) -> "AnchorRequest":
+    from featuredb.errors import InvalidValueError
+    from ingest.anchoring import AnchorRequest
+
+    if args.page and (args.auto or args.confirm or args.pose or args.picks):
+        raise InvalidValueError("--page asks a person for everything; expected it alone")
+    if args.auto and args.confirm:
+        raise InvalidValueError("expected --auto or --confirm, found both")
+    if args.image and not (args.pose or args.picks):
+        raise InvalidValueError("--image names the photo of --pose or --picks; give one of them")
+    if args.frames is not None and args.frames < 1:
+        raise InvalidValueError(f"--frames: expected a number > 0, found {args.frames}")
+    return AnchorRequest(
+        map_id=args.map_id,
+        photos=args.photos,
+        scan_ids=tuple(args.scan),
+        out=args.out,
+        frames=args.frames,
+        auto=args.auto,
+        confirm=tuple(args.confirm),
+        pose_file=args.pose,
+        picks_file=args.picks,
+        image=args.image,
+        storage_options=tuple(args.storage_option),
+    )
+
+
+def summary(done: "Anchoring", args: argparse.Namespace) -> str:
+    """What happened, for the terminal; the report has the rest."""
+    from featuredb.cli.common import format_table
+    from ingest.register.anchor.report import FRAME_HEADER, frame_rows
+
+    report, result = done.report, done.report.result
+    lines = list(report.notes)
+    rows = frame_rows(report)
+    if rows:
+        lines.append(format_table(FRAME_HEADER, rows).rstrip())
+    lines.extend(f"{name}: {seconds:.2f} s" for name, seconds in report.times_s().items())
+    if done.placed and result is not None and result.before is not None and result.after is not None:
+        move = result.checks["move"]
+        lines.append(
+            f"map {done.map_id} is placed by its scan: version {done.version}; moved "
+            f"{move['horizontal_m']:.2f} m in plan and {move['up_m']:+.2f} m up; its points lie "
+            f"{result.after.median_m:.3f} m (median) from the scan, {result.before.median_m:.2f} m before"
+        )
+        lines.extend(f"quarantined, since this map had placed it: {map_id}" for map_id in done.flagged)
+        lines.append(f"the old placement: featuredb rollback {shlex.quote(args.db)} {done.version_before}")
+    elif result is not None:
+        lines.append(f"not placed: {result.reason}: {result.message}")
+    elif done.proposed:
+        lines.append(f"look at {done.page}; if the edges of the scan lie on the photos, place the map:")
+        lines.append(f"  {done.command}")
+    else:
+        lines.append(_nothing(done))
+    lines.append(f"report: {done.report_page}")
+    return "\n".join(lines) + "\n"
+
+
+def _nothing(done: "Anchoring") -> str:
+    tried = done.report.tried.tried
+    if not tried:
+        return (
+            "nothing proposed: no frame of the map sees enough of the scan from where the map is placed now"
+        )
+    reasons = "; ".join(f"{f.image.name}: {f.registration.reason}: {f.registration.message}" for f in tried)
+    return f"nothing proposed: no frame was registered: {reasons}"

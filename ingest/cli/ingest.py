@@ -1,0 +1,203 @@
+"""`featuredb ingest KIND DB ...`: its arguments."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+_STAGES = ("scan", "extract", "match", "reconstruct", "build")
+
+
+def register(subparsers: Any) -> None:
+    """Add `ingest` to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    ingest = subparsers.add_parser("ingest", help="make maps of photos")
+    kinds = ingest.add_subparsers(title="what to ingest", metavar="KIND", required=True)
+    photos = kinds.add_parser(
+        "photos",
+        help="a folder of photos with GPS, or a table of photos",
+        description="Reconstruct photos, place them by their GPS and commit the maps. A killed ingest goes "
+        "on where it was when the same command runs again.",
+    )
+    add_database_argument(photos)
+    photos.add_argument(
+        "folder",
+        metavar="PATH",
+        type=Path,
+        help="folder of photos, searched through; or a table (.csv, .parquet, .jsonl) with the columns path "
+        "or id, lat, lon, accuracy, time, owner, licence, title; or OpenDroneMap's geo.txt",
+    )
+    _add_selection(photos)
+    _add_making(photos)
+    _add_control(photos)
+    _add_running(photos)
+    photos.set_defaults(run=run_photos)
+    _register_video(kinds)
+    _register_model(kinds)
+
+
+def _register_model(kinds: Any) -> None:
+    from featuredb.cli.common import add_database_argument
+    from ingest.cli.model import add_model_arguments, run_model
+
+    model = kinds.add_parser(
+        "model",
+        help="a model of COLMAP, OpenSfM, ODM or kapture, geo-referenced or of photos with GPS",
+        description="Import a model of COLMAP, OpenSfM, OpenDroneMap or kapture as a map: as `featuredb "
+        "export` "
+        "wrote it, "
+        "aligned to a known place, or of photos with GPS.",
+    )
+    add_database_argument(model)
+    add_model_arguments(model)
+    model.set_defaults(run=run_model)
+
+
+def _register_video(kinds: Any) -> None:
+    from featuredb.cli.common import add_database_argument
+    from ingest.cli.video import add_video_arguments, run_video
+
+    video = kinds.add_parser(
+        "video",
+        help="films and folders of them, with or without telemetry",
+        description="Split films into shots, choose keyframes by the picture's motion, reconstruct those of "
+        "all films together, place them by the telemetry where there is some, and commit the maps. Goes on "
+        "where it was when it was killed.",
+    )
+    add_database_argument(video)
+    add_video_arguments(video)
+    _add_selection(video)
+    _add_making(video)
+    _add_control(video)
+    _add_running(video)
+    video.set_defaults(run=run_video)
+
+
+def _add_selection(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("which photos, and whose")
+    group.add_argument(
+        "--exclude",
+        action="append",
+        default=[],
+        metavar="GLOB",
+        help="leave out files whose name fits; may be repeated",
+    )
+    group.add_argument("--name", default="", help="name of the map; default: the folder's name")
+    group.add_argument("--owner", default="", help="of photos that do not name their own")
+    group.add_argument("--licence", default="", help="of the photos, e.g. CC-BY-4.0")
+    group.add_argument(
+        "--trust-geotags",
+        action="store_true",
+        help="positions of a table place active maps, as those of a folder do; by default such maps are "
+        "quarantined",
+    )
+
+
+def _add_making(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how maps are made")
+    group.add_argument(
+        "--cameras",
+        choices=("shared", "per-image"),
+        default="shared",
+        help="whether photos of one make, model, size and focal length share their intrinsics, and photos "
+        "that name no camera those of the same owner, day (if known) and size; default: shared",
+    )
+    group.add_argument("--camera-model", default=None, help="COLMAP's name; default: SIMPLE_RADIAL")
+    group.add_argument(
+        "--keep-focal",
+        action="store_true",
+        help="do not refine focal lengths: for nadir flights, whose photos cannot tell focal length from "
+        "height, with a camera that is known well",
+    )
+    group.add_argument(
+        "--max-features",
+        type=int,
+        default=None,
+        help="per photo; default: 12000, for films 5000; fewer match faster",
+    )
+    group.add_argument("--max-side", type=int, default=None, metavar="PX", help="default: 1600")
+    group.add_argument(
+        "--min-track-length",
+        type=int,
+        default=None,
+        metavar="N",
+        help="points seen by at least N photos carry descriptors; default: see the README",
+    )
+    group.add_argument(
+        "--height-datum",
+        default="unknown",
+        help="of the photos' heights: ellipsoidal, egm96, egm2008, navd88 or unknown (default)",
+    )
+    group.add_argument(
+        "--gps-sigma",
+        type=_sigmas,
+        default=None,
+        metavar="M[,M]",
+        help="standard deviation of the photos' positions in metres, horizontal and vertical, instead of "
+        "what EXIF suggests",
+    )
+
+
+def _add_control(parser: argparse.ArgumentParser) -> None:
+    from ingest.cli.register import add_control_arguments
+
+    group = parser.add_argument_group("ground control points")
+    group.add_argument(
+        "--gcp",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="control points, OpenDroneMap's gcp_list.txt, which place the map instead of the photos' GPS",
+    )
+    add_control_arguments(group)
+
+
+def _add_running(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("how the job runs")
+    group.add_argument("--workers", type=int, default=None, help="processes; default: one per core")
+    group.add_argument(
+        "--dask",
+        metavar="ADDRESS",
+        default=None,
+        help="of a Dask scheduler, e.g. tcp://10.0.0.1:8786, whose workers do the work; they need the work "
+        "folder and the photos under the same paths (extra dask)",
+    )
+    group.add_argument(
+        "--vocabulary",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="of visual words for finding similar photos; default: the one that comes with featuredb",
+    )
+    group.add_argument(
+        "--work",
+        type=Path,
+        default=None,
+        metavar="DIR",
+        help="where unfinished work is kept; default: DB/_work, or a cache folder for object stores",
+    )
+    group.add_argument(
+        "--report", type=Path, default=None, metavar="DIR", help="write report.json and report.html there"
+    )
+    group.add_argument(
+        "--stop-after", choices=_STAGES, default=None, help="end after that stage; the next run goes on"
+    )
+    group.add_argument("--quiet", action="store_true", help="no progress bars")
+
+
+def run_photos(args: argparse.Namespace) -> int:
+    """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made."""
+    from ingest.cli.ingest_run import ingest_folder
+
+    return ingest_folder(args, args.folder)
+
+
+def _sigmas(text: str) -> tuple[float, float]:
+    """One or two numbers of metres."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected metres such as 3 or 3,5, found {text!r}") from error
+    if len(values) not in (1, 2) or not all(0 < v < 1e6 for v in values):
+        raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
+    return values[0], values[-1]

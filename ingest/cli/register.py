@@ -1,0 +1,152 @@
+"""`featuredb register DB MAP --gcp FILE`: a map that is there gets a better place, or its first one."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ingest.register.control.placement import GcpOptions
+    from ingest.register.control.registered_map import GcpRegistration
+
+
+def register(subparsers: Any) -> None:
+    """Add `register` to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+
+    parser = subparsers.add_parser(
+        "register",
+        help="place a map by ground control points",
+        description="Place a map by ground control points, one without a place, too: similarity, "
+        "adjustment with the points as control, residuals, wrong marks named. The new placement is a new "
+        "commit; `featuredb rollback` and --as-of reach the map as it was.",
+    )
+    add_database_argument(parser)
+    parser.add_argument("map_id", metavar="MAP", help="id of the map, see `featuredb maps`")
+    parser.add_argument(
+        "--gcp", type=Path, required=True, metavar="FILE", help="control points, OpenDroneMap's gcp_list.txt"
+    )
+    add_control_arguments(parser)
+    parser.add_argument(
+        "--height-datum",
+        default="unknown",
+        help="of the surveyed heights, where their reference system does not say it: ellipsoidal, egm96, "
+        "egm2008, navd88 or unknown (default)",
+    )
+    parser.add_argument(
+        "--report", type=Path, default=None, metavar="DIR", help="write control.html, .json and .png there"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="show the residuals and commit nothing")
+    parser.set_defaults(run=run_register)
+
+
+def add_control_arguments(parser: Any) -> None:
+    """What belongs to a control point file."""
+    parser.add_argument(
+        "--gcp-crs", default=None, metavar="CRS", help="reference system, instead of the file's first line"
+    )
+    parser.add_argument(
+        "--gcp-sigma",
+        type=_sigmas,
+        default=None,
+        metavar="M[,M]",
+        help="standard deviation of surveyed coordinates in metres, horizontal and vertical; default: from "
+        "the residuals",
+    )
+    parser.add_argument(
+        "--ground-height",
+        type=_height,
+        default=None,
+        metavar="M[,SIGMA]",
+        help="height of the control points in metres where the file has none, and its standard deviation "
+        "(default 10); without it such a map is put at height 0",
+    )
+
+
+def control_options(args: argparse.Namespace, *, keep_lens: bool = False) -> "GcpOptions":
+    """Options of a placement by control points."""
+    from ingest.register.control.adjust import ControlAdjustOptions
+    from ingest.register.control.level import LevelGroundOptions
+    from ingest.register.control.placement import GcpOptions
+
+    level = LevelGroundOptions()
+    if args.ground_height is not None:
+        level = LevelGroundOptions(ground_up_m=args.ground_height[0], sigma_ground_m=args.ground_height[1])
+    return GcpOptions(sigma_m=args.gcp_sigma, level=level, adjust=ControlAdjustOptions(keep_lens=keep_lens))
+
+
+def run_register(args: argparse.Namespace) -> int:
+    """Place, print the residuals, commit; 0 if the map has its new place, 1 if it was refused."""
+    from featuredb.cli.common import open_database
+    from featuredb.maps.unplaced_map import UnplacedMap
+    from ingest.register.control.control_file import read_control_file
+    from ingest.register.control.evidence import gcp_evidence, residual_table
+    from ingest.register.control.registered_map import place_unplaced_by_gcp, register_by_gcp
+    from ingest.register.control.report import write_control_report
+
+    file = read_control_file(args.gcp, args.gcp_crs)
+    database = open_database(args)
+    snapshot = database.snapshot()
+    before = snapshot.load_any(args.map_id)
+    options = control_options(args)
+    if isinstance(before, UnplacedMap):
+        result = place_unplaced_by_gcp(before, file, options, args.height_datum)
+    else:
+        result = register_by_gcp(before, file, options, args.height_datum)
+    sys.stdout.write("".join(f"note: {note}\n" for note in file.notes))
+    sys.stdout.write(residual_table(result.placement, result.control))
+    if args.report is not None:
+        write_control_report(
+            args.report,
+            f"Control points of {before.name}",
+            result.placement,
+            result.control,
+            gcp_evidence(result.placement, result.control),
+        )
+    if result.feature_map is None:
+        sys.stdout.write(f"refused: {result.placement.reason}: {result.placement.message}\n")
+        return 1
+    sys.stdout.write(_moved_words(result))
+    if args.dry_run:
+        sys.stdout.write("nothing was committed, as asked\n")
+        return 0
+    committed = database.commit_map(
+        result.feature_map, replaces=args.map_id, based_on=snapshot.get_any(args.map_id).write_id
+    )
+    word = "committed" if committed.created else "was placed so already"
+    sys.stdout.write(f"map {args.map_id}: {word}, snapshot {committed.version}\n")
+    for other in committed.flagged:
+        sys.stdout.write(f"warning: map {other} was placed by this one and is quarantined now\n")
+    return 0
+
+
+def _moved_words(result: "GcpRegistration") -> str:
+    if result.moved_m is None:
+        return "the map had no place before\n"
+    east, north, up = result.moved_m
+    return f"the map moves by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up\n"
+
+
+def _sigmas(text: str) -> tuple[float, float]:
+    values = _numbers(text)
+    if not all(0 < v < 1e4 for v in values):
+        raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
+    return values[0], values[-1]
+
+
+def _height(text: str) -> tuple[float, float]:
+    values = _numbers(text)
+    sigma = values[1] if len(values) == 2 else 10.0
+    if not -500 < values[0] < 9000 or not 0 < sigma < 1e4:
+        raise argparse.ArgumentTypeError(f"expected a height in metres, and a sigma > 0, found {text!r}")
+    return values[0], sigma
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"expected metres such as 3 or 3,5, found {text!r}") from error
+    if len(values) > 2:
+        raise argparse.ArgumentTypeError(f"expected one or two numbers, found {text!r}")
+    return values

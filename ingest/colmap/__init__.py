@@ -1,0 +1,1 @@
+"""COLMAP's database and reconstructions: read, adjusted, cut, and their covariances."""

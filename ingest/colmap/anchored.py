@@ -1,0 +1,307 @@
+"""Adjustment of a model against points and photos that stay where they are, lenses under their priors.
+
+Like ingest.colmap.bridge and ingest.colmap.adjust this module knows pycolmap's reconstructions.
+"""
+
+import tempfile
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from featuredb.adjust.block import Block, whole_camera, whole_lens
+from featuredb.adjust.problem import Problem
+from featuredb.adjust.terms import LensPrior, LensWidths, Marks, Terms, lens_prior
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from ingest.colmap.adjust import AdjustOptions, block_variance_px2, lens_prior_of, longest_side
+from ingest.colmap.bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
+
+_FUNCTION_TOLERANCE = 1e-6  # relative
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnchoredOptions:
+    """The adjustment.
+
+    Attributes:
+        loss_scale_px: of the Cauchy loss, at `error_reference_side_px`: a SIFT keypoint is good to about
+            half a pixel of the image that it was found on.
+        max_error_px: observations further off are dropped between rounds, at the same size; what
+            reconstruction itself allows.
+        error_reference_side_px: keypoints are located on images of about this size.
+        rounds: of adjusting and dropping.
+        lent: of a lens that a map lends, against that map's points. They were made with that very lens: what
+            it trades for height, they trade alike. Of the coefficients of a lens that is not whole no more is
+            known than of any lens.
+        mapping: what is known of other lenses, what observations count against it, and the solver, all as
+            where reconstructions are made.
+    """
+
+    loss_scale_px: float = 0.5
+    max_error_px: float = 4.0
+    error_reference_side_px: int = 1600
+    rounds: int = 3
+    lent: LensWidths = field(
+        default_factory=lambda: LensWidths(
+            focal_rel=0.001, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005
+        )
+    )
+    mapping: AdjustOptions = field(default_factory=AdjustOptions)
+
+    def keypoint_px(self, cameras: Sequence[Camera]) -> float:
+        """`loss_scale_px` at the size of these cameras' pictures."""
+        return self.loss_scale_px * max(1.0, longest_side(cameras) / self.error_reference_side_px)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lenses:
+    """What is known of a model's lenses, by camera, without its photos.
+
+    Attributes:
+        held: cameras whose lens stays.
+        lent: lenses of maps.
+        focal_px: focal lengths of EXIF.
+    """
+
+    held: Collection[int] = ()
+    lent: Mapping[int, Camera] = field(default_factory=dict)
+    focal_px: Mapping[int, float] = field(default_factory=dict)
+
+    def priors(self, cameras: Sequence[Camera], options: AnchoredOptions) -> tuple[LensPrior | None, ...]:
+        """Of whole lenses; None for those that are held."""
+
+        def prior(c: int, camera: Camera) -> LensPrior | None:
+            if c in self.held:
+                return None
+            if c in self.lent:
+                lens, widths = whole_camera(self.lent[c]), options.lent
+                if lens != self.lent[c]:  # the map did not ask for the other coefficients
+                    any_lens = options.mapping.lens
+                    widths = replace(widths, radial=any_lens.radial, tangential=any_lens.tangential)
+                return lens_prior(lens, widths)
+            return lens_prior_of(whole_camera(camera), self.focal_px.get(c), options.mapping)
+
+        return tuple(prior(c, camera) for c, camera in enumerate(cameras))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FixedPoints:
+    """Points that stay where they are and the pixels in which a model's photos see them.
+
+    Attributes:
+        xyz: (q, 3) in the model's frame.
+        point_of, photo_of: (m,) rows of xyz and of the model's photos.
+        pixels: (m, 2).
+    """
+
+    xyz: FloatArray
+    point_of: NDArray[np.int64]
+    photo_of: NDArray[np.int64]
+    pixels: FloatArray
+
+    @classmethod
+    def none(cls) -> "FixedPoints":
+        """No points."""
+        rows = np.zeros(0, dtype=np.int64)
+        return cls(xyz=np.zeros((0, 3)), point_of=rows, photo_of=rows, pixels=np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Anchored:
+    """An adjusted model.
+
+    Attributes:
+        model: poses, lenses and free points; observations that fit, points with at least two of them.
+        fixed_kept: (m,) observations of fixed points that fit.
+        old_point: (n,) row of the given model's points that each point was.
+    """
+
+    model: Model
+    fixed_kept: NDArray[np.bool_]
+    old_point: NDArray[np.int64]
+
+
+def adjust_anchored(
+    model: Model,
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    lenses: Lenses,
+    options: AnchoredOptions,
+    *,
+    held_photos: Sequence[int] = (),
+    held_points: Sequence[int] = (),
+) -> Anchored:
+    """Adjust poses, free points and whole lenses.
+
+    Without fixed points and held photos the first photo's pose stays.
+
+    Args:
+        keypoints: pixels (n, 2) of each photo of the model, in the order of its rows.
+        held_photos: rows of the model's photos whose poses stay. held_points: of its points.
+    """
+    observation = _in_tracks(model, np.ones(len(model.point_of), dtype=np.bool_))
+    kept = np.ones(len(fixed.point_of), dtype=np.bool_)
+    if not len(held_photos) and not len(fixed.point_of):
+        held_photos = (0,)
+    priors = lenses.priors(model.cameras, options)
+    state = model
+    variance_px2 = options.keypoint_px(model.cameras) ** 2  # until the model has settled
+    for _ in range(options.rounds):
+        block, marks = block_and_marks(state, observation, keypoints, fixed, kept, held_points, held_photos)
+        terms = terms_of(block, marks, priors, options, variance_px2, held_photos)
+        problem = Problem(block, terms, options.mapping.threads)
+        problem.solve(options.mapping.max_iterations, _FUNCTION_TOLERANCE)
+        found = problem.block()
+        variance_px2 = block_variance_px2(found, marks)
+        cameras = zip(model.cameras, found.cameras, priors, strict=True)
+        state = replace(
+            state,
+            cameras=tuple(given if prior is None else own for given, own, prior in cameras),
+            cam_from_sfm=found.cam_from_block,
+            xyz=found.xyz,
+        )
+        observation, kept = _fitting(state, keypoints, fixed, options)
+        observation &= _in_tracks(state, observation)
+    return Anchored(
+        model=with_observations(state, observation),
+        fixed_kept=kept,
+        old_point=np.unique(state.point_of[observation]),
+    )
+
+
+def block_and_marks(
+    model: Model,
+    observation: NDArray[np.bool_],
+    keypoints: Sequence[FloatArray],
+    fixed: FixedPoints,
+    kept: NDArray[np.bool_],
+    held_points: Sequence[int] = (),
+    held_photos: Sequence[int] = (),
+) -> tuple[Block, Marks]:
+    """The model with whole lenses, and what its free photos see of points that stay.
+
+    Args:
+        observation: (m,) those of the model that take part. kept: those of the fixed points.
+        held_points: of the model, those that stay.
+    """
+    held = np.isin(np.arange(len(model.xyz)), held_points)
+    xy = model.pixels(keypoints)
+    free = np.flatnonzero(observation & ~held[model.point_of])
+    stays = np.flatnonzero(observation & held[model.point_of] & ~np.isin(model.photo_of, held_photos))
+    block = replace(
+        model.block(xy), point_of=model.point_of[free], photo_of=model.photo_of[free], xy=xy[free]
+    )
+    marks = Marks(
+        xyz=np.concatenate([fixed.xyz[fixed.point_of[kept]], model.xyz[model.point_of[stays]]]),
+        photo_of=np.concatenate([fixed.photo_of[kept], model.photo_of[stays]]),
+        xy=np.concatenate([fixed.pixels[kept], xy[stays]]),
+    )
+    return whole_lens(block), marks
+
+
+def terms_of(
+    block: Block,
+    marks: Marks,
+    lenses: tuple[LensPrior | None, ...],
+    options: AnchoredOptions,
+    variance_px2: float,
+    held_photos: Sequence[int] = (),
+) -> Terms:
+    """Marks and lenses; observations count as they do where reconstructions are made.
+
+    Args:
+        variance_px2: of the residuals, with what neighbours share.
+    """
+    keypoint_px = options.keypoint_px(block.cameras)
+    return Terms(
+        keypoint_px=keypoint_px,
+        dilution=options.mapping.dilution * variance_px2 / keypoint_px**2,
+        lenses=lenses,
+        marks=replace(marks, sigma_px=keypoint_px),
+        held_photos=tuple(held_photos),
+    )
+
+
+def _fitting(
+    model: Model, keypoints: Sequence[FloatArray], fixed: FixedPoints, options: AnchoredOptions
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which observations of free and of fixed points lie within the tolerance."""
+    free = np.zeros(len(model.point_of), dtype=np.bool_)
+    held = np.zeros(len(fixed.point_of), dtype=np.bool_)
+    for k, pose in enumerate(model.cam_from_sfm):
+        camera = model.cameras[int(model.camera_of[k])]
+        limit = options.max_error_px * max(
+            1.0, max(camera.width, camera.height) / options.error_reference_side_px
+        )
+        mine = np.flatnonzero(model.photo_of == k)
+        pixels = camera.project(pose.act(model.xyz[model.point_of[mine]]))
+        free[mine] = np.linalg.norm(pixels - keypoints[k][model.keypoint_of[mine]], axis=1) < limit
+        mine = np.flatnonzero(fixed.photo_of == k)
+        pixels = camera.project(pose.act(fixed.xyz[fixed.point_of[mine]]))
+        held[mine] = np.linalg.norm(pixels - fixed.pixels[mine], axis=1) < limit
+    return free, held
+
+
+def _in_tracks(model: Model, observation: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Observations of points that at least two of them hold."""
+    counts = np.bincount(model.point_of[observation], minlength=len(model.xyz))
+    return np.asarray(counts[model.point_of] >= 2)
+
+
+def with_observations(model: Model, observation: NDArray[np.bool_]) -> Model:
+    """The model with the chosen observations (m,) and the points that they see."""
+    points, point_of = np.unique(model.point_of[observation], return_inverse=True)
+    return replace(
+        model,
+        xyz=model.xyz[points],
+        point_of=point_of.reshape(-1),
+        photo_of=model.photo_of[observation],
+        keypoint_of=model.keypoint_of[observation],
+    )
+
+
+def triangulate_posed(
+    cameras: Sequence[Camera],
+    photos: Sequence[SfmPhoto],
+    poses: Sequence[Rigid3],
+    geometries: Mapping[tuple[int, int], TwoView],
+) -> Model:
+    """Points from the verified matches of photos whose poses and lenses are known, and stay as they are.
+
+    Args:
+        photos: their camera_row names the camera. poses: cam_from_sfm of each.
+        geometries: of pairs of rows.
+    """
+    with quiet(), tempfile.TemporaryDirectory(prefix="featuredb-points-") as scratch:
+        database = Path(scratch) / "colmap.db"
+        write_database(database, [(camera, True) for camera in cameras], photos, geometries)
+        reconstruction = pycolmap.Reconstruction()
+        for c, camera in enumerate(cameras):
+            reconstruction.add_camera_with_trivial_rig(camera.to_pycolmap(c + 1))
+        for k, (photo, pose) in enumerate(zip(photos, poses, strict=True)):
+            image = pycolmap.Image(name=photo.name, camera_id=photo.camera_row + 1, image_id=k + 1)
+            reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose.matrix()[:3]))
+        settings = pycolmap.IncrementalPipelineOptions()
+        settings.extract_colors = False
+        settings.triangulation.ignore_two_view_tracks = False
+        settings.num_threads = 1
+        settings.random_seed = 0
+        error_px = 4.0 * max(1.0, longest_side(cameras) / AnchoredOptions().error_reference_side_px)
+        settings.triangulation.create_max_angle_error = 2.0
+        settings.mapper.filter_max_reproj_error = error_px
+        settings.triangulation.complete_max_reproj_error = error_px
+        settings.triangulation.merge_max_reproj_error = error_px
+        settings.ba_refine_focal_length = False
+        settings.ba_refine_extra_params = False
+        output = Path(scratch) / "points"
+        output.mkdir()
+        found = pycolmap.triangulate_points(
+            reconstruction, str(database), scratch, str(output), clear_points=True, options=settings
+        )
+        found.write(str(output))
+        return read_model(output)

@@ -1,0 +1,1 @@
+"""Photos of an ingest: files found and read, tables of photos, positions, cameras, copies."""

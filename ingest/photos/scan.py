@@ -1,0 +1,370 @@
+"""A folder of files to photos: what each one is, what it says of itself, and why it is not used.
+
+Nothing that a file contains is fatal. Every file is read, hashed and decoded once; a cache in the work
+folder, keyed by name, size and modification time, spares that the next time.
+"""
+
+import hashlib
+import os
+import stat
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from featuredb.errors import ImageError, IngestError
+from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, probe, read_image_bytes
+from featuredb.features.exif import read_exif
+from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.image_header import check_signature
+from featuredb.maps.exif_prior import prior_from_exif
+from featuredb.maps.feature_map import GeoPrior
+from ingest.executor import Progress, no_progress
+from ingest.fingerprint import options_fingerprint
+from ingest.photos.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
+from ingest.photos.photo import Photo
+from ingest.photos.scan_cache import ExaminedFile, read_cache, write_cache
+from ingest.photos.table import PhotoTable, TableRow, missing_reason, summary_of
+from ingest.photos.walk import FoundFile, walk
+
+# Raised when the same file would be judged differently, so that old caches are not used.
+_VERSION = 2
+# The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
+_SAVE_EVERY = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanOptions:
+    """What is taken from a folder.
+
+    Attributes:
+        limits: sizes that are refused.
+        duplicates: when two photos are copies.
+        recursive: folders in the folder are entered.
+        exclude: shell patterns; a file whose name, with or without its folder, fits one is left out.
+        workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
+        owner, licence: attribution of photos that do not name their own.
+        geotag_sigma_m: standard deviation of a table's position that does not say its own. Geotags of
+            photo sites are tens of metres off, where they are not wrong altogether.
+        trust_geotags: positions of a table place maps as those of a folder do.
+        films: the photos are keyframes, those of each film in a folder of its own.
+    """
+
+    limits: DecodeLimits = INGEST_LIMITS
+    duplicates: DuplicateOptions = field(default_factory=DuplicateOptions)
+    recursive: bool = True
+    exclude: tuple[str, ...] = ()
+    workers: int = 0
+    owner: str = ""
+    licence: str = ""
+    geotag_sigma_m: float = 30.0
+    trust_geotags: bool = False
+    films: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanResult:
+    """Every file of a folder.
+
+    Attributes:
+        photos: all files, used or not, sorted by name.
+        read: files that were opened; the others were in the cache or refused by their name.
+        notes: what is wrong with the table, where there is one.
+    """
+
+    photos: tuple[Photo, ...]
+    read: int = 0
+    notes: tuple[str, ...] = ()
+
+    @property
+    def usable(self) -> tuple[Photo, ...]:
+        """Photos to be ingested."""
+        return tuple(photo for photo in self.photos if photo.status == "ok")
+
+    @property
+    def skipped(self) -> dict[str, int]:
+        """Number of skipped files by reason code."""
+        counts: dict[str, int] = {}
+        for photo in self.photos:
+            if photo.status == "skipped":
+                counts[photo.reason_code] = counts.get(photo.reason_code, 0) + 1
+        return counts
+
+
+def scan_folder(
+    folder: Path,
+    options: ScanOptions | None = None,
+    progress: Progress = no_progress,
+    cache_file: Path | None = None,
+) -> ScanResult:
+    """Look at every file of a folder.
+
+    Args:
+        folder: the photos.
+        options: default ScanOptions().
+        progress: called as progress("scan", files done, all files).
+        cache_file: where results are kept for the next run; None: nowhere.
+
+    Raises:
+        IngestError: the folder cannot be listed.
+    """
+    options = options or ScanOptions()
+    files = [_excluded(file, options.exclude) for file in walk(folder, options.recursive)]
+    return _scan_files(files, options, progress, cache_file, {})
+
+
+def scan_table(
+    table: PhotoTable,
+    options: ScanOptions | None = None,
+    progress: Progress = no_progress,
+    cache_file: Path | None = None,
+) -> ScanResult:
+    """Look at every photo of a table; what the table says goes before what the file says.
+
+    Args: see `scan_folder`. Files that are not there, and rows that cannot be read, are among the photos
+        with their reason.
+    """
+    options = options or ScanOptions()
+    files = [_excluded(_table_file(row), options.exclude) for row in table.rows]
+    rows = {row.name: row for row in table.rows}
+    result = _scan_files(sorted(files, key=lambda f: f.name), options, progress, cache_file, rows)
+    bad = [
+        Photo(
+            name=f"row {row.number}",
+            path=Path(f"row {row.number}"),
+            status="skipped",
+            reason_code="bad_row",
+            reason=f"row {row.number} of the table: {row.reason}",
+        )
+        for row in table.bad
+    ]
+    return replace(result, photos=(*result.photos, *bad), notes=tuple(summary_of(table)))
+
+
+def _table_file(row: TableRow) -> FoundFile:
+    try:
+        info = row.path.stat()
+    except (OSError, ValueError):
+        return FoundFile(name=row.name, path=row.path, reason_code="missing", reason=missing_reason(row))
+    if not stat.S_ISREG(info.st_mode):
+        return FoundFile(name=row.name, path=row.path, reason_code="unreadable", reason="not a regular file")
+    return FoundFile(name=row.name, path=row.path, size=info.st_size, mtime_ns=info.st_mtime_ns)
+
+
+def _scan_files(
+    files: Sequence[FoundFile],
+    options: ScanOptions,
+    progress: Progress,
+    cache_file: Path | None,
+    rows: Mapping[str, TableRow],
+) -> ScanResult:
+    key = f"{_VERSION}:{options_fingerprint(options.limits)}"
+    known = read_cache(cache_file, key) if cache_file else {}
+    examined, read = _examine_all(files, known, options, progress, cache_file, key)
+    photos = [_as_photo(file, examined.get(file.name), options) for file in files]
+    photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
+    photos = _mark_exact(photos)
+    photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()}, options.duplicates)
+    return ScanResult(photos=tuple(photos), read=read)
+
+
+def _excluded(file: FoundFile, patterns: Sequence[str]) -> FoundFile:
+    """The file, refused if a pattern fits it."""
+    for pattern in patterns:
+        if fnmatchcase(file.name, pattern) or fnmatchcase(file.name.rsplit("/", 1)[-1], pattern):
+            return replace(file, reason_code="excluded", reason=f"left out by the pattern {pattern!r}")
+    return file
+
+
+def _examine_all(
+    files: Sequence[FoundFile],
+    known: dict[str, ExaminedFile],
+    options: ScanOptions,
+    progress: Progress,
+    cache_file: Path | None,
+    key: str,
+) -> tuple[dict[str, ExaminedFile], int]:
+    """The examined regular files by name, and how many were not in the cache."""
+    results: dict[str, ExaminedFile] = {}
+    todo: list[FoundFile] = []
+    for file in files:
+        if file.reason_code:
+            continue
+        old = known.get(file.name)
+        if old and (old.size, old.mtime_ns) == (file.size, file.mtime_ns):
+            results[file.name] = old
+        else:
+            todo.append(file)
+    done = len(files) - len(todo)
+    progress("scan", done, len(files))
+    next_save = _SAVE_EVERY
+    workers = options.workers or min(8, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers, thread_name_prefix="scan") as pool:
+        futures = {pool.submit(examine, file, options.limits): file for file in todo}
+        for count, future in enumerate(as_completed(futures), start=1):
+            results[futures[future].name] = future.result()
+            progress("scan", done + count, len(files))
+            if cache_file and count >= next_save:
+                write_cache(cache_file, key, results)
+                next_save = count + max(_SAVE_EVERY, len(results) // 4)
+    if cache_file and (todo or results.keys() != known.keys()):
+        write_cache(cache_file, key, results)
+    return results, len(todo)
+
+
+def examine(file: FoundFile, limits: DecodeLimits) -> ExaminedFile:
+    """Read one file once: its digest, its picture and its metadata, or why it is none."""
+    sha256 = ""
+    try:
+        _check_head(file.path)
+        data = read_image_bytes(file.path, limits)
+        sha256 = hashlib.sha256(data).hexdigest()
+        header = probe(data, limits)
+        gray = decode_gray(data, limits)
+    except ImageError as error:
+        return ExaminedFile(
+            size=file.size,
+            mtime_ns=file.mtime_ns,
+            sha256=sha256,
+            reason_code=error.code,
+            reason=str(error),
+        )
+    return ExaminedFile(
+        size=file.size,
+        mtime_ns=file.mtime_ns,
+        sha256=sha256,
+        picture_hash=picture_hash(gray),
+        exif=read_exif(data, header),
+    )
+
+
+def _check_head(path: Path) -> None:
+    """Refuse films and documents by their first bytes, before gigabytes are read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(32)
+    except OSError as error:
+        raise ImageError(f"{path.name} cannot be read: {error.strerror or error}", "unreadable") from error
+    check_signature(head)
+
+
+def _as_photo(file: FoundFile, examined: ExaminedFile | None, options: ScanOptions) -> Photo:
+    if examined is None or examined.exif is None:
+        source = examined or file
+        return Photo(
+            name=file.name,
+            path=file.path,
+            sha256=examined.sha256 if examined else "",
+            status="skipped",
+            reason_code=source.reason_code,
+            reason=source.reason,
+        )
+    exif = examined.exif
+    return Photo(
+        name=file.name,
+        path=file.path,
+        sha256=examined.sha256,
+        width=exif.width,
+        height=exif.height,
+        orientation=exif.orientation,
+        make=exif.make,
+        model=exif.model,
+        camera_key=exif.camera_key,
+        focal_px=exif.focal_px,
+        capture_time=exif.capture_time,
+        gps=prior_from_exif(exif),
+        angles=exif.angles,
+        altitude_reference=exif.altitude_reference,
+        relative_altitude_m=exif.relative_altitude_m,
+        owner=exif.artist or options.owner,
+        licence=exif.copyright or options.licence,
+        film=file.name.rpartition("/")[0] if options.films else "",
+        warnings=exif.warnings,
+    )
+
+
+def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
+    """The photo with what the table says of it; all else stays as EXIF has it."""
+    gps = photo.gps
+    if row.latitude_deg is not None and row.longitude_deg is not None:
+        gps = GeoPrior(
+            latitude_deg=row.latitude_deg,
+            longitude_deg=row.longitude_deg,
+            height_m=row.height_m if row.height_m is not None or gps is None else gps.height_m,
+            sigma_horizontal_m=row.accuracy_m or options.geotag_sigma_m,
+            sigma_vertical_m=_sigma_of_height(row, photo, options),
+        )
+    elif gps is not None:
+        gps = replace(
+            gps,
+            height_m=gps.height_m if row.height_m is None else row.height_m,
+            sigma_horizontal_m=row.accuracy_m or gps.sigma_horizontal_m,
+            sigma_vertical_m=row.accuracy_height_m or gps.sigma_vertical_m,
+        )
+    return replace(
+        photo,
+        gps=gps,
+        gps_is_hint=gps is not None and not options.trust_geotags,
+        angles=row.angles or photo.angles,
+        capture_time=row.time or photo.capture_time,
+        owner=row.owner or photo.owner,
+        licence=row.licence or photo.licence,
+        title=row.title,
+        warnings=(*photo.warnings, *row.warnings),
+    )
+
+
+def _sigma_of_height(row: TableRow, photo: Photo, options: ScanOptions) -> float:
+    """As the table says; a height of its own is worse than its position by as much as a plain receiver's."""
+    if row.accuracy_height_m is not None:
+        return row.accuracy_height_m
+    if row.height_m is not None:
+        ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
+        return ratio * (row.accuracy_m or options.geotag_sigma_m)
+    return options.geotag_sigma_m if photo.gps is None else photo.gps.sigma_vertical_m
+
+
+def _mark_exact(photos: list[Photo]) -> list[Photo]:
+    copies = exact_duplicates(photos)
+    return [
+        _skipped(photo, "duplicate", f"the same bytes as {copies[photo.name]}", copies[photo.name])
+        if photo.name in copies
+        else photo
+        for photo in photos
+    ]
+
+
+def _mark_near(photos: list[Photo], hashes: dict[str, str], options: DuplicateOptions) -> list[Photo]:
+    usable = [photo for photo in photos if photo.status == "ok"]
+    copies = near_duplicates(usable, [hashes[photo.name] for photo in usable], options)
+    marked = []
+    for photo in photos:
+        if photo.name in copies:
+            kept, bits = copies[photo.name]
+            reason = (
+                f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {options.max_bits})"
+            )
+            photo = _skipped(photo, "near_duplicate", reason, kept)
+        marked.append(photo)
+    return marked
+
+
+def _skipped(photo: Photo, code: str, reason: str, duplicate_of: str) -> Photo:
+    return replace(photo, status="skipped", reason_code=code, reason=reason, duplicate_of=duplicate_of)
+
+
+def require_usable(result: ScanResult, folder: Path, least: int = 1) -> tuple[Photo, ...]:
+    """The usable photos.
+
+    Raises:
+        IngestError: fewer than `least`; the message counts the reasons.
+    """
+    usable = result.usable
+    if len(usable) < least:
+        reasons = ", ".join(f"{count} {code}" for code, count in sorted(result.skipped.items())) or "no files"
+        raise IngestError(
+            f"{folder}: expected at least {least} usable photos, found {len(usable)} of "
+            f"{len(result.photos)} files (skipped: {reasons})"
+        )
+    return usable

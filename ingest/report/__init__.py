@@ -1,0 +1,1 @@
+"""The report of an ingest: its values, the page, pictures."""

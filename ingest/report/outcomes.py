@@ -1,0 +1,276 @@
+"""What happened to every file and every component, as the report's values."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from featuredb.geo.utm import meridian_convergence_deg, utm_from_geodetic
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
+from ingest.photos.cameras import shared_key
+from ingest.photos.photo import Photo
+from ingest.placed_models import Component
+from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
+from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
+
+
+def map_outcome(component: Component, created: Mapping[str, bool], options: MapMakingOptions) -> MapOutcome:
+    """A component for the report.
+
+    Args:
+        created: of committed maps, whether this ingest made them visible.
+    """
+    placement, feature_map = component.placement, component.feature_map
+    figures = component.control.evidence if component.control is not None else placement.figures
+    if component.unplaced is not None:
+        return _unplaced_outcome(component, component.unplaced, options)
+    if feature_map is None:
+        return MapOutcome(
+            map_id="",
+            name=f"{len(component.photos)} photos from {component.photos[0].name}",
+            status="refused",
+            reason_code=component.reason_code,
+            reason=component.reason,
+            photos=len(component.photos),
+            points=len(component.model.xyz),
+            observations=len(component.model.point_of),
+            gates=figures,
+            cameras=_cameras(component, options),
+            track_lengths=component.model.track_lengths().astype(np.int32),
+            control=component.control,
+        )
+    return MapOutcome(
+        map_id=feature_map.map_id,
+        name=feature_map.name,
+        status="committed" if created.get(feature_map.map_id) else "already_there",
+        photos=len(feature_map.images),
+        points=len(feature_map.points),
+        observations=len(feature_map.observations),
+        descriptors=int(feature_map.observations.has_descriptor.sum()),
+        epsg=feature_map.epsg,
+        height_datum=feature_map.height_datum,
+        scale=feature_map.placement.local_from_sfm.scale,
+        residual_rms_m=feature_map.placement.residual_rms_m,
+        radius_m=_radius_m(feature_map),
+        picture_shear=float(feature_map.provenance.get("picture_shear", 0.0)),
+        gates=figures,
+        cameras=_cameras(component, options),
+        errors_px=feature_map.points.error_px,
+        track_lengths=feature_map.points.track_length,
+        plan=_plan(component, feature_map),
+        control=component.control,
+    )
+
+
+def _radius_m(feature_map: FeatureMap) -> float:
+    """Horizontal, of 95 %: the longer half axis of the ellipse at the median camera, metres."""
+    at = point_jacobian(np.array([image.cam_from_local.center for image in feature_map.images]))[:, :2]
+    spread = at @ feature_map.placement.covariance @ at.transpose(0, 2, 1)
+    return float(np.median(np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(spread)[:, -1])))
+
+
+def _unplaced_outcome(component: Component, unplaced: UnplacedMap, options: MapMakingOptions) -> MapOutcome:
+    control = component.control
+    return MapOutcome(
+        map_id=unplaced.map_id,
+        name=unplaced.name,
+        status="unplaced",
+        reason_code=unplaced.no_place.reason_code,
+        reason=unplaced.no_place.reason,
+        photos=len(unplaced.images),
+        points=len(unplaced.points),
+        observations=len(unplaced.observations),
+        descriptors=int(unplaced.observations.has_descriptor.sum()),
+        picture_shear=float(unplaced.provenance.get("picture_shear", 0.0)),
+        gates=control.evidence if control is not None else component.placement.figures,
+        cameras=_cameras(component, options),
+        errors_px=unplaced.points.error_px,
+        track_lengths=unplaced.points.track_length,
+        control=control,
+    )
+
+
+def photo_outcomes(
+    photos: Sequence[Photo],
+    result: Reconstructed,
+    registered: Mapping[str, PhotoOutcome],
+    stop_after: Stage | None,
+) -> tuple[PhotoOutcome, ...]:
+    """Every file of the folder for the report, sorted by name.
+
+    Args:
+        registered: of the photos of all components, by name, see `registered_photos`.
+    """
+    return tuple(
+        registered.get(photo.name) or _left_out(photo, result, stop_after)
+        for photo in sorted(photos, key=lambda p: p.name)
+    )
+
+
+def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> PhotoOutcome:
+    """A file that is in no reconstruction."""
+    code, reason = photo.reason_code, photo.reason
+    if photo.status == "ok" and photo.name in result.unreadable:
+        code, reason = "unreadable", result.unreadable[photo.name]
+    elif photo.status == "ok" and stop_after is not None:
+        code, reason = "stopped", f"the ingest stopped after {stop_after}, as asked"
+    elif photo.status == "ok" and photo.name in result.lost:
+        code, reason = "lost", result.lost[photo.name]
+    elif photo.status == "ok" and photo.name in result.copies:
+        code, reason = "copy", f"the picture of {result.copies[photo.name]}, cut, framed or marked"
+    elif photo.status == "ok" and not result.matches_per_photo.get(photo.name):
+        code, reason = "no_matches", "no other photo shows the same place"
+    elif photo.status == "ok":
+        code, reason = "no_pose", "its matches fit no reconstruction of at least three photos"
+    skipped = photo.status == "skipped" or code in ("unreadable", "copy")
+    return _outcome(
+        photo, result, status="skipped" if skipped else "not_registered", code=code, reason=reason
+    )
+
+
+def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
+    """The photos of one component; those of a refused one are in no map, and have its reason."""
+    feature_map = component.feature_map
+    if component.unplaced is not None:
+        return _in_unplaced_map(component, component.unplaced, result)
+    if feature_map is None:
+        return {
+            p.name: _outcome(
+                p,
+                result,
+                status="not_registered",
+                code=component.reason_code.lower(),
+                reason=component.reason,
+            )
+            for p in component.photos
+        }
+    counts, errors = _counts_and_errors(feature_map)
+    _, gps, residuals = _centers_and_gps(component, feature_map)
+    used = _gps_used(component)
+    return {
+        photo.name: _outcome(
+            photo,
+            result,
+            status="registered",
+            observations=int(counts[k]),
+            map_id=feature_map.map_id,
+            reprojection_px=float(errors[k]),
+            gps_residual_m=None if np.isnan(gps[k, 0]) else tuple(float(v) for v in residuals[k]),
+            gps_used=used.get(k, False) if photo.gps is not None else None,
+        )
+        for k, photo in enumerate(component.photos)
+    }
+
+
+def _in_unplaced_map(
+    component: Component, unplaced: UnplacedMap, result: Reconstructed
+) -> dict[str, PhotoOutcome]:
+    counts, errors = _counts_and_errors(unplaced)
+    return {
+        photo.name: _outcome(
+            photo,
+            result,
+            status="unplaced",
+            code=component.reason_code.lower(),
+            reason=component.reason,
+            observations=int(counts[k]),
+            map_id=unplaced.map_id,
+            reprojection_px=float(errors[k]),
+        )
+        for k, photo in enumerate(component.photos)
+    }
+
+
+def _counts_and_errors(any_map: AnyMap) -> tuple[NDArray[np.int64], FloatArray]:
+    """Observations of each image (k,), and the mean reprojection error of their points (k,), pixels."""
+    seen, photos = any_map.observations, len(any_map.images)
+    counts = np.bincount(seen.image_id, minlength=photos)
+    weights = any_map.points.error_px[seen.point_index]
+    errors = np.bincount(seen.image_id, weights=weights, minlength=photos) / np.maximum(counts, 1)
+    return counts, errors
+
+
+def _outcome(
+    photo: Photo,
+    result: Reconstructed,
+    *,
+    status: str,
+    code: str = "",
+    reason: str = "",
+    **more: object,
+) -> PhotoOutcome:
+    return PhotoOutcome(
+        name=photo.name,
+        status=status,  # type: ignore[arg-type]
+        reason_code=code,
+        reason=reason,
+        width=photo.width,
+        height=photo.height,
+        camera_key=photo.camera_key,
+        capture_time=photo.capture_time,
+        has_gps=photo.gps is not None,
+        features=result.features_per_photo.get(photo.name),
+        matches=result.matches_per_photo.get(photo.name),
+        warnings=photo.warnings,
+        **more,  # type: ignore[arg-type]
+    )
+
+
+def _plan(component: Component, feature_map: FeatureMap) -> PlanView:
+    centers, gps, _ = _centers_and_gps(component, feature_map)
+    used = _gps_used(component)
+    frame = feature_map.frame
+    return PlanView(
+        points=feature_map.points.utm,
+        cameras=centers,
+        gps=gps,
+        names=tuple(image.name for image in feature_map.images),
+        gps_used=np.array([used.get(k, False) for k in range(len(component.photos))]),
+        convergence_deg=meridian_convergence_deg(frame.latitude_deg, frame.longitude_deg, feature_map.epsg),
+        epsg=feature_map.epsg,
+    )
+
+
+def _centers_and_gps(
+    component: Component, feature_map: FeatureMap
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """UTM camera centres (k, 3), GPS positions (k, 3) with NaN where absent, and their difference."""
+    enu = np.array([image.cam_from_local.center for image in feature_map.images])
+    centers = feature_map.frame.utm_from_enu(enu, feature_map.epsg)
+    gps = np.full_like(centers, np.nan)
+    for k, photo in enumerate(component.photos):
+        if photo.gps is not None:
+            height = photo.gps.height_m
+            place = (photo.gps.latitude_deg, photo.gps.longitude_deg, height or 0.0)
+            gps[k] = utm_from_geodetic(place, feature_map.epsg)
+            gps[k, 2] = np.nan if height is None else gps[k, 2]
+    return centers, gps, gps - centers
+
+
+def _gps_used(component: Component) -> dict[int, bool]:
+    """Whether a photo's GPS helped to place the map, by place in the component."""
+    return {k: bool(inner) for k, inner in zip(component.with_gps, component.placement.inliers, strict=True)}
+
+
+def _cameras(component: Component, options: MapMakingOptions) -> tuple[CameraOutcome, ...]:
+    outcomes = []
+    for index, camera in enumerate(component.model.cameras):
+        members = [
+            p for p, c in zip(component.photos, component.model.camera_of, strict=True) if int(c) == index
+        ]
+        outcomes.append(
+            CameraOutcome(
+                name=shared_key(members[0], options.cameras),
+                model=camera.model,
+                width=camera.width,
+                height=camera.height,
+                photos=len(members),
+                focal_before_px=members[0].focal_px,
+                focal_after_px=camera.focal_px,
+            )
+        )
+    return tuple(outcomes)

@@ -1,0 +1,204 @@
+"""The report as one page: no network, no scripts, pictures inside."""
+
+import math
+from html import escape
+from pathlib import Path
+
+from ingest.html_parts import duration, folded, note, number, page, picture, pill, table
+from ingest.register.control.report import control_html
+from ingest.report.films import films_html
+from ingest.report.plots import histograms_png, plan_png
+from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, report_json
+from ingest.workspace import atomic_file, write_json
+
+REPORT_JSON = "report.json"
+
+_FILE_PILLS = {
+    "registered": ("good", "in a map"),
+    "unplaced": ("fair", "in a map without a place"),
+    "not_registered": ("fair", "not registered"),
+    "skipped": ("none", "skipped"),
+}
+_MAP_PILLS = {
+    "committed": ("good", "committed"),
+    "already_there": ("good", "was there already"),
+    "unplaced": ("fair", "kept without a place"),
+    "refused": ("bad", "refused"),
+}
+
+
+def write_report(folder: Path, report: IngestReport) -> tuple[Path, Path]:
+    """Write `report.json` and `report.html` into the folder, each atomically; returns both paths."""
+    json_path, html_path = folder / REPORT_JSON, folder / "report.html"
+    write_json(json_path, report_json(report))
+    with atomic_file(html_path) as temporary:
+        temporary.write_text(report_page(report), encoding="utf-8")
+    return json_path, html_path
+
+
+def report_page(report: IngestReport) -> str:
+    """The page as HTML. Everything that comes from files is escaped."""
+    title = f"Ingest of {report.folder.rstrip('/').rsplit('/', 1)[-1] or report.folder}"
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f'<p class="soft">from <code>{escape(report.folder)}</code> '
+        f"into <code>{escape(report.database)}</code>, "
+        f"started {report.started:%Y-%m-%d %H:%M:%S %Z}, job <code>{escape(report.job_id[:16])}</code></p>",
+        _cards(report),
+        *(note(warning) for warning in report.warnings),
+        *(_map(outcome) for outcome in report.maps),
+        films_html(report.films, report.photos),
+        _stages(report),
+        _files(report),
+        _options(report),
+    ]
+    return page(title, parts)
+
+
+def _cards(report: IngestReport) -> str:
+    placed = sum(outcome.status != "refused" for outcome in report.maps)
+    points = sum(outcome.points for outcome in report.maps if outcome.status != "refused")
+    figures = (
+        (f"{report.count('registered')} of {len(report.photos)}", "files are in a map"),
+        (str(report.count("unplaced")), "files are in a map without a place"),
+        (str(report.count("not_registered")), "usable, but not registered"),
+        (str(report.count("skipped")), "skipped"),
+        (str(placed), "map" if placed == 1 else "maps"),
+        (f"{points:,}", "points"),
+        (duration(report.seconds), "wall time"),
+    )
+    cards = (f'<div class="card"><b>{escape(value)}</b><span>{what}</span></div>' for value, what in figures)
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _map(outcome: MapOutcome) -> str:
+    reason = ""
+    if outcome.status in ("refused", "unplaced"):
+        reason = f'<p class="note stop"><b>{escape(outcome.reason_code)}</b>: {escape(outcome.reason)}</p>'
+    method = "GPS" if outcome.control is None else "control points"
+    facts = [
+        ("photos", str(outcome.photos)),
+        ("points", f"{outcome.points:,}"),
+        ("observations", f"{outcome.observations:,}, {outcome.descriptors:,} with descriptors"),
+        (f"residual to {method}", number(outcome.residual_rms_m, "{:.2f} m root mean square")),
+        ("place known to", number(outcome.radius_m, "{:.2f} m horizontally (95 %)")),
+        ("scale", number(outcome.scale, "{:.4g} m per unit of the reconstruction")),
+        ("coordinates", f"EPSG:{outcome.epsg}, heights: {outcome.height_datum}" if outcome.epsg else "none"),
+        ("map id", outcome.map_id or "none"),
+    ]
+    notes = "".join(note(warning) for warning in outcome.warnings)
+    pictures = ""
+    if outcome.plan is not None:
+        pictures += picture(plan_png(outcome.plan), "Plan view and side view of the map")
+    if len(outcome.errors_px):
+        pictures += picture(histograms_png(outcome), "Reprojection errors and track lengths")
+    return (
+        f"<h2>Map {escape(outcome.name)} {pill(*_MAP_PILLS[outcome.status])}</h2><section>{reason}{notes}"
+        + table((), facts, names=(0,))
+        + pictures
+        + _control(outcome)
+        + _cameras(outcome)
+        + folded("Gates and their figures", outcome.gates)
+        + "</section>"
+    )
+
+
+def _control(outcome: MapOutcome) -> str:
+    if outcome.control is None or not outcome.control.control.marks:
+        return ""
+    return control_html(outcome.control.placement, outcome.control.control)
+
+
+def _cameras(outcome: MapOutcome) -> str:
+    if not outcome.cameras:
+        return ""
+    rows = []
+    for camera in outcome.cameras:
+        before, after = camera.focal_before_px, camera.focal_after_px
+        change = f"{100 * (after / before - 1):+.1f} %" if before else ""
+        rows.append(
+            (
+                camera.name,
+                f"{camera.width}x{camera.height}",
+                camera.model,
+                str(camera.photos),
+                number(before, "{:.0f}"),
+                f"{after:.0f}",
+                change,
+            )
+        )
+    head = ("camera", "size", "model", "photos", "focal length by EXIF, px", "refined, px", "change")
+    return "<h3>Cameras</h3>" + table(head, rows, numbers=(3, 4, 5, 6), names=(0,))
+
+
+def _stages(report: IngestReport) -> str:
+    if not report.stages:
+        return ""
+    longest = max(stage.seconds for stage in report.stages) or 1.0
+    rows = ""
+    for stage in report.stages:
+        reused = f"{stage.reused} of {stage.total} from an earlier run" if stage.reused else ""
+        rows += (
+            f'<tr><td>{escape(stage.name)}</td><td class="n">{stage.seconds:.1f} s</td>'
+            f'<td class="track"><div class="bar" style="width:{100 * stage.seconds / longest:.1f}%"></div>'
+            f'</td><td class="soft">{reused}</td></tr>'
+        )
+    pairs = f"{report.verified_pairs} of {report.pairs} pairs of photos have verified matches."
+    return f'<h2>Time</h2><section><table>{rows}</table><p class="soft">{pairs}</p></section>'
+
+
+def _files(report: IngestReport) -> str:
+    head = (
+        "file",
+        "outcome",
+        "why, and remarks",
+        "size",
+        "features",
+        "matches",
+        "observations",
+        "error, px",
+        "GPS off by, m",
+    )
+    numbers = (4, 5, 6, 7, 8)
+    cells = "".join(f'<th class="{"n" if i in numbers else ""}">{h}</th>' for i, h in enumerate(head))
+    rows = "".join(_file_row(photo) for photo in report.photos)
+    return (
+        f'<h2>All {len(report.photos)} files</h2><section class="wide"><table><thead><tr>{cells}</tr></thead>'
+        f"<tbody>{rows}</tbody></table></section>"
+    )
+
+
+def _file_row(photo: PhotoOutcome) -> str:
+    remarks = [escape(photo.reason)] if photo.reason else []
+    remarks += [f'<span class="soft">{escape(warning)}</span>' for warning in photo.warnings]
+    residual = ""
+    if photo.gps_residual_m:
+        east, north, up = photo.gps_residual_m
+        residual = f"{math.hypot(east, north):.2f}" + (f"<br>{up:+.2f} up" if math.isfinite(up) else "")
+        if photo.gps_used is False:
+            remarks.append("its GPS was not used: it contradicts the others'")
+    elif photo.status != "skipped" and not photo.has_gps:
+        remarks.append('<span class="soft">no GPS</span>')
+    figures = (
+        _count(photo.features),
+        _count(photo.matches),
+        _count(photo.observations),
+        number(photo.reprojection_px, "{:.2f}"),
+        residual,
+    )
+    size = f"{photo.width}x{photo.height}" if photo.width else ""
+    return (
+        f'<tr><td class="name">{escape(photo.name)}</td><td>{pill(*_FILE_PILLS[photo.status])}</td>'
+        f"<td>{'<br>'.join(remarks)}</td><td>{size}</td>"
+        + "".join(f'<td class="n">{figure}</td>' for figure in figures)
+        + "</tr>"
+    )
+
+
+def _options(report: IngestReport) -> str:
+    document = report_json(report)
+    return folded("Options", document["options"]) + folded("Versions", document["versions"])
+
+
+def _count(value: int | None) -> str:
+    return "" if value is None else f"{value:,}"

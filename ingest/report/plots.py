@@ -1,0 +1,259 @@
+"""Pictures of a report, as PNG bytes. Matplotlib by its object interface: no global state, no display."""
+
+import math
+from typing import Any
+
+import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.text import OffsetFrom
+from numpy.typing import NDArray
+
+from featuredb.geo.tiles import TILE_SIZE_M, tile_of
+from featuredb.geometry.arrays import FloatArray
+from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
+from ingest.report.values import MapOutcome, PlanView
+
+_DPI = 110
+_MAX_POINTS = 40_000  # more only hide each other and cost seconds
+_MAX_NAMES = 40
+_INK, _GPS, _BAD, _FAINT = "#1b2733", "#1565c0", "#c62828", "#9aa7b4"
+
+
+def plan_png(plan: PlanView) -> bytes:
+    """Plan view (points by height, cameras, GPS with residual vectors, tiles) above a side view."""
+    plan_box = _box(plan)
+    width_m, height_m = plan_box[1] - plan_box[0], plan_box[3] - plan_box[2]
+    side_low, side_high = _heights(plan)
+    plan_inches = min(max(7.4 * height_m / width_m, 3.0), 9.0)
+    side_inches = min(max(7.4 * (side_high - side_low) / width_m, 1.1), 3.0)
+    total = plan_inches + side_inches + 1.5
+    figure = Figure(figsize=(9.2, total), dpi=_DPI, facecolor="white")
+    grid = figure.add_gridspec(
+        2,
+        2,
+        height_ratios=(plan_inches, side_inches),
+        width_ratios=(40, 1),
+        left=0.105,
+        right=0.925,
+        top=1 - 0.55 / total,
+        bottom=0.5 / total,
+        hspace=0.45 / (total / 2),
+        wspace=0.03,
+    )
+    top = figure.add_subplot(grid[0, 0])
+    side = figure.add_subplot(grid[1, 0])
+    bar = figure.add_subplot(grid[:, 1])
+    shown = _sample(plan.points, plan_box)
+    low, high = np.percentile(shown[:, 2], (1, 99)) if len(shown) else (0.0, 1.0)
+    colours = Normalize(low, max(high, low + 0.1))
+    _draw_plan(top, plan, shown, colours, plan_box)
+    _draw_side(side, plan, shown, colours, plan_box, (side_low, side_high))
+    figure.colorbar(ScalarMappable(colours, "viridis"), cax=bar, label="height of points, m")
+    bar.tick_params(labelsize=8)
+    return png_bytes(figure)
+
+
+def histograms_png(outcome: MapOutcome) -> bytes:
+    """Histograms of the points' reprojection errors and track lengths, side by side."""
+    figure = Figure(figsize=(9.2, 2.7), dpi=_DPI, facecolor="white", layout="constrained")
+    left, right = figure.subplots(1, 2)
+    errors, tracks = outcome.errors_px, outcome.track_lengths
+    limit = max(float(np.percentile(errors, 99)), 0.1) if len(errors) else 1.0
+    left.hist(np.minimum(errors, limit), bins=40, range=(0, limit), color="#3f7fbf")
+    left.set_xlabel("mean reprojection error of a point, pixels (last bar: and more)")
+    if len(errors):
+        median = float(np.median(errors))
+        left.axvline(median, color=_BAD, lw=1.2)
+        left.annotate(
+            f"median {median:.2f} px",
+            (median, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=(5, -11),
+            textcoords="offset points",
+            fontsize=8,
+            color=_BAD,
+        )
+    most = int(min(max(tracks.max(initial=2), 4), 30))
+    right.hist(np.minimum(tracks, most), bins=np.arange(1.5, most + 1), color="#4f9d69", rwidth=0.85)
+    right.set_xlabel("photos that see a point" + (" (last bar: and more)" if most == 30 else ""))
+    right.xaxis.get_major_locator().set_params(integer=True)
+    for axes in (left, right):
+        axes.set_ylabel("points")
+        _tidy(axes)
+    return png_bytes(figure)
+
+
+def _draw_plan(axes: Any, plan: PlanView, shown: FloatArray, colours: Normalize, box: NDArray[Any]) -> None:
+    axes.set_xlim(box[0], box[1])
+    axes.set_ylim(box[2], box[3])
+    axes.set_aspect("equal", adjustable="box")
+    _draw_tiles(axes, box)
+    axes.scatter(shown[:, 0], shown[:, 1], c=shown[:, 2], cmap="viridis", norm=colours, s=3, lw=0, zorder=2)
+    residuals = (plan.gps - plan.cameras)[:, :2]
+    factor = residual_exaggeration(residuals[plan.gps_used], float(max(box[1] - box[0], box[3] - box[2])))
+    # Outliers are long enough as they are.
+    tips = plan.cameras[:, :2] + np.where(plan.gps_used, factor, 1)[:, None] * residuals
+    for used, colour, word in ((True, _GPS, "GPS"), (False, _BAD, "GPS, not used")):
+        rows = np.isfinite(tips[:, 0]) & (plan.gps_used == used)
+        if rows.any():
+            times = f" (residuals drawn {factor} times longer)" if used and factor > 1 else ""
+            x, y = plan.cameras[rows, :2].T, tips[rows].T
+            axes.plot([x[0], y[0]], [x[1], y[1]], color=colour, lw=1.5, zorder=4)
+            axes.plot(*y, "x", color=colour, ms=6, mew=1.6, zorder=5, label=word + times)
+    axes.plot(*plan.cameras[:, :2].T, "^", mfc="white", mec=_INK, ms=7, mew=1.3, zorder=6, label="cameras")
+    if len(plan.names) <= _MAX_NAMES:
+        for name, camera in zip(plan.names, plan.cameras, strict=True):
+            axes.annotate(
+                name.rsplit("/", 1)[-1].rsplit(".", 1)[0],
+                camera[:2],
+                xytext=(7, 4),
+                textcoords="offset points",
+                fontsize=6.5,
+                color=_INK,
+                zorder=7,
+                bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.65},
+            )
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncol=3, fontsize=8, frameon=False, borderaxespad=0.1
+    )
+    _draw_north(axes, plan.convergence_deg)
+    _draw_scale_bar(axes, box)
+    axes.set_title(f"EPSG:{plan.epsg}, {_tile_words(box)}", fontsize=9, color=_INK, loc="left", pad=22)
+    axes.set_xlabel("easting, m", fontsize=8)
+    axes.set_ylabel("northing, m", fontsize=8)
+    _tidy(axes)
+
+
+def _draw_side(
+    axes: Any,
+    plan: PlanView,
+    shown: FloatArray,
+    colours: Normalize,
+    box: NDArray[Any],
+    heights: tuple[float, float],
+) -> None:
+    """Height over easting, seen from the south."""
+    axes.scatter(shown[:, 0], shown[:, 2], c=shown[:, 2], cmap="viridis", norm=colours, s=3, lw=0)
+    for camera, gps, used in zip(plan.cameras, plan.gps, plan.gps_used, strict=True):
+        if np.isfinite(gps[2]):
+            colour = _GPS if used else _BAD
+            axes.plot([camera[0], gps[0]], [camera[2], gps[2]], color=colour, lw=1.2)
+            axes.plot(gps[0], gps[2], "x", color=colour, ms=5, mew=1.3)
+    axes.plot(plan.cameras[:, 0], plan.cameras[:, 2], "^", mfc="white", mec=_INK, ms=6, mew=1.2)
+    axes.set_xlim(box[0], box[1])
+    axes.set_ylim(*heights)
+    axes.set_xlabel("easting, m (seen from the south, residuals as they are)", fontsize=8)
+    axes.set_ylabel("height, m", fontsize=8)
+    _tidy(axes)
+
+
+def _draw_tiles(axes: Any, box: NDArray[Any]) -> None:
+    for low, high, draw in ((box[0], box[1], axes.axvline), (box[2], box[3], axes.axhline)):
+        for line in np.arange(math.ceil(low / TILE_SIZE_M), math.floor(high / TILE_SIZE_M) + 1) * TILE_SIZE_M:
+            draw(line, color=_INK, lw=1.0, ls=(0, (6, 4)), alpha=0.7, zorder=3)
+
+
+def _tile_words(box: NDArray[Any]) -> str:
+    corners = np.array([[box[0], box[2], 0.0], [box[1], box[3], 0.0]])
+    first, last = (str(name) for name in tile_of(corners))
+    return f"tile {first}" if first == last else f"tiles {first} to {last} (dashed)"
+
+
+def _draw_north(axes: Any, convergence_deg: float) -> None:
+    """An arrow to true north; the picture's own up is grid north."""
+    angle = math.radians(-convergence_deg)
+    x, y, length = 0.955, 0.86, 34.0
+    axes.annotate(
+        "",
+        xy=(length * math.sin(angle), length * math.cos(angle)),
+        xytext=(0, 0),
+        xycoords=_offset_from(axes, x, y),
+        textcoords=_offset_from(axes, x, y),
+        arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.8},
+        zorder=8,
+    )
+    axes.annotate(
+        "true N",
+        (x, y),
+        xycoords="axes fraction",
+        xytext=(0, -5),
+        textcoords="offset points",
+        ha="center",
+        va="top",
+        fontsize=8,
+        color=_INK,
+        zorder=8,
+        bbox={"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.75},
+    )
+
+
+def _offset_from(axes: Any, x: float, y: float) -> Any:
+    return OffsetFrom(axes.patch, (x, y))
+
+
+def _draw_scale_bar(axes: Any, box: NDArray[Any]) -> None:
+    width = float(box[1] - box[0])
+    length = nice_length(0.25 * width)
+    x0, y0 = box[1] - 0.03 * width - length, box[2] + 0.03 * (box[3] - box[2])
+    axes.plot([x0, x0 + length], [y0, y0], color=_INK, lw=4, solid_capstyle="butt", zorder=8)
+    axes.plot(
+        [x0 + 0.5 * length, x0 + length], [y0, y0], color="white", lw=2, solid_capstyle="butt", zorder=9
+    )
+    axes.annotate(
+        f"{length:g} m",
+        (x0 + length / 2, y0),
+        xytext=(0, 5),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8,
+        color=_INK,
+        zorder=9,
+        bbox={"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.75},
+    )
+
+
+def _box(plan: PlanView) -> NDArray[Any]:
+    """(e0, e1, n0, n1) around the cameras and all but the outermost points, with a margin."""
+    corners = [plan.cameras[:, :2]]
+    if len(plan.points):
+        corners.append(np.percentile(plan.points[:, :2], (1, 99), axis=0))
+    used = np.isfinite(plan.gps[:, 0]) & plan.gps_used
+    corners.append(plan.gps[used, :2])
+    xy = np.concatenate(corners)
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    margin = max(0.06 * float((high - low).max()), 2.0)
+    return np.array([low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin])
+
+
+def _heights(plan: PlanView) -> tuple[float, float]:
+    parts = [plan.cameras[:, 2], plan.gps[np.isfinite(plan.gps[:, 2]) & plan.gps_used, 2]]
+    if len(plan.points):
+        parts.append(np.percentile(plan.points[:, 2], (1, 99)))
+    heights = np.concatenate(parts)
+    margin = max(0.08 * float(np.ptp(heights)), 1.0)
+    return float(heights.min() - margin), float(heights.max() + margin)
+
+
+def _sample(points: FloatArray, box: NDArray[Any]) -> FloatArray:
+    """The points within the box, at most so many, low ones first so that high ones lie on top."""
+    inside = (
+        (points[:, 0] >= box[0])
+        & (points[:, 0] <= box[1])
+        & (points[:, 1] >= box[2])
+        & (points[:, 1] <= box[3])
+    )
+    chosen = points[inside]
+    chosen = chosen[:: max(1, math.ceil(len(chosen) / _MAX_POINTS))]
+    return np.asarray(chosen[np.argsort(chosen[:, 2])], dtype=np.float64)
+
+
+def _tidy(axes: Any) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8, colors=_INK)
+    axes.xaxis.label.set_size(8)
+    axes.yaxis.label.set_size(8)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.get_major_formatter().set_useOffset(False)
+        axis.get_major_formatter().set_scientific(False)

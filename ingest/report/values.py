@@ -1,0 +1,336 @@
+"""What an ingest did: one value, and its JSON for programs; `ingest.report.page` writes it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.plain_json import plain
+from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
+from ingest.register.control.model import ControlledPlacement
+from ingest.report.films import FilmOutcome, films_json
+
+FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
+MapOutcomeStatus = Literal["committed", "already_there", "unplaced", "refused"]
+SCHEMA_ID = "featuredb/ingest/report/1"
+
+# EXIF rounds to whole millimetres of 35 mm equivalent (2.5 % at 20 mm) and makers count the frame differently
+# (4 %); beyond their sum something else is at work.
+FOCAL_CHANGE_TO_WARN = 0.08
+
+_TRACK_BINS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 50)
+_PERCENTILES = (50, 90, 99)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StageTiming:
+    """How long a stage took.
+
+    Attributes:
+        name: scan, extract, match ...
+        seconds: wall time.
+        reused: results taken over from an earlier run, of `total`.
+    """
+
+    name: str
+    seconds: float
+    reused: int = 0
+    total: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoOutcome:
+    """One file of the folder and what happened to it.
+
+    Attributes:
+        name: path within the folder.
+        status: registered (part of a map), unplaced (part of a map without a place), not_registered (usable,
+            but in no map), skipped (not usable).
+        reason_code, reason: why it is in no map; "" where it is.
+        width, height: pixels as stored, 0 where unknown.
+        camera_key: its camera, "" where unknown.
+        capture_time: or None.
+        has_gps: whether it says where it was taken.
+        features: found in it, or None where it did not come so far.
+        matches: verified with other photos.
+        observations: of map points.
+        map_id: its map, "" for none.
+        reprojection_px: mean reprojection error of its observations.
+        gps_residual_m: GPS position minus its place in the map along UTM's axes (east, north, up),
+            metres; up is NaN without a height.
+        gps_used: whether its GPS helped to place the map (False: it was an outlier).
+        warnings: what was wrong in its metadata.
+    """
+
+    name: str
+    status: FileStatus
+    reason_code: str = ""
+    reason: str = ""
+    width: int = 0
+    height: int = 0
+    camera_key: str = ""
+    capture_time: datetime | None = None
+    has_gps: bool = False
+    features: int | None = None
+    matches: int | None = None
+    observations: int | None = None
+    map_id: str = ""
+    reprojection_px: float | None = None
+    gps_residual_m: tuple[float, float, float] | None = None
+    gps_used: bool | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraOutcome:
+    """One set of intrinsics.
+
+    Attributes:
+        name: its EXIF key, or the photo's name.
+        photos: how many photos share it.
+        focal_before_px: from EXIF, None where that says nothing.
+        focal_after_px: as refined with the map.
+    """
+
+    name: str
+    model: str
+    width: int
+    height: int
+    photos: int
+    focal_before_px: float | None
+    focal_after_px: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlanView:
+    """What the picture of a map shows, all in UTM metres of one zone.
+
+    Attributes:
+        points: (n, 3) easting, northing, height.
+        cameras: (k, 3) camera centres.
+        gps: (k, 3) their GPS positions, NaN where there is none.
+        names: k names.
+        gps_used: (k,) bool.
+        convergence_deg: angle from true north to grid north, clockwise.
+        epsg: of the zone.
+    """
+
+    points: FloatArray
+    cameras: FloatArray
+    gps: FloatArray
+    names: tuple[str, ...]
+    gps_used: NDArray[np.bool_]
+    convergence_deg: float
+    epsg: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapOutcome:
+    """One connected component of the photos.
+
+    Attributes:
+        map_id: "" where it was refused.
+        status: committed, already_there (an earlier run committed it), unplaced (kept without a place),
+            refused.
+        reason_code, reason: why it was refused or has no place.
+        gates: figures of every gate, JSON-able.
+        scale: metres per unit of the reconstruction.
+        residual_rms_m: of the GPS positions that were used.
+        radius_m: horizontal, in which the true place of its cameras lies with 95 %, by the covariance.
+        picture_shear: `ingest.colmap.picture_shear.PictureShear.size`; 0 where it was not measured.
+        descriptors: observations with descriptors.
+        errors_px: (n,) mean reprojection error of each point; track_lengths: (n,) photos that see it.
+        plan: None where the map has no place.
+        control: the placement by control points, where there are some.
+    """
+
+    map_id: str
+    name: str
+    status: MapOutcomeStatus
+    reason_code: str = ""
+    reason: str = ""
+    photos: int = 0
+    points: int = 0
+    observations: int = 0
+    descriptors: int = 0
+    epsg: int | None = None
+    height_datum: str = ""
+    scale: float | None = None
+    residual_rms_m: float | None = None
+    radius_m: float | None = None
+    picture_shear: float = 0.0
+    gates: Mapping[str, Any] = field(default_factory=dict)
+    cameras: tuple[CameraOutcome, ...] = ()
+    errors_px: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    track_lengths: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    plan: PlanView | None = None
+    control: ControlledPlacement | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know before relying on the map."""
+        focal = [
+            f"The focal length of {c.name} became {c.focal_after_px:.0f} px, "
+            f"EXIF says {c.focal_before_px:.0f}. "
+            "Photos that all look the same way from one height cannot tell focal length from height, so "
+            "heights above the ground may be wrong by the same share; add photos from other heights or "
+            "directions, or keep the focal length fixed."
+            for c in self.cameras
+            if c.focal_before_px and abs(c.focal_after_px / c.focal_before_px - 1) > FOCAL_CHANGE_TO_WARN
+        ]
+        sheared = [
+            f"Map {self.map_id}: {shear_words(self.picture_shear)}. That counts in the uncertainty of its "
+            "poses, but its shape may bend; move more slowly, or use a mechanical shutter."
+        ]
+        return tuple(focal + sheared * (UNUSUAL < self.picture_shear <= IMPOSSIBLE))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IngestReport:
+    """All of an ingest.
+
+    Attributes:
+        job_id: digest of photos and options.
+        database: address of the database, folder: of the photos.
+        started: timezone-aware.
+        options: of every stage, JSON-able; versions: of this program and the libraries.
+        pairs: tried, verified_pairs: with enough verified matches.
+        stages: in order.
+        photos: every file of the folder, sorted by name.
+        maps: largest first.
+        films: whose keyframes the photos are.
+        warnings: about the ingest as a whole.
+    """
+
+    job_id: str
+    database: str
+    folder: str
+    started: datetime
+    options: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+    pairs: int = 0
+    verified_pairs: int = 0
+    stages: tuple[StageTiming, ...] = ()
+    photos: tuple[PhotoOutcome, ...] = ()
+    maps: tuple[MapOutcome, ...] = ()
+    films: tuple[FilmOutcome, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.started.tzinfo is None:
+            raise InvalidValueError("IngestReport.started: expected a time with its zone, found none")
+        names = [photo.name for photo in self.photos]
+        if len(set(names)) != len(names):
+            raise InvalidValueError("IngestReport.photos: a file occurs twice")
+
+    def count(self, status: FileStatus) -> int:
+        """Number of files with that status."""
+        return sum(photo.status == status for photo in self.photos)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time of all stages."""
+        return sum(stage.seconds for stage in self.stages)
+
+
+def report_json(report: IngestReport) -> dict[str, Any]:
+    """The report as JSON of `schemas/ingest/report.json`; NaN and infinity become null."""
+    document: dict[str, Any] = plain(
+        {
+            "schema": SCHEMA_ID,
+            "job_id": report.job_id,
+            "database": report.database,
+            "folder": report.folder,
+            "started": report.started.isoformat(),
+            "seconds": report.seconds,
+            "options": report.options,
+            "versions": report.versions,
+            "warnings": report.warnings,
+            "pairs": {"tried": report.pairs, "verified": report.verified_pairs},
+            "files": {
+                "all": len(report.photos),
+                "registered": report.count("registered"),
+                "unplaced": report.count("unplaced"),
+                "not_registered": report.count("not_registered"),
+                "skipped": report.count("skipped"),
+            },
+            "stages": [
+                {"name": s.name, "seconds": s.seconds, "reused": s.reused, "total": s.total}
+                for s in report.stages
+            ],
+            "maps": [_map_json(outcome) for outcome in report.maps],
+            "films": films_json(report.films),
+            "photos": [_photo_json(photo) for photo in report.photos],
+        }
+    )
+    return document
+
+
+def _photo_json(photo: PhotoOutcome) -> dict[str, Any]:
+    return {
+        "name": photo.name,
+        "status": photo.status,
+        "reason_code": photo.reason_code,
+        "reason": photo.reason,
+        "width": photo.width,
+        "height": photo.height,
+        "camera_key": photo.camera_key,
+        "capture_time": photo.capture_time.isoformat() if photo.capture_time else None,
+        "has_gps": photo.has_gps,
+        "features": photo.features,
+        "matches": photo.matches,
+        "observations": photo.observations,
+        "map_id": photo.map_id,
+        "reprojection_px": photo.reprojection_px,
+        "gps_residual_m": photo.gps_residual_m,
+        "gps_used": photo.gps_used,
+        "warnings": photo.warnings,
+    }
+
+
+def _map_json(outcome: MapOutcome) -> dict[str, Any]:
+    errors, tracks = outcome.errors_px, outcome.track_lengths
+    edges = [*_TRACK_BINS, 1 << 30]
+    counts: list[int] = np.histogram(tracks, bins=edges)[0].tolist() if len(tracks) else []
+    return {
+        "map_id": outcome.map_id,
+        "name": outcome.name,
+        "status": outcome.status,
+        "reason_code": outcome.reason_code,
+        "reason": outcome.reason,
+        "photos": outcome.photos,
+        "points": outcome.points,
+        "observations": outcome.observations,
+        "descriptors": outcome.descriptors,
+        "epsg": outcome.epsg,
+        "height_datum": outcome.height_datum,
+        "scale": outcome.scale,
+        "residual_rms_m": outcome.residual_rms_m,
+        "radius_m": outcome.radius_m,
+        "picture_shear": outcome.picture_shear,
+        "warnings": outcome.warnings,
+        "gates": outcome.gates,
+        "cameras": [
+            {
+                "name": c.name,
+                "model": c.model,
+                "width": c.width,
+                "height": c.height,
+                "photos": c.photos,
+                "focal_before_px": c.focal_before_px,
+                "focal_after_px": c.focal_after_px,
+            }
+            for c in outcome.cameras
+        ],
+        "reprojection_px": _percentiles(errors),
+        "track_lengths": [{"from": low, "points": n} for low, n in zip(_TRACK_BINS, counts, strict=False)],
+    }
+
+
+def _percentiles(errors: NDArray[np.float32]) -> dict[str, float]:
+    return {f"p{p}": float(np.percentile(errors, p)) for p in _PERCENTILES} if len(errors) else {}

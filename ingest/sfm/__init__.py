@@ -1,0 +1,1 @@
+"""Structure from motion by stages: features, pairs, matches, models, and what joins them."""

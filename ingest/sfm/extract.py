@@ -1,0 +1,160 @@
+"""Stage: the features of each photo, on a pool of processes, one file each."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import overload
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import ImageError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
+from ingest.executor import Executor, Lost, Progress, no_progress
+from ingest.fingerprint import options_fingerprint
+from ingest.photos.photo import Photo
+from ingest.workspace import Workspace, read_array, read_arrays, write_arrays
+
+_COLOUR_SHRINK = 4  # colours of points need no full resolution; JPEG decodes a quarter size much faster
+_ARRAYS = ("xy", "scale", "angle", "response", "descriptors")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExtractTask:
+    """One photo to extract; travels to a worker.
+
+    Attributes:
+        photo: the photo's file.
+        target: the npz file to write.
+    """
+
+    photo: Path
+    target: Path
+    options: ExtractorOptions
+
+    def __str__(self) -> str:
+        return self.photo.name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoFeatures:
+    """Features of a photo with the colour under each keypoint, (n, 3) uint8 RGB."""
+
+    features: Features
+    rgb: NDArray[np.uint8]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Extracted:
+    """What the stage did.
+
+    Attributes:
+        unreadable: photos by name whose pixels could not be read after all, with the reason.
+        reused: photos whose features were there already.
+    """
+
+    unreadable: dict[str, str]
+    reused: int
+
+
+def extract_photos(
+    photos: list[Photo],
+    workspace: Workspace,
+    options: ExtractorOptions,
+    executor: Executor,
+    progress: Progress = no_progress,
+) -> Extracted:
+    """Write the features of every photo that has none yet."""
+    fingerprint = features_key(options)
+    tasks: dict[str, ExtractTask] = {}
+    for photo in photos:
+        target = workspace.features(fingerprint, photo.sha256)
+        if not target.exists():
+            tasks[photo.name] = ExtractTask(photo=photo.path, target=target, options=options)
+    outcomes = executor.map("extract", _extract_one, list(tasks.values()), progress)
+    reasons = (o.reason if isinstance(o, Lost) else o for o in outcomes)
+    return Extracted(
+        unreadable={name: reason for name, reason in zip(tasks, reasons, strict=True) if reason},
+        reused=len(photos) - len(tasks),
+    )
+
+
+def features_key(options: ExtractorOptions) -> str:
+    """Names the folder of features made with these options by this version of the extractor."""
+    return f"{options.fingerprint}-{options_fingerprint(options)}"
+
+
+def read_features(path: Path) -> PhotoFeatures:
+    """Features and colours of one npz file of this stage."""
+    arrays = read_arrays(path)
+    width, height = (int(v) for v in arrays["size"])
+    features = Features(
+        **{name: arrays[name] for name in _ARRAYS},
+        width=width,
+        height=height,
+        fingerprint=str(arrays["fingerprint"]),
+    )
+    return PhotoFeatures(features=features, rgb=arrays["rgb"])
+
+
+def read_keypoints(path: Path) -> NDArray[np.float32]:
+    """Keypoints (n, 2) in pixels of one npz file of this stage; nothing else is read."""
+    return np.asarray(read_array(path, "xy"), dtype=np.float32)
+
+
+class FeatureFiles(Sequence[PhotoFeatures]):
+    """Features of many photos, each read from its file when it is asked for, and not kept."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+
+    @overload
+    def __getitem__(self, index: int) -> PhotoFeatures: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> "FeatureFiles": ...
+
+    def __getitem__(self, index: int | slice) -> "PhotoFeatures | FeatureFiles":
+        if isinstance(index, slice):
+            return FeatureFiles(self.paths[index])
+        return read_features(self.paths[index])
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def of(self, rows: Sequence[int] | NDArray[np.int64]) -> "FeatureFiles":
+        """Those of some photos."""
+        return FeatureFiles([self.paths[int(row)] for row in rows])
+
+
+def _extract_one(task: ExtractTask) -> str:
+    """Extract one photo; the reason for people if its pixels cannot be used, else ""."""
+    try:
+        data = task.photo.read_bytes()
+        features = extract(decode_gray(data, INGEST_LIMITS), task.options)
+    except (ImageError, OSError) as error:
+        return str(error)
+    write_arrays(
+        task.target,
+        {name: getattr(features, name) for name in _ARRAYS}
+        | {
+            "size": np.array([features.width, features.height]),
+            "fingerprint": np.array(features.fingerprint),
+            "rgb": _colours(data, features),
+        },
+    )
+    return ""
+
+
+def _colours(data: bytes, features: Features) -> NDArray[np.uint8]:
+    """RGB (n, 3) under the keypoints, from the photo at a quarter of its size."""
+    flags = cv2.IMREAD_REDUCED_COLOR_4 | cv2.IMREAD_IGNORE_ORIENTATION
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if bgr is None:
+        return np.full((len(features), 3), 128, np.uint8)  # colour is for display only
+    columns = np.clip((features.xy[:, 0] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[1] - 1)
+    rows = np.clip((features.xy[:, 1] / _COLOUR_SHRINK).astype(int), 0, bgr.shape[0] - 1)
+    return np.asarray(bgr[rows, columns, ::-1], dtype=np.uint8)

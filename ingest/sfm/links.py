@@ -1,0 +1,76 @@
+"""How firmly the photos of a reconstruction hang together.
+
+Look-alike buildings join reconstructions at the wrong place: a few dozen points of one facade tie photos that
+share thousands among themselves. Nothing in the residuals shows it, and covariances take the tie for true.
+"""
+
+import heapq
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+
+from featuredb.geometry.arrays import FloatArray
+from ingest.colmap.bridge import Model
+
+
+def points_in_common(model: Model) -> sparse.csr_array:
+    """(k, k): how many points both photos see; on the diagonal those of one."""
+    seen: NDArray[np.float64] = np.ones(len(model.point_of))
+    sees = sparse.csr_array(
+        (seen, (model.photo_of, model.point_of)), shape=(len(model.rows), max(len(model.xyz), 1))
+    )
+    return sparse.csr_array(sees @ sees.T)
+
+
+def link_shares(model: Model) -> FloatArray:
+    """(k, k): the share of the points of the photo that sees fewer which both see; 0 on the diagonal."""
+    common = points_in_common(model).toarray()
+    counts = np.maximum(np.diag(common), 1.0)
+    shares = common / np.minimum.outer(counts, counts)
+    np.fill_diagonal(shares, 0.0)
+    return np.asarray(shares)
+
+
+def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> FloatArray:
+    """(k,) of every photo: the weakest link of its firmest chain of photos to one that is held.
+
+    Args:
+        held: photos of the model, by place among its rows, that need no link; they have infinity.
+        without: photos that no chain goes through.
+
+    Returns:
+        0 for photos without a chain.
+    """
+    shares = link_shares(model)
+    shares[:, list(without)] = 0.0
+    firm = np.zeros(len(model.rows))
+    firm[list(held)] = np.inf
+    queue = [(-np.inf, k) for k in held]
+    while queue:
+        width, photo = heapq.heappop(queue)
+        if -width < firm[photo]:
+            continue
+        reach = np.minimum(-width, shares[photo])
+        for other in np.flatnonzero(reach > firm).tolist():
+            firm[other] = reach[other]
+            heapq.heappush(queue, (-float(reach[other]), other))
+    return firm
+
+
+def firm_parts(model: Model, least_share: float) -> list[list[int]]:
+    """Rows of the photos that hang together by links of at least `least_share`, largest part first."""
+    return _parts(model, sparse.csr_array(link_shares(model) >= least_share))
+
+
+def tied_parts(model: Model, least_points: int) -> list[list[int]]:
+    """Rows of the photos that hang together by pairs with so many points in common, largest part first."""
+    return _parts(model, points_in_common(model) >= least_points)
+
+
+def _parts(model: Model, tied: sparse.csr_array) -> list[list[int]]:
+    count, label = connected_components(tied.astype(np.int8), directed=False)
+    parts = [model.rows[label == part].tolist() for part in range(count)]
+    return sorted(parts, key=lambda rows: (-len(rows), rows))
