@@ -50,8 +50,8 @@ def _gates() -> Row:
             ("tools.growth_gates", *(f"{{work}}/{k}.jsonl" for k in range(len(_GATED))), *OUT),
         ),
         figures=same("judged", "alone_right", "alone_wrong", "refine_right", "refine_wrong"),
-        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates that "
-        "alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
+        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates "
+        "that alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
         limits=(Limit(figure="refine_wrong", most=0),),
         needs=tuple(photos for photos, _ in _GATED),
         minutes=8,
