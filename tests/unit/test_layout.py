@@ -29,9 +29,6 @@ FULL_FOLDERS = {
     "featuredb/video/telemetry",
     "ingest/register/anchor",
     "ingest/register/frame",
-    "reloc",
-    "reloc/service",
-    "reloc/tracking",
 }
 
 
