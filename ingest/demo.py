@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from featuredb.simworld.world import World
     from ingest.report.values import IngestReport
     from reloc.client import Client
-    from reloc.wire import LocaliseReply
+    from reloc.wire.query import LocaliseReply
 
 Say = Callable[[str], None]
 # What the simulated drone's tags are good for: exact ones are rounded by EXIF to about a millimetre, and a

@@ -13,7 +13,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapPoints, Placement
 from featuredb.maps.unplaced_map import UnplacedMap
-from reloc.result import LocalisedPose, LocaliseResult, PoseInMap
+from reloc.localise.result import LocalisedPose, LocaliseResult, PoseInMap
 
 _EPSG = 32631
 _STAND_IN = LocalFrame(latitude_deg=0.0, longitude_deg=3.0, height_m=0.0)

@@ -20,11 +20,11 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import MapLineage
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database, MapSummary, Snapshot
-from reloc.candidates import IndexedArea
 from reloc.in_map import at_stand_in, in_own_frame
-from reloc.localise import localise
-from reloc.options import LocaliseOptions
-from reloc.result import LocaliseRequest, LocaliseResult
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.localise import localise
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest, LocaliseResult
 
 _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.

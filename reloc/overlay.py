@@ -19,9 +19,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.candidates import IndexedArea
-from reloc.matching import visible_points
-from reloc.wire import LocaliseReply
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.matching import visible_points
+from reloc.wire.query import LocaliseReply
 
 _INLIER_BGR = (60, 220, 60)
 _RESIDUAL_BGR = (40, 40, 240)

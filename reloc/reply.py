@@ -8,8 +8,8 @@ from featuredb.geo.geopose import BODY_AXES, GeoPose
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import quaternion_from_matrix
-from reloc.result import Inliers, LocalisedPose, LocaliseResult, PoseInMap
-from reloc.wire import (
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseResult, PoseInMap
+from reloc.wire.query import (
     Accuracy,
     CameraUsed,
     InlierPoints,
@@ -72,7 +72,7 @@ _NO_POSE: dict[str, Any] = {
 
 
 class OnEarth(Protocol):
-    """What every pose on Earth has; conventions as in `reloc.result.LocalisedPose`."""
+    """What every pose on Earth has; conventions as in `reloc.localise.result.LocalisedPose`."""
 
     @property
     def epsg(self) -> int: ...

@@ -1,7 +1,7 @@
 """One lens of many photos, estimated with all their poses: a photo alone hardly tells it from its height.
 
-One adjustment (`featuredb.adjust`) over the pixels of all photos, with the prior of `reloc.lens_prior`. The
-map's points are held fixed.
+One adjustment (`featuredb.adjust`) over the pixels of all photos, with the prior of
+`reloc.localise.lens_prior`. The map's points are held fixed.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
-from reloc.lens_prior import LensPriors, QueryLensPrior, opencv_by_lens, with_lens
-from reloc.options import PoseOptions
-from reloc.self_calibration import LensProblem, calibrate, measured_noise_px
-from reloc.wire import CameraRequest, LocaliseReply
+from reloc.localise.lens_prior import LensPriors, QueryLensPrior, opencv_by_lens, with_lens
+from reloc.localise.options import PoseOptions
+from reloc.localise.self_calibration import LensProblem, calibrate, measured_noise_px
+from reloc.wire.query import CameraRequest, LocaliseReply
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

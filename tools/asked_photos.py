@@ -15,7 +15,7 @@ from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.shared_lens import lenses_of_cameras, views_of
-from reloc.wire import CameraRequest, LocaliseReply
+from reloc.wire.query import CameraRequest, LocaliseReply
 
 Lens = Literal["exif", "known", "shared"]
 

@@ -26,7 +26,7 @@ from typing import Any
 from featuredb.simworld.airborne import scan_town
 from featuredb.simworld.scan_file import write_scan
 from featuredb.simworld.scan_options import AirborneScanOptions
-from reloc.tracking.trajectory_read import read_trajectory_csv
+from reloc.tracking.trajectory.read import read_trajectory_csv
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
 from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth

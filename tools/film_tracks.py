@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from reloc.tracking.trajectory import Trajectory
+from reloc.tracking.trajectory.values import Trajectory
 from tools.film_folder import FrameTruth
 from tools.track_evaluation import axis_errors
 

@@ -41,7 +41,7 @@ from ingest.growing import GrowingOptions, grow_candidates
 from ingest.growth.trust.promotion import promote_by_hand
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
-from reloc.wire import LocaliseWireRequest
+from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
     Album,
     Verdict,

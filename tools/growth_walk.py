@@ -37,7 +37,7 @@ from featuredb.store import Database
 from ingest.growing import GrowingOptions, grow_candidates
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
-from reloc.wire import LocaliseWireRequest
+from reloc.wire.query import LocaliseWireRequest
 from tools.growth_common import (
     WRONG_M,
     Album,

@@ -27,9 +27,9 @@ from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from reloc.answer import placement_covariance, radius_68
-from reloc.lens_prior import lens_of, seen_by_a_map
-from reloc.wire import CameraRequest
+from reloc.localise.answer import placement_covariance, radius_68
+from reloc.localise.lens_prior import lens_of, seen_by_a_map
+from reloc.wire.query import CameraRequest
 from tools.figures import add_json_option, write_figures
 from tools.laser_baseline import colmap_given_the_lens
 from tools.laser_set import FRAME, LaserSet, read_laser_set, with_exif

@@ -47,10 +47,10 @@ from ingest.placed_models import placed_by_gps
 from ingest.register.gps import GpsOptions
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.mapper import SfmOptions, mapping_settings
-from reloc.candidates import IndexedArea
-from reloc.localise import localise_features
-from reloc.options import LocaliseOptions
-from reloc.result import LocaliseRequest
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.localise import localise_features
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest
 from tools.calibration import pose_offset
 from tools.figures import add_json_option, write_figures
 

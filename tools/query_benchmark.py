@@ -41,14 +41,14 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.search import camera_hypotheses
 from reloc.localiser import Localiser
-from reloc.options import LocaliseOptions
-from reloc.search import camera_hypotheses
 from reloc.service.handler import answer_query, localise_request
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.service.threads import capped_process
-from reloc.wire import LocaliseWireRequest, RequestOptions
+from reloc.wire.query import LocaliseWireRequest, RequestOptions
 from tools.figures import add_json_option, write_figures
 
 MAX_QUERY_MS, MAX_TRANSPORT_MS = 250.0, 10.0

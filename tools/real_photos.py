@@ -29,11 +29,11 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
-from reloc.answer import radius_68
 from reloc.client import Client, LocaliseReply
+from reloc.localise.answer import radius_68
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from reloc.wire import CameraRequest
+from reloc.wire.query import CameraRequest
 from tools.figures import add_json_option, write_figures
 
 _ROOT = Path(__file__).resolve().parent.parent

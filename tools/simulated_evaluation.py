@@ -42,10 +42,10 @@ from featuredb.simworld.scoring import PoseError, pose_error, summarise
 from featuredb.simworld.world import World, open_world
 from featuredb.store import Database
 from ingest.demo import ingest_world, make_world
+from reloc.localise.result import LocaliseResult
 from reloc.localiser import Localiser
-from reloc.result import LocaliseResult
 from reloc.service.handler import localise_request
-from reloc.wire import LocaliseWireRequest
+from reloc.wire.query import LocaliseWireRequest
 from tools.calibration import RECEIVERS, Calibration, Coverage, as_reported, over_placements
 from tools.figures import add_json_option, write_figures
 

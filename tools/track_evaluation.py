@@ -47,8 +47,8 @@ from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.track_video import TrackedVideo, track_video
-from reloc.tracking.trajectory import Trajectory
-from reloc.tracking.trajectory_plot import plot_png
+from reloc.tracking.trajectory.plot import plot_png
+from reloc.tracking.trajectory.values import Trajectory
 from tools.anchor_simworld import anchored, featuredb
 from tools.growth_common import Verdict, conclude, say, table
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film

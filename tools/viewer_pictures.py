@@ -23,8 +23,8 @@ from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.tracking.track_video import track_video
-from reloc.tracking.trajectory_files import write_trajectory
-from reloc.tracking.trajectory_read import read_trajectory_csv
+from reloc.tracking.trajectory.files import write_trajectory
+from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.viewer.scene import build_scene
 from tools.viewer_page import open_page, settled
 from tools.worlds.film_world import FILM_FILE, FilmOptions, write_film

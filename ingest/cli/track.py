@@ -87,10 +87,15 @@ def run_track(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from featuredb.errors import InvalidValueError
     from ingest.track.finders import FilmGround, finder_for
-    from reloc.result import LocaliseRequest
+    from reloc.localise.result import LocaliseRequest
     from reloc.tracking.map_ground import MapFinder
-    from reloc.tracking.outputs import check_outputs, check_outputs_in_map, exit_code, write_outputs
     from reloc.tracking.track_video import TrackVideoOptions, track_video
+    from reloc.tracking.trajectory.outputs import (
+        check_outputs,
+        check_outputs_in_map,
+        exit_code,
+        write_outputs,
+    )
 
     check_outputs(args.out)
     options = TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end)
@@ -128,7 +133,7 @@ def run_track(args: argparse.Namespace) -> int:
 
 def _camera(text: str | None) -> "Camera | None":
     from featuredb.geometry.camera import Camera
-    from reloc.query_arguments import parse_camera
+    from reloc.cli.query_arguments import parse_camera
 
     asked = parse_camera(text)
     if asked is None:
@@ -138,7 +143,7 @@ def _camera(text: str | None) -> "Camera | None":
 
 def _prior(text: str | None) -> "GeoPrior | None":
     from featuredb.maps.feature_map import GeoPrior
-    from reloc.query_arguments import parse_prior
+    from reloc.cli.query_arguments import parse_prior
 
     asked = parse_prior(text)
     if asked is None:

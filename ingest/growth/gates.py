@@ -13,7 +13,8 @@ from scipy.stats import binom, chi2
 from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
 
-# Chi-square with two degrees of freedom is above this once in 10,000 honest positions (as in reloc.prior).
+# Chi-square with two degrees of freedom is above this once in 10,000 honest positions
+# (as in reloc.localise.prior).
 GPS_LIMIT = 18.42
 # Share of positions that are wrong by accident, with a margin over the tenth that communities have; as many
 # wrong ones as come about less often than that are no accident.

@@ -40,7 +40,7 @@ from ingest.growth.trust.witnesses import NewPhotos
 from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)

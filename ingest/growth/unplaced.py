@@ -36,7 +36,7 @@ from ingest.growth.values import GrownMap, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
 from ingest.sfm.extract import PhotoFeatures
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
 _LEAST_PHOTOS = 3  # of a map without a place, as of any reconstruction

@@ -17,7 +17,7 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.bridge import Model
 from ingest.growth.gates import Gate
 from ingest.sfm.extract import PhotoFeatures
-from reloc.result import LocaliseResult
+from reloc.localise.result import LocaliseResult
 
 FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""

@@ -11,7 +11,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.track.scan_ground import ScanFinder, ScanGround
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.tracking.ground import Ground, Keyframe, Standing, StandingInMap, Unmatched
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions

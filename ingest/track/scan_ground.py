@@ -27,7 +27,7 @@ from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import DepthFilterOptions, surface_at
 from ingest.track.keyframe_average import KeyframeAverage
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import of_camera

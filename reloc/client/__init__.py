@@ -3,8 +3,8 @@
 from reloc.client.client import Client, EventStream
 from reloc.client.live import LiveTrack
 from reloc.client.replies import BAD_REPLY, NO_SERVER, TIMEOUT
-from reloc.wire import CameraRequest, LocaliseReply, PriorRequest
-from reloc.wire_track import TrackPose
+from reloc.wire.query import CameraRequest, LocaliseReply, PriorRequest
+from reloc.wire.track import TrackPose
 
 __all__ = [
     "BAD_REPLY",

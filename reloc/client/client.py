@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from featuredb.errors import InvalidValueError, ServiceError
 from reloc.client.live import LiveTrack
 from reloc.client.replies import NO_SERVER, TIMEOUT, read_message, service_error
-from reloc.wire import (
+from reloc.wire.query import (
     CameraRequest,
     LocaliseReply,
     LocaliseWireRequest,
@@ -23,7 +23,7 @@ from reloc.wire import (
     RequestOptions,
     encode,
 )
-from reloc.wire_server import Event, MapsReply, StatusReply
+from reloc.wire.server import Event, MapsReply, StatusReply
 
 _Message = TypeVar("_Message", bound=BaseModel)
 
@@ -47,8 +47,8 @@ class Client:
             else:
                 print(reply.reason, reply.detail)
 
-    Methods raise ServiceError; its `code` is one of reloc.wire.ErrorCode, or NO_SERVER (nobody answers),
-    TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
+    Methods raise ServiceError; its `code` is one of reloc.wire.query.ErrorCode, or NO_SERVER (nobody
+    answers), TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
     """
 
     def __init__(

@@ -16,9 +16,9 @@ from reloc.client.client import Client
 from reloc.client.live import LiveTrack
 from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.pose_message import point_of_message
-from reloc.tracking.trajectory import Trajectory, TrajectoryPoint
-from reloc.wire import CameraRequest, PriorRequest
-from reloc.wire_track import TrackPose
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint
+from reloc.wire.query import CameraRequest, PriorRequest
+from reloc.wire.track import TrackPose
 
 OnPose = Callable[[TrackPose, float | None], None]
 

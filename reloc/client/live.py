@@ -15,8 +15,8 @@ from zenoh.handlers import Callback
 
 from featuredb.errors import ServiceError
 from reloc.client.replies import BAD_REPLY, NO_SERVER, TIMEOUT, read_message, service_error
-from reloc.wire import CameraRequest, PriorRequest, encode
-from reloc.wire_track import TrackEvent, TrackFrame, TrackOpened, TrackOpenRequest, TrackPose
+from reloc.wire.query import CameraRequest, PriorRequest, encode
+from reloc.wire.track import TrackEvent, TrackFrame, TrackOpened, TrackOpenRequest, TrackPose
 
 _KEPT = 10_000  # poses that nobody has read, and frames whose times are remembered; the oldest go
 _KEPT_REFUSALS = 100
@@ -146,7 +146,7 @@ class LiveTrack:
         """The next pose; None when none came within the time.
 
         Raises:
-            ServiceError: no more will come: the session has ended (`code` is a reloc.wire_track.EndReason, or
+            ServiceError: no more will come: the session has ended (`code` is a reloc.wire.track.EndReason, or
                 CLOSED), or NO_SERVER: the server is gone.
         """
         end = None if timeout_s is None else time.monotonic() + timeout_s

@@ -5,7 +5,7 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from featuredb.errors import ServiceError
-from reloc.wire import ErrorReply
+from reloc.wire.query import ErrorReply
 
 _Message = TypeVar("_Message", bound=BaseModel)
 

@@ -37,8 +37,8 @@ from reloc.gateway.options import GatewayOptions
 from reloc.gateway.protocol import MEDIA_TYPE as GEOPOSE_TYPE
 from reloc.gateway.protocol import VERSION as GEOPOSE_VERSION
 from reloc.gateway.protocol import GeoPoseResp
-from reloc.wire import ErrorCode, LocaliseReply
-from reloc.wire_server import MapsReply, StatusReply
+from reloc.wire.query import ErrorCode, LocaliseReply
+from reloc.wire.server import MapsReply, StatusReply
 
 logger = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from pydantic import BaseModel, Field
 
 from featuredb.errors import ServiceError
 from reloc.client import BAD_REPLY, NO_SERVER, TIMEOUT
-from reloc.wire import ErrorCode
+from reloc.wire.query import ErrorCode
 
 NOT_LOCALISED = "NOT_LOCALISED"
 NOT_FOUND = "NOT_FOUND"

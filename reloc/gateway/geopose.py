@@ -30,7 +30,7 @@ from reloc.gateway.protocol import (
     GeoPoseReq,
     GeoPoseResp,
 )
-from reloc.wire import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
+from reloc.wire.query import CameraRequest, ErrorCode, LocaliseReply, LocaliseWireRequest, PriorRequest
 
 # The W3C's accuracy holds 95 % of the errors; so many sigmas of one axis does a circle that holds them have.
 _SIGMAS_OF_95 = math.sqrt(-2.0 * math.log(0.05))

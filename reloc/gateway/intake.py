@@ -10,7 +10,7 @@ from starlette.types import Message, Receive
 
 from reloc.gateway.failures import SLOW_BODY, UNSUPPORTED_MEDIA_TYPE, GatewayError
 from reloc.gateway.options import GatewayOptions
-from reloc.wire import ErrorCode
+from reloc.wire.query import ErrorCode
 
 
 class Intake:

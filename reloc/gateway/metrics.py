@@ -5,7 +5,7 @@ from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterable
 
-from reloc.wire_server import StatusReply
+from reloc.wire.server import StatusReply
 
 MEDIA_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 

@@ -9,7 +9,7 @@ from starlette.requests import Request
 
 from reloc.gateway.failures import GatewayError
 from reloc.gateway.options import GatewayOptions
-from reloc.wire import (
+from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
     CameraRequest,
     ErrorCode,

@@ -8,8 +8,8 @@ from pydantic import BaseModel
 
 from reloc.gateway.failures import ErrorBody
 from reloc.gateway.protocol import MEDIA_TYPE, GeoPoseReq, GeoPoseResp
-from reloc.wire import CameraRequest, LocaliseReply, PriorRequest, RequestOptions
-from reloc.wire_server import MapsReply
+from reloc.wire.query import CameraRequest, LocaliseReply, PriorRequest, RequestOptions
+from reloc.wire.server import MapsReply
 
 DESCRIPTION = (
     "Where was this photo taken? A thin adapter over a featuredb server, which is asked over Zenoh: OSCP "

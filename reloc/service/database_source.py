@@ -4,10 +4,10 @@ import numpy as np
 
 from featuredb.geo.utm import geodetic_from_utm
 from featuredb.store import Database, MapSummary
+from reloc.localise.options import LocaliseOptions
 from reloc.localiser import Localiser
-from reloc.options import LocaliseOptions
 from reloc.service.source import ServedArea
-from reloc.wire_server import BoundingBox, MapInfo
+from reloc.wire.server import BoundingBox, MapInfo
 
 
 class DatabaseSource:

@@ -19,11 +19,11 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.stage_clock import StageClock
-from reloc.lens_prior import QueryLensPrior, known_within
+from reloc.localise.lens_prior import QueryLensPrior, known_within
+from reloc.localise.result import LocaliseRequest
 from reloc.reply import reply_from_result
-from reloc.result import LocaliseRequest
 from reloc.service.source import LocaliserLike
-from reloc.wire import (
+from reloc.wire.query import (
     CameraRequest,
     ErrorCode,
     LocaliseReply,

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reloc.wire_server import Latency, QueryCounts
+from reloc.wire.server import Latency, QueryCounts
 
 _LATENCY_WINDOW = 1000  # latest queries; enough for a 99th percentile, forgets a slow start
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
-from reloc.service.inbox import InboxOptions
+from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only

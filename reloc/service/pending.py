@@ -8,7 +8,7 @@ import uuid
 import zenoh
 
 from reloc.service.metrics import ServerMetrics
-from reloc.wire import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
+from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError, encode
 
 logger = logging.getLogger(__name__)
 

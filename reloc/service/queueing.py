@@ -7,7 +7,7 @@ import time
 from collections import deque
 
 from reloc.service.pending import PendingQuery
-from reloc.wire import ErrorCode, RequestError
+from reloc.wire.query import ErrorCode, RequestError
 
 
 class QueryQueue:

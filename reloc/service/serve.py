@@ -5,10 +5,10 @@ import threading
 from collections.abc import Callable
 
 from featuredb.store import Database
-from reloc.options import LocaliseOptions
-from reloc.service.database_inbox import DatabaseInbox
+from reloc.localise.options import LocaliseOptions
+from reloc.service.contributions.database_inbox import DatabaseInbox
+from reloc.service.contributions.inbox import Inbox
 from reloc.service.database_source import DatabaseSource
-from reloc.service.inbox import Inbox
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
 

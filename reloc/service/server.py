@@ -10,7 +10,7 @@ from typing import Self
 
 import zenoh
 
-from reloc.service.inbox import Inbox
+from reloc.service.contributions.inbox import Inbox
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions
@@ -20,8 +20,8 @@ from reloc.service.session import Keys, ServiceStartError, bind_free_port, open_
 from reloc.service.source import AreaSource, ServedArea
 from reloc.service.watcher import AreaWatcher
 from reloc.service.worker import WorkerPool
-from reloc.wire import WIRE_VERSION, ErrorCode, RequestError, encode
-from reloc.wire_server import (
+from reloc.wire.query import WIRE_VERSION, ErrorCode, RequestError, encode
+from reloc.wire.server import (
     Event,
     EventType,
     Limits,

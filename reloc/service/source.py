@@ -6,10 +6,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from reloc.candidates import IndexedArea
-from reloc.options import LocaliseOptions
-from reloc.result import LocaliseRequest, LocaliseResult
-from reloc.wire_server import MapInfo
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest, LocaliseResult
+from reloc.wire.server import MapInfo
 
 
 class LocaliserLike(Protocol):

@@ -10,15 +10,15 @@ from datetime import UTC, datetime
 
 from featuredb.stage_clock import StageClock
 from featuredb.store.candidate_states import candidate_id_of
-from reloc.service.database_inbox import contribution_of
+from reloc.service.contributions.database_inbox import contribution_of
+from reloc.service.contributions.inbox import Inbox, InboxRefusal
 from reloc.service.handler import answer_query
-from reloc.service.inbox import Inbox, InboxRefusal
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.source import ServedArea
 from reloc.service.threads import capped_process, capped_thread
-from reloc.wire import (
+from reloc.wire.query import (
     ContributionReply,
     ErrorCode,
     LocaliseReply,

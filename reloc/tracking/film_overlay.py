@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reloc.tracking.tracker import TrackedFrame
-from reloc.tracking.trajectory import TrajectoryPoint
+from reloc.tracking.trajectory.values import TrajectoryPoint
 
 _LANDMARK_RGB, _OTHER_RGB = (60, 220, 60), (40, 160, 240)
 _STATE_RGB = {"tracking": (60, 220, 60), "relocalised": (250, 210, 40), "lost": (240, 40, 40)}

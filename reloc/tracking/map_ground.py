@@ -14,13 +14,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area
 from featuredb.maps.unplaced_map import OwnFrame
-from reloc.answer import on_earth
-from reloc.candidates import IndexedArea
-from reloc.localise import localise_features
-from reloc.matching import guided_matches, visible_points
-from reloc.pose import PoseHypothesis, refine_pose
-from reloc.result import LocaliseRequest
-from reloc.search import pairs
+from reloc.localise.answer import on_earth
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.localise import localise_features
+from reloc.localise.matching import guided_matches, visible_points
+from reloc.localise.pose import PoseHypothesis, refine_pose
+from reloc.localise.result import LocaliseRequest
+from reloc.localise.search import pairs
 from reloc.tracking.ground import Ground, Keyframe, Standing, StandingInMap, Unmatched
 from reloc.tracking.options import TrackOptions
 

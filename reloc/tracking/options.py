@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
-from reloc.lens_prior import LensPriors
-from reloc.options import LocaliseOptions
+from reloc.localise.lens_prior import LensPriors
+from reloc.localise.options import LocaliseOptions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -26,8 +26,8 @@ class FittedPose:
         residual_px: (n, 2) of all.
         focal_px, focal_rel: focal length, and the standard deviation of its logarithm; 0 where it was given.
         covariance: (6, 6) of the camera's rotation about the local axes (rad) before the displacement of its
-            centre (m), as in `reloc.result`; of independent pixels, scaled by their residuals, and of what
-            they leave open of the focal length.
+            centre (m), as in `reloc.localise.result`; of independent pixels, scaled by their residuals, and
+            of what they leave open of the focal length.
     """
 
     cam_from_local: Rigid3

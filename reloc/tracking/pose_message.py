@@ -6,11 +6,11 @@ import numpy as np
 
 from featuredb.geo.geopose import BODY_AXES, GeoPose
 from featuredb.geometry.camera import Camera
-from reloc.answer import radius_68
+from reloc.localise.answer import radius_68
 from reloc.reply import place_fields
-from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
-from reloc.wire import Accuracy
-from reloc.wire_track import Intrinsics, TrackPose
+from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
+from reloc.wire.query import Accuracy
+from reloc.wire.track import Intrinsics, TrackPose
 
 _POSE_FIELDS = (
     *("position", "quaternion", "height_datum", "utm"),

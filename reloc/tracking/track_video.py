@@ -17,13 +17,13 @@ from featuredb.video.ahead import ReadAhead
 from featuredb.video.film import VideoInfo, VideoOptions
 from featuredb.video.frames import Source, open_video
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.film_overlay import draw_frame
 from reloc.tracking.ground import Finder
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
-from reloc.tracking.trajectory import Trajectory, TrajectoryPoint, point_of
+from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.
 _READ_ON = 4

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, carried
 from reloc.tracking.ground import Finder, Ground, Keyframe, Unmatched
 from reloc.tracking.lens_walk import LensWalk

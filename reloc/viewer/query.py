@@ -20,7 +20,7 @@ from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, jpeg_of
 from reloc.viewer.poses import drawn_pose, worded_sigmas
 from reloc.viewer.scene import ViewerScene
-from reloc.wire import LocaliseReply, LocaliseWireRequest, RequestOptions
+from reloc.wire.query import LocaliseReply, LocaliseWireRequest, RequestOptions
 
 LIMITS = DecodeLimits()
 

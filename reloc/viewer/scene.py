@@ -18,7 +18,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import MAP_STATUSES, MapImage
 from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import ScanSummary, count_points, list_scans
-from reloc.tracking.trajectory import Trajectory
+from reloc.tracking.trajectory.values import Trajectory
 from reloc.viewer.map_layer import coverage, describe_map, describe_photos, spot_of_map
 from reloc.viewer.own_layer import describe_own_place, own_points, picks_command
 from reloc.viewer.places import Spot, group, scan_box, spot_of

@@ -27,7 +27,7 @@ from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.query import LIMITS, Queries
 from reloc.viewer.scene import ViewerScene
-from reloc.wire import ErrorCode
+from reloc.wire.query import ErrorCode
 
 HOST = "127.0.0.1"
 PHOTO_TYPE = "application/octet-stream"

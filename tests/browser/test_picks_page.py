@@ -19,8 +19,8 @@ from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from ingest.register.picks_page.server import create_app
 from ingest.register.picks_page.session import PickSession
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.result import LocaliseRequest
 from reloc.viewer.server import listen, uvicorn_server
 from tests.browser.test_viewer import browser as browser
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos

@@ -16,7 +16,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, sync_playwright
 
 from featuredb.store import Database
-from reloc.tracking.trajectory_read import read_trajectory_csv
+from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import ViewerSceneOptions, build_scene

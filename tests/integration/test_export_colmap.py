@@ -27,8 +27,8 @@ from featuredb.features.extractor import extract
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from reloc.localise import localise
-from reloc.result import LocaliseRequest
+from reloc.localise.localise import localise
+from reloc.localise.result import LocaliseRequest
 from tests.support import planar_map as field
 from tests.support.scanned_map import scanned_map
 from tests.support.scenes import indexed

@@ -9,7 +9,7 @@ import requests
 from featuredb.errors import IncompatibleExtractorError, MapNotFoundError
 from reloc.gateway.failures import STATUS_OF
 from reloc.service.options import ServeOptions
-from reloc.wire import ErrorCode
+from reloc.wire.query import ErrorCode
 from tests.support.gateway import geopose_request, running_gateway
 from tests.support.service import Gate, ScriptedLocaliser, photo, running_server
 

@@ -20,8 +20,8 @@ from reloc.gateway.options import GatewayOptions
 from reloc.gateway.serve import GatewayStartError, listen
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
-from reloc.wire import LocaliseReply
-from reloc.wire_server import MapsReply
+from reloc.wire.query import LocaliseReply
+from reloc.wire.server import MapsReply
 from tests.support.gateway import geopose_request, running_gateway
 from tests.support.service import (
     MemorySource,
@@ -273,7 +273,7 @@ _PROGRAM = """
 import sys
 from importlib.metadata import EntryPoint
 from featuredb.cli.main import build_parser, run_command
-entry = EntryPoint(name="gateway", value="reloc.gateway.command:register", group="featuredb.commands")
+entry = EntryPoint(name="gateway", value="reloc.cli.gateway:register", group="featuredb.commands")
 args = build_parser([entry]).parse_args(sys.argv[1:])
 sys.exit(run_command(args.run, args))
 """
@@ -302,7 +302,7 @@ def test_the_command_serves_until_it_is_told_to_stop():
 
 
 def test_the_command_is_among_those_of_the_program():
-    entry = EntryPoint(name="gateway", value="reloc.gateway.command:register", group="featuredb.commands")
+    entry = EntryPoint(name="gateway", value="reloc.cli.gateway:register", group="featuredb.commands")
     parser = build_parser([entry])
     args = parser.parse_args(["gateway", "--database", "town", "--cors-origin", "*", "--timeout", "3"])
     assert (args.database, args.cors_origin, args.timeout, args.port) == ("town", ["*"], 3.0, 8080)

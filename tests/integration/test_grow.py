@@ -23,9 +23,9 @@ from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.photos.photo import Photo
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.result import LocaliseRequest
 from tests.support.hill_photos import CAMERA, FRAME
 from tests.support.hill_scan import write_hill_scan
 from tests.support.hill_walk import (

@@ -9,7 +9,7 @@ from featuredb.geometry.camera import Camera
 from ingest.growth.place.component import grow_component
 from ingest.growth.place.localised import LocaliseEachOptions, localise_photos, with_shared_lenses
 from ingest.growth.values import GrownMap
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, centers_error, existing, walk
 from tests.support.new_photos import NewPhotos, identity, moved, take_photos
 from tests.support.scenes import CAMERA, indexed

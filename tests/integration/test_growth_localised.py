@@ -22,10 +22,10 @@ from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.witnesses import NewPhotos as WitnessPhotos
 from ingest.growth.trust.witnesses import hear_witnesses
 from ingest.growth.values import LocalisedPhoto
-from reloc.candidates import IndexedArea
-from reloc.localise import Localised
-from reloc.options import LocaliseOptions
-from reloc.result import LocaliseRequest
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.localise import Localised
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocaliseRequest
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import (

@@ -16,7 +16,7 @@ from ingest.growth.place.localised import (
     localise_photos,
 )
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 from tests.support.growth_box import (
     DESCRIPTORS,
     EAST,

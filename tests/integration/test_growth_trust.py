@@ -19,9 +19,9 @@ from ingest.growth.place.overlaps import measure_overlap
 from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
-from reloc.localise import localise_features
+from reloc.localise.localise import localise_features
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.result import LocaliseRequest
 from tests.support.scene_strip import DESCRIPTORS, FRAME, POINTS, east, error_m, strip_map
 from tests.support.scenes import CAMERA, looking_at, pixels_inside, query_features
 

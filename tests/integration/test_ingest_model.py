@@ -24,8 +24,8 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from ingest.models_in.model_map import ModelOptions, map_of_model
 from ingest.models_in.place import Stated
-from reloc.localise import localise
-from reloc.result import LocaliseRequest
+from reloc.localise.localise import localise
+from reloc.localise.result import LocaliseRequest
 from tests.support import planar_map as field
 from tests.support.command_line import only_command
 from tests.support.maps import without_place

@@ -16,7 +16,7 @@ from reloc.client import Client
 from reloc.client.film import StreamOptions, stream_film
 from reloc.service.server import Server
 from reloc.tracking.pose_message import point_of_message, pose_message
-from reloc.wire_track import TrackPose
+from reloc.wire.track import TrackPose
 from tests.support.live import LENS, error_m, frame, localiser
 from tests.support.planar_map import CAMERA
 from tests.support.service import running_server

@@ -7,8 +7,8 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from reloc.service.options import ServeOptions
-from reloc.wire import ErrorCode, RequestError, parse_attachment
-from reloc.wire_track import (
+from reloc.wire.query import ErrorCode, RequestError, parse_attachment
+from reloc.wire.track import (
     EndReason,
     TrackEvent,
     TrackFrame,

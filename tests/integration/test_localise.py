@@ -20,13 +20,13 @@ from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from reloc import search
-from reloc.candidates import IndexedArea
-from reloc.localise import localise
+from reloc.localise import search
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.localise import localise
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.pose import PoseHypothesis
+from reloc.localise.result import LocaliseRequest, LocaliseResult
 from reloc.localiser import Localiser
-from reloc.options import LocaliseOptions
-from reloc.pose import PoseHypothesis
-from reloc.result import LocaliseRequest, LocaliseResult
 from tests.support import planar_map as field
 from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, field_texture, render, view
 

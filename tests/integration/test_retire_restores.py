@@ -8,9 +8,9 @@ import pytest
 
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.store import Database
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
-from reloc.result import LocaliseRequest
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 
 _LIE_EAST_M = 6.0  # the same field once more, so far from where it is

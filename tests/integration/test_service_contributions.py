@@ -15,10 +15,10 @@ from featuredb.store import Database
 from featuredb.store.candidate_states import candidate_id_of
 from featuredb.store.candidates import InboxCounts, list_candidates
 from reloc.client import PriorRequest
-from reloc.service.database_inbox import DatabaseInbox
-from reloc.service.inbox import Inbox, InboxOptions
+from reloc.service.contributions.database_inbox import DatabaseInbox
+from reloc.service.contributions.inbox import Inbox, InboxOptions
 from reloc.service.options import ServeOptions
-from reloc.wire import LocaliseReply
+from reloc.wire.query import LocaliseReply
 from tests.support.contributions import load_image
 from tests.support.service import (
     Gate,

@@ -4,7 +4,7 @@ import ast
 import re
 from pathlib import Path
 
-from reloc.service.inbox import InboxOptions
+from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
 from tests.support.service import ScriptedLocaliser, photo, running_server
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from featuredb.errors import ServiceError
-from reloc.wire import ErrorCode, LocaliseReply
+from reloc.wire.query import ErrorCode, LocaliseReply
 from tests.support.service import ScriptedLocaliser, client_of, photo, running_server
 
 QUERIES = 300

@@ -24,8 +24,8 @@ from reloc.service.live.options import LiveOptions
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.tracking.options import TrackOptions
-from reloc.wire import CameraRequest, PriorRequest
-from reloc.wire_track import LiveStatus
+from reloc.wire.query import CameraRequest, PriorRequest
+from reloc.wire.track import LiveStatus
 from schemas import load_schema
 from tests.support.live import LENS, SOON_S, error_m, jpeg, localiser, wait_until
 from tests.support.service import MemorySource, area_of, client_of, photo, running_server

@@ -12,7 +12,7 @@ from featuredb.features.decode import DecodeLimits
 from reloc.client import NO_SERVER, Client
 from reloc.service.logs import JsonLinesFormatter
 from reloc.service.options import ServeOptions
-from reloc.wire import ErrorCode
+from reloc.wire.query import ErrorCode
 from tests.support.service import (
     Gate,
     MemorySource,

@@ -28,7 +28,7 @@ from reloc.client import CameraRequest, Client, PriorRequest
 from reloc.overlay import project_utm
 from reloc.service.options import ServeOptions
 from reloc.service.serve import serve
-from reloc.wire import LocaliseReply
+from reloc.wire.query import LocaliseReply
 from tests.support.contributions import load_image
 from tests.support.planar_map import (
     CAMERA,
@@ -80,7 +80,7 @@ def database(tmp_path_factory, field):
 
 
 def parse(*argv: str):
-    entry = EntryPoint(name="reloc", value="reloc.cli:register", group="featuredb.commands")
+    entry = EntryPoint(name="reloc", value="reloc.cli.commands:register", group="featuredb.commands")
     return build_parser([entry]).parse_args([str(a) for a in argv])
 
 
@@ -93,7 +93,7 @@ _PROGRAM = """
 import sys
 from importlib.metadata import EntryPoint
 from featuredb.cli.main import build_parser, run_command
-entry = EntryPoint(name="reloc", value="reloc.cli:register", group="featuredb.commands")
+entry = EntryPoint(name="reloc", value="reloc.cli.commands:register", group="featuredb.commands")
 args = build_parser([entry]).parse_args(sys.argv[1:])
 sys.exit(run_command(args.run, args))
 """
@@ -295,7 +295,7 @@ def test_priors_select_and_contradict(server, photos, capsys):
 
 
 def test_a_southern_prior_is_understood():
-    from reloc.query_arguments import parse_prior
+    from reloc.cli.query_arguments import parse_prior
 
     args = parse("query", "x.jpg", "--prior=-33.86,151.21,25")
     assert parse_prior(args.prior) == PriorRequest(lat=-33.86, lon=151.21, sigma_m=25.0)

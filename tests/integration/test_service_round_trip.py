@@ -15,7 +15,7 @@ from reloc.client import NO_SERVER, TIMEOUT, CameraRequest, Client, PriorRequest
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.session import ServiceStartError
-from reloc.wire import LocaliseReply
+from reloc.wire.query import LocaliseReply
 from tests.support.service import (
     EASTING,
     EPSG,

@@ -7,16 +7,16 @@ import pytest
 from pydantic import ValidationError
 
 from featuredb.features.decode import DecodeLimits
-from reloc.service.inbox import Inbox, InboxOptions
+from reloc.service.contributions.inbox import Inbox, InboxOptions
 from reloc.service.options import ServeOptions
-from reloc.wire import (
+from reloc.wire.query import (
     ErrorCode,
     LocaliseReply,
     LocaliseWireRequest,
     RequestError,
     parse_request,
 )
-from reloc.wire_server import MapsReply, StatusReply
+from reloc.wire.server import MapsReply, StatusReply
 from schemas import load_schema
 from tests.support.service import (
     MemoryInbox,

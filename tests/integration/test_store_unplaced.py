@@ -16,8 +16,8 @@ from featuredb.store.encode import content_digest
 from featuredb.store.maintenance import compact
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.result import LocaliseRequest
 from tests.support.maps import assert_same_map, random_map, random_unplaced_map
 from tests.support.planar_map import CAMERA, field_texture, render, view
 

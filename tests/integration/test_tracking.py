@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import reloc.tracking.track_video as track_video_module
-import reloc.tracking.trajectory_files as trajectory_files_module
+import reloc.tracking.trajectory.files as trajectory_files_module
 from featuredb.cli.main import main
 from featuredb.errors import InvalidValueError, VideoError
 from featuredb.geo.geopose import geopose_from_camera
@@ -20,14 +20,14 @@ from featuredb.store import Database
 from featuredb.video.film import Video, VideoFrame
 from featuredb.video.frames import open_video
 from featuredb.video.writer import VideoWriter
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from reloc.result import LocaliseRequest
 from reloc.tracking.ground import Keyframe, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.tracker import TrackedFrame, Tracker
-from reloc.tracking.trajectory import EarthPose, TrajectoryPoint
+from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import WEST_M, anchored_database
 from tests.support.made_once import made_once

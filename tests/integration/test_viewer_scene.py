@@ -14,8 +14,8 @@ from featuredb.export.selection import Selection
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import ScanLabels
 from featuredb.store import Database
-from reloc.tracking.trajectory_files import write_trajectory
-from reloc.tracking.trajectory_read import read_trajectory_csv
+from reloc.tracking.trajectory.files import write_trajectory
+from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.viewer.photos import Pictures
 from reloc.viewer.scene import ViewerScene, ViewerSceneOptions, build_scene
 from reloc.viewer.server import listen
@@ -26,7 +26,7 @@ from tests.support.maps import random_map
 from tests.support.planar_map import planar_map
 from tests.support.viewer import track_over
 
-COMMAND = EntryPoint("view", "reloc.viewer.command:register", COMMAND_GROUP)
+COMMAND = EntryPoint("view", "reloc.cli.view:register", COMMAND_GROUP)
 BESIDE = np.array([400.0, 0.0, 0.0])
 
 

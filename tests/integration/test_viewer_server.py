@@ -32,7 +32,7 @@ from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
 from reloc.viewer.server import ViewerStartError, listen
-from reloc.wire import LocaliseWireRequest
+from reloc.wire.query import LocaliseWireRequest
 from tests.support.maps import random_map
 from tests.support.viewer import MISSING, ViewerWorld, get, make_world, running_viewer
 

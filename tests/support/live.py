@@ -11,8 +11,8 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
-from reloc.candidates import IndexedArea
-from reloc.wire import CameraRequest
+from reloc.localise.candidates import IndexedArea
+from reloc.wire.query import CameraRequest
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 from tests.support.service import ScriptedLocaliser
 

@@ -15,7 +15,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapObservations, MapPoints, Placement
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 EPSG = 32632
 EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0

@@ -17,15 +17,15 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import InboxCounts
-from reloc.candidates import IndexedArea
 from reloc.client import Client
-from reloc.options import LocaliseOptions
-from reloc.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult, RunnerUp
-from reloc.service.inbox import Inbox
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import Inliers, LocalisedPose, LocaliseRequest, LocaliseResult, RunnerUp
+from reloc.service.contributions.inbox import Inbox
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.service.source import ServedArea
-from reloc.wire_server import BoundingBox, MapInfo
+from reloc.wire.server import BoundingBox, MapInfo
 
 EPSG = 32632
 EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0

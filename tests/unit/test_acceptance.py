@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.maps.feature_map import GeoPrior
-from reloc.acceptance import (
+from reloc.localise.acceptance import (
     AcceptanceOptions,
     Evidence,
     agreement,

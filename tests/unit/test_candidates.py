@@ -7,10 +7,10 @@ import pytest
 
 from featuredb.features.features import Features
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
-from reloc.candidates import IndexedArea, find_clusters, images_in_reach
-from reloc.matching import ClusterMatcher
-from reloc.options import CandidateOptions, LocaliseOptions
-from reloc.search import most_matched
+from reloc.localise.candidates import IndexedArea, find_clusters, images_in_reach
+from reloc.localise.matching import ClusterMatcher
+from reloc.localise.options import CandidateOptions, LocaliseOptions
+from reloc.localise.search import most_matched
 from tests.support.scenes import (
     CAMERA,
     box_points,

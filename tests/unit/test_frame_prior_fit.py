@@ -17,8 +17,8 @@ from ingest.register.frame.prior_fit import (
     prior_sigmas,
 )
 from ingest.register.frame_registration import FramePrior
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis
 
 DOWN = np.diag([1.0, -1.0, -1.0])
 LONG_LENS = Camera(model="SIMPLE_PINHOLE", width=400, height=400, params=(3300.0, 200.0, 200.0))

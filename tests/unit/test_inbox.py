@@ -8,7 +8,7 @@ import pytest
 from featuredb.errors import StoreError
 from featuredb.store.candidate_states import Contribution
 from featuredb.store.candidates import InboxCounts
-from reloc.service.inbox import Inbox, InboxOptions, InboxRefusal, Ticket
+from reloc.service.contributions.inbox import Inbox, InboxOptions, InboxRefusal, Ticket
 from tests.support.contributions import contribution
 from tests.support.service import Gate, MemoryInbox
 

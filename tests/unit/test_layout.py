@@ -30,9 +30,6 @@ FULL_FOLDERS = {
     "featuredb/video/telemetry",
     "ingest/register/anchor",
     "ingest/register/frame",
-    "reloc",
-    "reloc/service",
-    "reloc/tracking",
 }
 
 

@@ -14,8 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from ingest.colmap.map_errors import map_errors
-from reloc.lens_prior import QueryLensPrior, seen_by_a_map
-from reloc.self_calibration import calibrate
+from reloc.localise.lens_prior import QueryLensPrior, seen_by_a_map
+from reloc.localise.self_calibration import calibrate
 
 _LENS = Camera(
     model="OPENCV", width=1600, height=1200, params=(1200.0, 1202.0, 805.0, 597.0, -0.02, 0.01, 4e-4, -3e-4)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import reloc.matching as matching_module
+import reloc.localise.matching as matching_module
 from featuredb.features.features import Features
 from featuredb.geometry.rigid3 import Rigid3
-from reloc.candidates import Cluster, IndexedArea
-from reloc.matching import (
+from reloc.localise.candidates import Cluster, IndexedArea
+from reloc.localise.matching import (
     EXPECTED_DEG,
     POSSIBLE_DEG,
     ClusterMatcher,
@@ -17,7 +17,7 @@ from reloc.matching import (
     guided_matches,
     visible_points,
 )
-from reloc.options import PointMatchOptions
+from reloc.localise.options import PointMatchOptions
 from tests.support.scenes import (
     CAMERA,
     box_points,

@@ -8,9 +8,9 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
-from reloc.jacobians import pixel_jacobians
-from reloc.options import PoseOptions
-from reloc.pose import (
+from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import (
     PoseHypothesis,
     _price_of_robustness,
     estimate_pose,

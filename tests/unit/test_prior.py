@@ -7,8 +7,8 @@ import pyproj
 import pytest
 
 from featuredb.maps.feature_map import GeoPrior
-from reloc.prior import contradicts_prior
-from reloc.result import LocalisedPose
+from reloc.localise.prior import contradicts_prior
+from reloc.localise.result import LocalisedPose
 from tests.unit.test_answer import POSE, a_map, answer_of
 
 SIGMA_M = 4.0

@@ -3,8 +3,8 @@
 import pytest
 
 from featuredb.errors import InvalidValueError
-from reloc.query_arguments import as_arguments, parse_camera
-from reloc.wire import CameraRequest
+from reloc.cli.query_arguments import as_arguments, parse_camera
+from reloc.wire.query import CameraRequest
 
 CAMERA = CameraRequest(
     model="SIMPLE_RADIAL",

@@ -11,14 +11,14 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
+from reloc.cli.wording import ADVICE, describe
+from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
-from reloc.result import REASONS
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
 from reloc.service.session import Keys, bind_free_port
 from reloc.service.threads import capped_process
-from reloc.wire import ContributionReply, encode, parse_request
-from reloc.wording import ADVICE, describe
+from reloc.wire.query import ContributionReply, encode, parse_request
 from tests.support.service import localised, not_localised
 
 

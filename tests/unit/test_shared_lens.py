@@ -5,9 +5,9 @@ import pytest
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-from reloc.lens_prior import LensPriors, known_within, lens_of
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, refine_pose
+from reloc.localise.lens_prior import LensPriors, known_within, lens_of
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis, refine_pose
 from reloc.shared_lens import LensView, lenses_of_cameras, shared_lens
 from tests.support.scenes import looking_at
 

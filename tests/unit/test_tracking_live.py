@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import reloc.tracking.tracker as tracker_module
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.recent import RecentFrame, RecentFrames

@@ -11,7 +11,7 @@ from featuredb.errors import VideoError
 from featuredb.video.film import VideoOptions
 from featuredb.video.folder import natural_key
 from featuredb.video.frames import open_video
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.tracking.track_video import _with_film
 from tests.support.films import HEIGHT, WIDTH, overwritten, picture, read, shown
 

@@ -27,7 +27,7 @@ from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlace
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import firm_parts
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.cameras import shared_key
 from ingest.photos.photo import Photo
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,15 +16,15 @@ from featuredb.index.area import Area
 from featuredb.index.descriptor_index import use_threads
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
-from reloc.acceptance import AcceptanceOptions, agreement
-from reloc.candidates import IndexedArea
-from reloc.lens_prior import LensPriors
-from reloc.localise import Localised, localise_features
-from reloc.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
-from reloc.options import LocaliseOptions, PoseOptions
-from reloc.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
-from reloc.result import LocaliseRequest
-from reloc.search import pairs
+from reloc.localise.acceptance import AcceptanceOptions, agreement
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.lens_prior import LensPriors
+from reloc.localise.localise import Localised, localise_features
+from reloc.localise.matching import POSSIBLE_DEG, Matches, guided_matches, visible_points
+from reloc.localise.options import LocaliseOptions, PoseOptions
+from reloc.localise.pose import PoseHypothesis, estimate_pose, pose_uncertainty, refine_pose
+from reloc.localise.result import LocaliseRequest
+from reloc.localise.search import pairs
 
 _LOG = logging.getLogger(__name__)
 

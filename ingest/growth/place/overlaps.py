@@ -29,7 +29,7 @@ from ingest.growth.place.similarity_fit import (
 )
 from ingest.growth.values import LocalisedPhoto
 from ingest.photos.photo import Photo
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,8 +18,8 @@ from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
 from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
-from reloc.acceptance import agreement
-from reloc.matching import EXPECTED_DEG, visible_points
+from reloc.localise.acceptance import agreement
+from reloc.localise.matching import EXPECTED_DEG, visible_points
 
 logger = logging.getLogger(__name__)
 
@@ -30,8 +30,8 @@ class VisibilityOptions:
 
     Attributes:
         min_visible: least share of the parts of a photo where existing points should be seen that shows some:
-            as for a query (reloc.acceptance). In a simulated community a re-upload 10.8 m off showed 0.13 of
-            its parts, right photos 0.22 and more.
+            as for a query (reloc.localise.acceptance). In a simulated community a re-upload 10.8 m off showed
+            0.13 of its parts, right photos 0.22 and more.
         min_witnessed: the same where the points of its own reconstruction are asked for as well. Another
             re-upload, 13.3 m off, showed 0.17; right photos of that database 0.32 and more, of the one that
             grew with this limit 0.23 and more.

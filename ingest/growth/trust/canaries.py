@@ -25,12 +25,12 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.map_images import features_of_image
-from reloc.localise import localise_features
+from reloc.localise.localise import localise_features
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.localiser import Localiser
-from reloc.options import LocaliseOptions
-from reloc.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.service.handler import localise_request
-from reloc.wire import LocaliseWireRequest
+from reloc.wire.query import LocaliseWireRequest
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 

@@ -57,7 +57,7 @@ class ConfirmationOptions:
             day is enough, which a contributor who means harm can make up.
         trusted_owners: whose photos need nobody else: surveys of those who keep the database.
         min_shared_points: two photos confirm each other from so many common points of the map on. An
-            accepted pose has at least so many inliers (reloc.options), and chance gives a few.
+            accepted pose has at least so many inliers (reloc.localise.options), and chance gives a few.
         min_confirmed_share: of the map's photos. Photos at the rim of a map often share less with others;
             a map of which most photos hang on one source alone is that source's claim.
         min_parallax: distance of two cameras over their distance from what both see. The same picture given

@@ -16,7 +16,7 @@ from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witnes
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
 from ingest.sfm.pairs import Pair
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -17,7 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from reloc.jacobians import pixel_jacobians
+from reloc.localise.jacobians import pixel_jacobians
 
 _STARTS = 60  # triples that P3P is asked for
 _REFINED = 6  # of their poses, best first, that are refined

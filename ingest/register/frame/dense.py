@@ -12,8 +12,8 @@ from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.search import FrameHypothesis, independent
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, refine_pose
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis, refine_pose
 
 _MIN_PLACES = 12  # twice what six parameters need
 _FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart

@@ -20,7 +20,7 @@ from ingest.register.frame.search import FrameHypothesis, pose_options
 from ingest.register.frame.uncertainty import frame_covariance
 from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, RenderSource
-from reloc.pose import PoseHypothesis
+from reloc.localise.pose import PoseHypothesis
 
 _MIN_INLIERS = 20  # as the verdict on a frame asks
 

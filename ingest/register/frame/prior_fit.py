@@ -15,9 +15,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
 from ingest.register.frame.matching import FrameMatches
 from ingest.register.frame_registration import FramePrior
-from reloc.jacobians import pixel_jacobians
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, reprojection_errors
+from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis, reprojection_errors
 
 _ROUNDS = 5  # Gauss-Newton; a step of 50 m and 3 degrees leaves a metre to the next
 _MIN_MATCHES = 6

@@ -17,10 +17,10 @@ from ingest.register.frame.prior_fit import fitted_under_prior
 from ingest.register.frame.star import fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
-from reloc.acceptance import independent_inliers, log_nfa
-from reloc.lens_prior import LensPriors
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+from reloc.localise.acceptance import independent_inliers, log_nfa
+from reloc.localise.lens_prior import LensPriors
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
 
 MatchKind = Literal["upright", "oriented", "dense"]
 

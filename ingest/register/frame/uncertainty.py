@@ -6,8 +6,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.frame.prior_fit import prior_information
 from ingest.register.frame_registration import FramePrior
-from reloc.options import PoseOptions
-from reloc.pose import PoseHypothesis, pose_uncertainty
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import PoseHypothesis, pose_uncertainty
 
 
 def frame_covariance(

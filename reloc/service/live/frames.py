@@ -15,7 +15,7 @@ from featuredb.features.decode import decode_gray
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
 from featuredb.video.film import fitted_size
-from reloc.result import LocaliseRequest
+from reloc.localise.result import LocaliseRequest
 from reloc.service.handler import geo_prior
 from reloc.service.live.latest import Arrival
 from reloc.service.live.options import LiveOptions
@@ -23,9 +23,9 @@ from reloc.service.source import ServedArea
 from reloc.tracking.map_ground import MapFinder, usable_areas
 from reloc.tracking.pose_message import pose_message
 from reloc.tracking.tracker import Tracker
-from reloc.tracking.trajectory import point_of
-from reloc.wire import CameraRequest, ErrorCode, RequestError, parse_attachment
-from reloc.wire_track import TrackFrame, TrackOpenRequest, TrackPose
+from reloc.tracking.trajectory.values import point_of
+from reloc.wire.query import CameraRequest, ErrorCode, RequestError, parse_attachment
+from reloc.wire.track import TrackFrame, TrackOpenRequest, TrackPose
 
 
 class FrameError(RequestError):

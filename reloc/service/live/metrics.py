@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reloc.wire_track import LiveFrameCounts, LiveLatency, LiveStatus
+from reloc.wire.track import LiveFrameCounts, LiveLatency, LiveStatus
 
 _LATENCY_WINDOW = 1000  # latest frames: half a minute of one session
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from reloc.service.live.frames import FrameAnswerer, FrameError
 from reloc.service.live.latest import Arrival, LatestFrame
 from reloc.service.live.metrics import LiveMetrics
-from reloc.wire_track import EndReason, TrackEvent
+from reloc.wire.track import EndReason, TrackEvent
 
 logger = logging.getLogger(__name__)
 

@@ -17,8 +17,15 @@ from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
 from reloc.service.session import Keys
 from reloc.service.source import ServedArea
-from reloc.wire import MAX_ATTACHMENT_BYTES, ErrorCode, ErrorReply, RequestError, encode, parse_attachment
-from reloc.wire_track import (
+from reloc.wire.query import (
+    MAX_ATTACHMENT_BYTES,
+    ErrorCode,
+    ErrorReply,
+    RequestError,
+    encode,
+    parse_attachment,
+)
+from reloc.wire.track import (
     EndReason,
     LiveStatus,
     SessionName,

@@ -16,7 +16,7 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame
 from ingest.growth.place.overlaps import localise_image
-from reloc.candidates import IndexedArea
+from reloc.localise.candidates import IndexedArea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

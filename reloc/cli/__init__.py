@@ -1,0 +1,1 @@
+"""Subcommands of `featuredb` that `reloc` adds; what they need is imported when they run."""

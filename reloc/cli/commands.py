@@ -1,0 +1,321 @@
+"""Subcommands `serve`, `query`, `live` and `localise`; what they need is imported when they run."""
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
+
+if TYPE_CHECKING:
+    from featuredb.geometry.arrays import FloatArray
+    from reloc.wire.query import CameraRequest, LocaliseReply
+
+    # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
+    Ask = Callable[[bytes, CameraRequest | None, bool], LocaliseReply]
+
+_NOT_LOCALISED = 1  # exit code: everything worked, and the answer is no
+_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+def register(subparsers: Any) -> None:
+    """Add the subcommands to the parser of `featuredb`."""
+    from featuredb.cli.common import add_database_argument
+    from reloc.cli.live import register as register_live
+
+    serve = subparsers.add_parser(
+        "serve", help="answer queries over Zenoh", description="Answer queries over Zenoh until stopped."
+    )
+    add_database_argument(serve)
+    serve.add_argument(
+        "--listen",
+        action="append",
+        metavar="ENDPOINT",
+        help=f"Zenoh endpoint, may be repeated; default {_DEFAULT_ENDPOINT} where no --config is given",
+    )
+    serve.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
+    serve.add_argument("--workers", type=int, default=2, help="queries localised at a time; default 2")
+    serve.add_argument("--max-queue", type=int, default=32, help="queries that may wait; default 32")
+    serve.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="per query; default 8")
+    serve.add_argument(
+        "--contributions",
+        choices=("on", "off"),
+        default="on",
+        help="take photos that clients contribute, with owner and licence, into a bounded inbox; default on",
+    )
+    serve.add_argument(
+        "--live-sessions", type=int, default=2, metavar="N", help="streams followed at a time; default 2"
+    )
+    serve.add_argument(
+        "--live-idle",
+        type=float,
+        default=5.0,
+        metavar="SECONDS",
+        help="a live session without a usable frame for so long ends; default 5",
+    )
+    serve.set_defaults(run=_serve)
+
+    query = subparsers.add_parser(
+        "query", help="ask a server where photos were taken", description="Ask a server over Zenoh."
+    )
+    query.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
+    query.add_argument("--connect", default=_DEFAULT_ENDPOINT, metavar="ENDPOINT", help="Zenoh endpoint")
+    query.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration instead of --connect")
+    query.add_argument("--database", metavar="NAME", help="default: the only one that is served")
+    query.add_argument("--timeout", type=float, default=10.0, metavar="SECONDS", help="per image; default 10")
+    query.add_argument(
+        "--contribute",
+        action="store_true",
+        help="give the photos to the database, so that its maps can grow; needs --owner and --licence",
+    )
+    query.add_argument("--owner", metavar="NAME", help="whose photos they are")
+    query.add_argument("--licence", metavar="TERMS", help="under what terms they are given, e.g. CC-BY-4.0")
+    query.add_argument(
+        "--client-id", metavar="NAME", help="what this client calls itself; kept with the photos"
+    )
+    _add_query_arguments(query)
+    query.set_defaults(run=_query)
+
+    register_live(subparsers)
+
+    localise = subparsers.add_parser(
+        "localise",
+        help="localise photos without a server",
+        description="The same as `query`, with the database opened here.",
+    )
+    add_database_argument(localise)
+    localise.add_argument("image", nargs="+", metavar="IMAGE", help="image file")
+    _add_query_arguments(localise)
+    localise.set_defaults(run=_localise)
+
+
+def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--prior",
+        metavar="LAT,LON,SIGMA_M",
+        help="where it may have been taken, WGS84 degrees and metres; with an equals sign where the latitude "
+        "is negative: --prior=-33.86,151.21,25",
+    )
+    parser.add_argument("--exif-prior", action="store_true", help="the photo's own GPS is the prior")
+    parser.add_argument(
+        "--camera",
+        metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
+        help="intrinsics by COLMAP's model, e.g. PINHOLE,4000,3000,3200,3200,2000,1500",
+    )
+    parser.add_argument(
+        "--camera-sigmas",
+        metavar="SIGMAS...",
+        help="one standard deviation of each of --camera's parameters, OPENCV's or SIMPLE_RADIAL's; without "
+        "it they are exact",
+    )
+    parser.add_argument(
+        "--shared-lens",
+        action="store_true",
+        help="photos of one camera, by EXIF and size, have one lens: it is estimated from all of them, three "
+        "or more, and each is then answered with it; a photo alone hardly tells its focal length from its "
+        "height. Not for zoom lenses without EXIF, nor for cropped pictures",
+    )
+    parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
+    parser.add_argument("--json", action="store_true", help="print one JSON reply per line")
+    parser.add_argument(
+        "--overlay",
+        type=Path,
+        metavar="PNG",
+        help="write the photo with the projected map; with several images their names are appended",
+    )
+
+
+def _serve(args: argparse.Namespace) -> int:
+    import cv2
+
+    from featuredb.cli.common import open_database
+    from reloc.service.live.options import LiveOptions
+    from reloc.service.logs import log_to
+    from reloc.service.options import ServeOptions
+    from reloc.service.serve import serve
+    from reloc.service.server import Server
+
+    listen = tuple(args.listen or (() if args.config else (_DEFAULT_ENDPOINT,)))
+    options = ServeOptions(
+        listen=listen,
+        config_path=args.config,
+        name=args.name,
+        workers=args.workers,
+        max_queue=args.max_queue,
+        deadline_s=args.deadline,
+        contributions=args.contributions == "on",
+        live=LiveOptions(max_sessions=args.live_sessions, idle_timeout_s=args.live_idle),
+    )
+    database = open_database(args)
+    log_to(sys.stderr)
+    # Its decoders tell stderr about each hostile file; the refusal in our log says it once.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+
+    def announce(server: Server) -> None:
+        where = ", ".join(server.endpoints) or str(args.config)
+        sys.stdout.write(
+            f"serving {server.database!r} (snapshot {server.status().snapshot}, {server.status().maps} maps) "
+            f"on {where}; stop with Ctrl-C\n"
+        )
+        sys.stdout.flush()
+
+    serve(database, options, on_ready=announce)
+    return 0
+
+
+def _query(args: argparse.Namespace) -> int:
+    from reloc.cli.query_arguments import parse_camera, parse_prior
+    from reloc.client import Client
+
+    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
+    if args.contribute and not (args.owner and args.licence):
+        raise InvalidValueError(
+            "--contribute: expected --owner and --licence, too: whose photos they are, and under what terms"
+        )
+    with Client(args.connect, args.database, config_path=args.config) as client:
+
+        def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
+            return client.localise(
+                data,
+                prior,
+                lens or camera,
+                timeout_s=args.timeout,
+                inliers=first or args.overlay is not None,
+                exif_prior=args.exif_prior,
+                maps=tuple(args.map) if args.map else None,
+                contribute=args.contribute and not first,
+                owner=args.owner,
+                licence=args.licence,
+                client_id=args.client_id,
+            )
+
+        return _answer_all(args, ask)
+
+
+def _localise(args: argparse.Namespace) -> int:
+    import uuid
+
+    from featuredb.cli.common import open_database
+    from featuredb.features.decode import DecodeLimits
+    from featuredb.stage_clock import StageClock
+    from reloc.cli.query_arguments import parse_camera, parse_prior
+    from reloc.localiser import Localiser
+    from reloc.overlay import map_points_in_view
+    from reloc.service.handler import answer_query
+    from reloc.wire.query import LocaliseWireRequest, RequestOptions
+
+    prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
+    localiser = Localiser.open(open_database(args))
+
+    def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
+        request = LocaliseWireRequest(
+            prior=prior,
+            camera=lens or camera,
+            options=RequestOptions(
+                inliers=first or args.overlay is not None,
+                exif_prior=args.exif_prior,
+                maps=tuple(args.map) if args.map else None,
+            ),
+        )
+        return answer_query(
+            data,
+            request,
+            localiser,
+            limits=DecodeLimits(),
+            request_id=uuid.uuid4().hex,
+            clock=StageClock(),
+        )
+
+    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+
+
+def _answer_all(
+    args: argparse.Namespace,
+    ask: "Ask",
+    other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
+) -> int:
+    """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
+    from reloc.cli.wording import describe
+
+    codes = {0}
+    lenses = _shared_lenses(args, ask) if args.shared_lens else {}
+    for path in map(Path, args.image):
+        try:
+            data = path.read_bytes()
+            reply = ask(data, lenses.get(path), False)
+            sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
+            sys.stdout.flush()
+            if reply.status == "not_localised":
+                codes.add(_NOT_LOCALISED)
+            elif reply.in_map is not None:
+                if args.overlay is not None:
+                    sys.stderr.write(f"featuredb: {path}: no overlay of a map without a place\n")
+            elif args.overlay is not None:
+                from reloc.overlay import write_overlay
+
+                target = _overlay_path(args.overlay, path, args.image)
+                write_overlay(target, data, reply, other_points(reply))
+                sys.stderr.write(f"wrote {target}\n")
+        except OSError as error:
+            sys.stderr.write(f"featuredb: {path}: {error.strerror or error}\n")
+            codes.add(2)
+        except ServiceError as error:
+            sys.stderr.write(f"featuredb: {path}: {error}\n")
+            codes.add(2)
+            if error.code == "NO_SERVER":
+                break
+        except FeatureDbError as error:
+            sys.stderr.write(f"featuredb: {path}: {error}\n")
+            codes.add(2)
+    return max(codes)
+
+
+def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRequest]":
+    """Ask for each image once, and find the lens that all photos of a camera agree on; says it on stderr."""
+    from featuredb.features.exif import read_exif
+    from reloc.cli.query_arguments import as_arguments
+    from reloc.shared_lens import lenses_of_cameras, views_of
+
+    if args.camera is not None:
+        raise InvalidValueError(
+            "--shared-lens: expected no --camera, which is the lens of all photos already"
+        )
+    paths: list[Path] = []
+    keys: list[str] = []
+    replies: list[LocaliseReply] = []
+    for path in map(Path, args.image):
+        try:
+            data = path.read_bytes()
+            reply = ask(data, None, True)
+        except (OSError, FeatureDbError) as error:
+            if isinstance(error, ServiceError) and error.code == "NO_SERVER":
+                break
+            continue  # said when it is asked for again
+        if reply.camera is not None:
+            exif = read_exif(data)
+            paths.append(path)
+            keys.append(exif.camera_key or f"no EXIF, {reply.camera.width}x{reply.camera.height}")
+            replies.append(reply)
+    lenses, asked_with = lenses_of_cameras(keys, views_of(replies))
+    for key in dict.fromkeys(keys):
+        lens = lenses.get(key)
+        if lens is None:
+            sys.stderr.write(f"{key}: no lens that three photos or more agree on\n")
+        else:
+            said = as_arguments(lens.as_request())
+            sys.stderr.write(f"{key}: lens of {lens.agree.sum()} of {len(lens.agree)} photos: {said}\n")
+    return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
+
+
+def _as_json_line(path: Path, reply: "LocaliseReply") -> str:
+    import json
+
+    return json.dumps({"image": str(path), **reply.model_dump(mode="json")}) + "\n"
+
+
+def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:
+    if len(list(images)) == 1:
+        return overlay
+    return overlay.with_name(f"{overlay.stem}-{image.stem}{overlay.suffix or '.png'}")

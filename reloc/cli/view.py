@@ -1,0 +1,124 @@
+"""Subcommand `view`; what it needs is imported when it runs."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from featuredb.errors import ExportError
+from featuredb.extras import require
+
+if TYPE_CHECKING:
+    from featuredb.export.selection import Selection
+    from reloc.viewer.placing import PlacingPages
+    from reloc.viewer.scene import ViewerScene
+
+
+def register(subparsers: Any) -> None:
+    """Add the subcommand to the parser of `featuredb`."""
+    from featuredb.cli.common import add_as_of_argument, add_database_argument
+    from featuredb.cli.export import add_selection_arguments
+
+    view = subparsers.add_parser(
+        "view",
+        help="look at a database in a browser",
+        description="Open a page on this machine: maps, photos, scans, lineage, tracks of films, and where a "
+        "photo that is dropped on it was taken. Nothing is loaded from the network.",
+    )
+    add_database_argument(view)
+    view.add_argument(
+        "--photos",
+        type=Path,
+        metavar="FOLDER",
+        help="where the photos are; only read, found by name or bytes",
+    )
+    view.add_argument(
+        "--trajectory",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a track, as CSV of `featuredb track`; may be repeated",
+    )
+    view.add_argument(
+        "--points",
+        type=int,
+        metavar="N",
+        help="at most so many points in each place; default 1000000, with --static 250000",
+    )
+    view.add_argument(
+        "--static", type=Path, metavar="OUT.html", help="write one file that can be sent, instead of serving"
+    )
+    view.add_argument("--port", type=int, default=0, help="default: a free one")
+    view.add_argument("--no-browser", action="store_true", help="print the address only")
+    add_selection_arguments(view)
+    add_as_of_argument(view)
+    view.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    from featuredb.cli.common import open_database, progress_of_maps
+    from reloc.tracking.trajectory.read import read_trajectory_csv
+    from reloc.viewer.photos import Pictures
+    from reloc.viewer.scene import DEFAULT_POINTS, ViewerSceneOptions, build_scene
+    from reloc.viewer.static_page import DEFAULT_POINTS as STATIC_POINTS
+    from reloc.viewer.static_page import write_static_page
+
+    if args.static is None:
+        require("http", "The viewer (but not `--static OUT.html`)", "fastapi", "uvicorn")
+    elif args.static.exists():
+        raise ExportError(f"{args.static}: expected a name that is free; nothing is overwritten")
+    tracks = [read_trajectory_csv(path) for path in args.trajectory]
+    pictures = Pictures(args.photos)
+    usual = DEFAULT_POINTS if args.static is None else STATIC_POINTS
+    options = ViewerSceneOptions(
+        selection=_selection(args),
+        points=usual if args.points is None else args.points,
+        photos=None if args.photos is None else args.photos.absolute(),
+        told=progress_of_maps(),
+    )
+    database = open_database(args)
+    scene = build_scene(database, database.snapshot(args.as_of), tracks, options)
+    if args.static is not None:
+        size = write_static_page(args.static, scene, pictures)
+        sys.stdout.write(f"{args.static}: {size / 1e6:.1f} MB, of version {scene.document['snapshot']}\n")
+        return 0
+    from reloc.viewer.query import Queries
+    from reloc.viewer.serve import serve
+    from reloc.viewer.server import create_app
+
+    pages = _placing_pages(scene, database.url, args)
+    try:
+        app = create_app(scene, pictures, Queries(database, scene), pages)
+        serve(app, args.port, browser=not args.no_browser, path="" if pages is None else f"#{pages.key}")
+    finally:
+        if pages is not None:
+            pages.close()
+    return 0
+
+
+def _placing_pages(scene: "ViewerScene", url: str, args: argparse.Namespace) -> "PlacingPages | None":
+    """Where maps without a place can be placed from the page: the newest ones, by photos that are there."""
+    from reloc.viewer.placing import PlacingPages, anchor_command
+
+    if args.photos is None or args.as_of is not None or args.storage_option:
+        return None
+    unplaced = [m["id"] for place in scene.document["places"] if place.get("own") for m in place["maps"]]
+    if not unplaced:
+        return None
+    return PlacingPages({m: anchor_command(url, m, args.photos.absolute()) for m in unplaced})
+
+
+def _selection(args: argparse.Namespace) -> "Selection":
+    """As the arguments say; every status where they name none.
+
+    Raises:
+        ExportError, InvalidValueError: they contradict each other.
+    """
+    from dataclasses import replace
+
+    from featuredb.cli.export import selection_of
+    from reloc.viewer.scene import ViewerSceneOptions
+
+    chosen = selection_of(args)
+    return chosen if args.status else replace(chosen, statuses=ViewerSceneOptions().selection.statuses)

@@ -1,0 +1,156 @@
+"""From an accepted pose in the area's frame to an answer on Earth with its uncertainty."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from featuredb.geo.geopose import geopose_from_camera
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rotation import quaternion_from_matrix, skew
+from featuredb.geometry.sim3 import point_jacobian
+from featuredb.index.area import Area
+from featuredb.maps.feature_map import FeatureMap
+from reloc.localise.map_shape import shape_covariance
+from reloc.localise.pose import PoseHypothesis, PoseUncertainty
+from reloc.localise.result import Inliers, LocalisedPose
+
+
+def make_answer(
+    area: Area,
+    pose: PoseHypothesis,
+    uncertainty: PoseUncertainty,
+    pixels: FloatArray,
+    point_rows: NDArray[np.int64],
+    want_inliers: bool,
+    told: Camera | None = None,
+) -> LocalisedPose:
+    """The pose in UTM and as a GeoPose, with covariance and radii.
+
+    Args:
+        pixels: (k, 2) of the inliers. point_rows: (k,) rows of the area's points.
+        told: the camera that the request gives as exact, whatever the map's errors made of it.
+    """
+    counts = np.bincount(area.point_map[point_rows], minlength=len(area.maps))
+    order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
+    main = area.maps[order[0]]
+    center = pose.cam_from_local.center
+    modes = area.modes[order[0]]
+    shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes)
+    covariance = on_earth(area, main, center, uncertainty.covariance, point_rows, shape)
+    grid_from_local = area.frame.grid_from_enu(center, main.epsg)
+    return LocalisedPose(
+        frame=area.frame,
+        cam_from_local=pose.cam_from_local,
+        covariance=covariance,
+        camera=told or pose.camera,
+        camera_source=pose.camera_source,
+        epsg=main.epsg,
+        utm=area.frame.utm_from_enu(center, main.epsg),
+        cam_from_utm_xyzw=quaternion_from_matrix(pose.cam_from_local.rotation @ grid_from_local.T),
+        geopose=geopose_from_camera(pose.cam_from_local, area.frame),
+        height_datum=main.height_datum,
+        horizontal_68_m=radius_68(covariance[3:5, 3:5]),
+        vertical_68_m=radius_68(covariance[5:, 5:]),
+        orientation_68_deg=float(np.degrees(radius_68(covariance[:3, :3]))),
+        map_ids=tuple(area.maps[i].map_id for i in order),
+        lineage=tuple(_lineage(area.maps[i]) for i in order),
+        residual_rms_px=uncertainty.residual_rms_px,
+        inliers=_inliers(area, order, pixels, point_rows) if want_inliers else None,
+    )
+
+
+def radius_68(covariance: FloatArray) -> float:
+    """Radius around a Gaussian's mean that holds 68 % of it, for covariances (d, d), d = 1, 2 or 3.
+
+    The squared distance is a weighted sum of chi-squares; a gamma distribution with its mean and variance
+    (Satterthwaite) is exact for d = 1 and for equal weights, and within 2 % in radius in between.
+    """
+    weights = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
+    mean, variance = float(weights.sum()), float(2.0 * (weights**2).sum())
+    if mean <= 0.0:
+        return 0.0
+    return float(np.sqrt(gammaincinv(mean**2 / variance, 0.68) * variance / mean))
+
+
+def placement_covariance(area: Area, feature_map: FeatureMap, center: FloatArray) -> FloatArray:
+    """What the map's placement adds to the covariance (6, 6) of a pose, in the area's axes.
+
+    Args:
+        center: (3,) camera centre in the area's frame.
+    """
+    area_from_map = area.frame.enu_from(feature_map.frame)
+    by_placement = np.zeros((6, 7))
+    by_placement[:3, 1:4] = np.eye(3)
+    by_placement[3:, :] = point_jacobian(area_from_map.inverse().act(center))
+    turn = np.kron(np.eye(2), area_from_map.rotation)
+    placed = turn @ by_placement @ feature_map.placement.covariance @ by_placement.T @ turn.T
+    return np.asarray(placed, dtype=np.float64)
+
+
+def map_covariance(area: Area, center: FloatArray, rows: NDArray[np.int64]) -> FloatArray:
+    """What the map's adjustment adds to the covariance (6, 6) of a pose, in the area's axes.
+
+    The pose of the map's image that shares most points stands for the shape of the map there: what moved it
+    moves whoever is localised by those points.
+
+    Args:
+        center: (3,) camera centre in the area's frame. rows: of the area's points that gave the pose.
+    """
+    wanted = np.zeros(len(area.points), dtype=np.bool_)
+    wanted[rows] = True
+    shared = np.bincount(area.see_image[wanted[area.see_point]], minlength=len(area.image_map))
+    best = int(np.argmax(shared))
+    feature_map = area.maps[int(area.image_map[best])]
+    first = int(np.searchsorted(area.image_map, area.image_map[best]))
+    image = feature_map.images[best - first]
+    if image.covariance is None:
+        return np.zeros((6, 6))
+    turn = area.frame.enu_from(feature_map.frame).rotation @ image.cam_from_local.rotation.T
+    arm = np.eye(6)
+    arm[3:, :3] = -skew(center - area.image_center[best])
+    by_pose = arm @ np.kron(np.eye(2), -turn)
+    return np.asarray(by_pose @ image.covariance @ by_pose.T, dtype=np.float64)
+
+
+def on_earth(
+    area: Area,
+    main: FeatureMap,
+    center: FloatArray,
+    measured: FloatArray,
+    rows: NDArray[np.int64],
+    shape: FloatArray | None = None,
+) -> FloatArray:
+    """Measured covariance (6, 6) plus those of the map and its placement, true east-north-up at the camera.
+
+    Args:
+        center: (3,) camera centre in the area's frame. measured: in the area's axes.
+        rows: of the area's points that gave the pose.
+    """
+    mapped = placement_covariance(area, main, center)
+    mapped += map_covariance(area, center, rows) if shape is None else shape
+    to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
+    covariance = to_true @ (measured + mapped) @ to_true.T
+    return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
+
+
+def _lineage(feature_map: FeatureMap) -> dict[str, Any]:
+    return {
+        "map_id": feature_map.map_id,
+        "name": feature_map.name,
+        "method": feature_map.placement.method,
+        "generation": feature_map.generation,
+        "parents": list(feature_map.parents),
+    }
+
+
+def _inliers(area: Area, order: list[int], pixels: FloatArray, point_rows: NDArray[np.int64]) -> Inliers:
+    place = np.full(len(area.maps), -1, dtype=np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    utm = np.empty((len(point_rows), 3))
+    for i in order:
+        mine = area.point_map[point_rows] == i
+        utm[mine] = area.maps[i].points.utm[area.point_row[point_rows[mine]]]
+    return Inliers(pixels=pixels, points_utm=utm, map_rows=place[area.point_map[point_rows]])

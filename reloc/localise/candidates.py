@@ -1,0 +1,165 @@
+"""Which part of the maps a photo may show: voting for images, then clusters of images that see the same."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from featuredb.features.features import Features
+from featuredb.geometry.arrays import FloatArray
+from featuredb.index.area import Area
+from featuredb.index.descriptor_index import DescriptorIndex
+from featuredb.maps.feature_map import GeoPrior
+from reloc.localise.options import CandidateOptions
+
+# A place this far under the frame's horizon is more than 1,100 km away.
+_FAR_BELOW_M = 100_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class IndexedArea:
+    """An area and the index over its descriptors."""
+
+    area: Area
+    index: DescriptorIndex
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cluster:
+    """Images of one area that see the same place.
+
+    Attributes:
+        area: where they are.
+        images: (i,) rows of the area's images.
+        points: (p,) rows of the area's points that they see.
+        score: votes above expectation, in standard deviations; infinity where all areas are tried anyway.
+    """
+
+    area: Area
+    images: NDArray[np.intp]
+    points: NDArray[np.int32]
+    score: float
+
+
+def find_clusters(
+    areas: Sequence[IndexedArea],
+    features: Features,
+    prior: GeoPrior | None,
+    options: CandidateOptions,
+    beyond: GeoPrior | None = None,
+) -> list[Cluster]:
+    """Clusters to try, best first; empty where the prior lies outside all maps or nothing got votes.
+
+    Args:
+        beyond: images that may see what a camera within this prior sees are left out: they were tried.
+    """
+    reach = [(indexed, images_in_reach(indexed.area, prior, options)) for indexed in areas]
+    if beyond is not None:
+        reach = [(a, allowed & ~images_in_reach(a.area, beyond, options)) for a, allowed in reach]
+    reach = [(indexed, allowed) for indexed, allowed in reach if allowed.any()]
+    images = [np.flatnonzero(allowed) for _, allowed in reach]
+    points = [indexed.area.points_of_images(rows) for (indexed, _), rows in zip(reach, images, strict=True)]
+    small = [len(rows) <= options.single_cluster_points for rows in points]
+    if all(small) and len(reach) <= options.max_clusters:
+        return [
+            Cluster(area=indexed.area, images=images[i], points=points[i], score=np.inf)
+            for i, (indexed, _) in enumerate(reach)
+        ]
+    votes = _vote([indexed for indexed, _ in reach], features, options)
+    share = sum(float(v.sum()) for v in votes) / max(sum(len(v) for v in votes), 1)
+    found: list[Cluster] = []
+    for i, (indexed, allowed) in enumerate(reach):
+        if small[i]:
+            score = float(_above_chance(votes[i][points[i]].sum(), share * len(points[i])))
+            found.append(Cluster(area=indexed.area, images=images[i], points=points[i], score=score))
+        else:
+            scores = np.where(allowed, _image_scores(indexed.area, votes[i], share), -np.inf)
+            found.extend(_grow_clusters(indexed.area, scores, options))
+    found.sort(key=lambda cluster: -cluster.score)
+    return found[: options.shortlist]
+
+
+def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
+    """(i,) which images may see what a camera within the prior sees. Only horizontal distances count."""
+    if prior is None:
+        return np.ones(len(area.image_center), dtype=np.bool_)
+    height = prior.height_m if prior.height_m is not None else area.frame.height_m
+    place = area.frame.enu_from_geodetic(np.array([prior.latitude_deg, prior.longitude_deg, height]))
+    if place[2] < -_FAR_BELOW_M:  # the far side of the Earth: its horizontal distances come back to zero
+        return np.zeros(len(area.image_center), dtype=np.bool_)
+    margin = options.prior_sigmas * prior.sigma_horizontal_m + options.prior_reach * area.image_reach
+    to_camera = np.linalg.norm(area.image_center[:, :2] - place[:2], axis=1)
+    to_scene = np.linalg.norm(area.image_scene[:, :2] - place[:2], axis=1)
+    return np.asarray(np.minimum(to_camera, to_scene) <= margin, dtype=np.bool_)
+
+
+def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOptions) -> list[FloatArray]:
+    """For each area the votes (p,) of its points: a feature votes for its nearest point of all areas.
+
+    By as much as that point is nearer than the `vote_background`-th, in squares: what looks like everything
+    else says nothing (McCann and Lowe, Local Naive Bayes Nearest Neighbor, 2012). Points as near as the
+    nearest get the same vote: other maps' points of the same place, and look-alikes. A vote counts one on
+    average.
+    """
+    asked = features.descriptors[: options.vote_features]
+    found = [indexed.index.search(asked, options.vote_background) for indexed in areas]
+    rows = np.concatenate([r for _, r in found], axis=1)
+    squared = np.concatenate([d for d, _ in found], axis=1).astype(np.float64)
+    squared[rows < 0] = np.inf
+    ranked = np.sort(squared, axis=1)[:, : options.vote_background]
+    background = np.max(ranked, axis=1, where=np.isfinite(ranked), initial=1.0)[:, None]
+    weight = np.maximum(1.0 - squared / background, 0.0)
+    weight[squared > (1.0 + options.vote_tie) ** 2 * ranked[:, :1]] = 0.0
+    weight /= max(float(weight[weight > 0.0].mean()) if (weight > 0.0).any() else 0.0, 1e-9)
+    votes: list[FloatArray] = []
+    for indexed, part in zip(areas, np.split(np.arange(rows.shape[1]), len(areas)), strict=True):
+        given = weight[:, part] > 0.0
+        chosen, weights = rows[:, part][given], weight[:, part][given]
+        counted = np.bincount(chosen, weights=weights, minlength=len(indexed.area.points))
+        votes.append(counted.astype(np.float64))
+    return votes
+
+
+def _image_scores(area: Area, votes_of_point: FloatArray, share: float) -> FloatArray:
+    """(i,) votes of each image above what chance gives it, in standard deviations.
+
+    Args:
+        share: votes per point over all areas. An image that sees many points gets many votes by chance:
+            p points get p times this, with about that variance.
+    """
+    votes = np.add.reduceat(
+        np.append(votes_of_point[area.see_point], 0.0), np.minimum(area.image_start[:-1], len(area.see_point))
+    )
+    seen = np.diff(area.image_start)
+    votes[seen == 0] = 0.0
+    return np.asarray(_above_chance(votes, share * seen), dtype=np.float64)
+
+
+def _above_chance(votes: ArrayLike, expected: ArrayLike) -> FloatArray:
+    return np.asarray((np.subtract(votes, expected)) / np.sqrt(np.add(expected, 1.0)), dtype=np.float64)
+
+
+def _grow_clusters(area: Area, scores: FloatArray, options: CandidateOptions) -> list[Cluster]:
+    """Around each image with most votes left, the images that share most points with it."""
+    free = np.isfinite(scores)
+    clusters: list[Cluster] = []
+    for _ in range(options.shortlist):
+        if not free.any():
+            break
+        seed = int(np.argmax(np.where(free, scores, -np.inf)))
+        row = area.covisible[[seed], :].tocoo()
+        neighbours, shared = row.coords[1], row.data
+        usable = np.isfinite(scores[neighbours])
+        neighbours, shared = neighbours[usable], shared[usable]
+        # Shared points decide which images belong together, votes which of them matter.
+        weight = np.sqrt(shared) * np.maximum(scores[neighbours], 0.0) + 1e-3 * shared
+        weight[neighbours == seed] = np.inf
+        images = np.union1d(
+            [seed], neighbours[np.argsort(-weight, kind="stable")[: options.max_cluster_images]]
+        )
+        free[images] = False
+        clusters.append(
+            Cluster(area=area, images=images, points=area.points_of_images(images), score=float(scores[seed]))
+        )
+    return clusters

@@ -1,0 +1,171 @@
+"""One photo against indexed maps: a pose, or a reason why there is none.
+
+The steps, in order: features; clusters of map images that may show the same; 2D-3D matches inside each
+cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import IncompatibleExtractorError
+from featuredb.features.extractor import extract
+from featuredb.features.features import Features
+from featuredb.stage_clock import StageClock
+from reloc.localise.acceptance import confidence, prior_tells, verdict
+from reloc.localise.answer import make_answer
+from reloc.localise.candidates import IndexedArea
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.pose import PoseUncertainty, pose_uncertainty
+from reloc.localise.prior import contradicts_prior
+from reloc.localise.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
+from reloc.localise.rivals import runner_up
+from reloc.localise.search import PoseCandidate, Search, pairs, search
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Localised:
+    """A result with what it was made of, for callers that go on from there.
+
+    Attributes:
+        best: the believed pose with its matches and area; None exactly where the result has no pose.
+        uncertainty: of that pose, measured part only, in the area's axes.
+    """
+
+    result: LocaliseResult
+    best: PoseCandidate | None = None
+    uncertainty: PoseUncertainty | None = None
+
+
+def localise(
+    gray: NDArray[np.uint8],
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions | None = None,
+    snapshot: int = 0,
+) -> LocaliseResult:
+    """Pose of a photo.
+
+    Args:
+        gray: (h, w) uint8, pixels as stored in the file.
+        areas: the indexed maps to search.
+        snapshot: version of the database that the areas come from, passed through.
+
+    Raises:
+        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        ImageError: the image is not (h, w) uint8 or tiny.
+        InvalidValueError: the request's camera is of another image size.
+    """
+    options = options or LocaliseOptions()
+    check_extractor(areas, options)
+    clock = StageClock()
+    features = extract(gray, options.extractor)
+    clock.lap("features")
+    return _localised(features, request, areas, options, snapshot, clock).result
+
+
+def localise_features(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions | None = None,
+) -> Localised:
+    """`localise` of a photo whose features are there already, strongest and best spread first.
+
+    Raises:
+        IncompatibleExtractorError: an area's descriptors are of another extractor than the options'.
+        InvalidValueError: the request's camera is of another image size.
+    """
+    options = options or LocaliseOptions()
+    check_extractor(areas, options)
+    return _localised(features, request, areas, options, 0, StageClock())
+
+
+def _localised(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions,
+    snapshot: int,
+    clock: StageClock,
+) -> Localised:
+    found = search(features, request, areas, options, clock)
+    localised = _decide(found, features, request, options, snapshot)
+    clock.lap("answer")
+    return replace(localised, result=replace(localised.result, timings_ms=clock.milliseconds()))
+
+
+def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:
+    """Raise IncompatibleExtractorError where descriptors could not be compared."""
+    for indexed in areas:
+        if indexed.area.extractor_fingerprint != options.extractor.fingerprint:
+            raise IncompatibleExtractorError(
+                f"the maps were made by extractor {indexed.area.extractor_fingerprint}, this query uses "
+                f"{options.extractor.fingerprint}: their descriptors cannot be compared; use the same "
+                "extractor options (upright or not) as the ingest"
+            )
+
+
+def _decide(
+    found: Search,
+    features: Features,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    snapshot: int,
+) -> Localised:
+    def refuse(reason: Reason, detail: str, inliers: int = 0, rival: RunnerUp | None = None) -> Localised:
+        result = LocaliseResult(
+            reason=reason,
+            detail=detail,
+            pose=None,
+            confidence=0.0,
+            features=len(features),
+            matches=found.matches,
+            inliers=inliers,
+            runner_up=rival,
+            snapshot=snapshot,
+            evidence=found.candidates[0].evidence if found.candidates else None,
+        )
+        return Localised(result=result)
+
+    if found.reason is not None:
+        return refuse(found.reason, found.detail)
+    if not found.candidates:
+        return refuse("TOO_FEW_INLIERS", f"no pose agrees with the {found.matches} matches")
+    best = found.candidates[0]
+    rival = runner_up(best, found.candidates[1:])
+    refusal = verdict(
+        best.evidence,
+        rival.inliers if rival else 0,
+        options.acceptance,
+        told_by_prior=prior_tells(request.prior, options.acceptance),
+    )
+    if refusal is not None:
+        return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
+    pixels, points = pairs(features, best.area, best.matches)
+    rows = best.matches.point[best.rows]
+    uncertainty = pose_uncertainty(
+        pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
+    )
+    told = request.camera if request.camera_is_exact else None
+    answer = make_answer(
+        best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers, told
+    )
+    against = contradicts_prior(answer, request.prior)
+    if against is not None:
+        return refuse("CONTRADICTS_PRIOR", against, best.evidence.inliers, rival)
+    result = LocaliseResult(
+        reason=None,
+        detail=f"{best.evidence.inliers} inliers of {found.matches} matches",
+        pose=answer,
+        confidence=confidence(best.evidence, rival.inliers if rival else 0),
+        features=len(features),
+        matches=found.matches,
+        inliers=best.evidence.inliers,
+        runner_up=rival,
+        snapshot=snapshot,
+        evidence=best.evidence,
+    )
+    return Localised(result=result, best=best, uncertainty=uncertainty)

@@ -1,0 +1,289 @@
+"""Absolute pose from 2D-3D matches: LO-RANSAC, focal length where unknown, refinement, covariance."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import poselib
+import pycolmap
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from reloc.localise.jacobians import pixel_jacobians
+from reloc.localise.lens_prior import QueryLensPrior
+from reloc.localise.options import PoseOptions
+from reloc.localise.self_calibration import calibrate, covariance_from_information, joint_jacobians
+
+CameraSource = Literal["request", "map", "exif", "estimated"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseHypothesis:
+    """A pose with the matches that agree with it.
+
+    Attributes:
+        cam_from_local: area frame to camera.
+        camera: intrinsics, the focal length estimated where `camera_source` is exif or estimated.
+        inliers: (m,) bool over the matches that it was estimated from.
+        prior_focal_px: focal length from EXIF, or the guess that stands for an unknown one.
+        lens_prior: what was known of the lens beforehand, where it is estimated with the pose; None: it is
+            exact, or nothing has been refined yet.
+    """
+
+    cam_from_local: Rigid3
+    camera: Camera
+    camera_source: CameraSource
+    inliers: NDArray[np.bool_]
+    prior_focal_px: float
+    lens_prior: QueryLensPrior | None = None
+
+    @property
+    def count(self) -> int:
+        return int(self.inliers.sum())
+
+    @property
+    def focal_is_free(self) -> bool:
+        """Whether the focal length was looked for together with the pose."""
+        return self.camera_source in ("exif", "estimated")
+
+
+def estimate_pose(
+    pixels: FloatArray, points: FloatArray, camera: Camera, source: CameraSource, options: PoseOptions
+) -> PoseHypothesis | None:
+    """LO-RANSAC (poselib's P3P; pycolmap's P4Pf besides where the focal length is free), or None.
+
+    Args:
+        pixels: (m, 2) full-size pixels. points: (m, 3) metres in the area's frame.
+        camera: intrinsics, or a start for the focal length where `source` is exif or estimated.
+    """
+    if len(pixels) < options.min_matches:
+        return None
+    tolerance_px = options.tolerance_rel * max(camera.width, camera.height)
+    tries = [_ransac(pixels, points, guess, tolerance_px, options) for guess in _guesses(camera, source)]
+    if source in ("exif", "estimated"):
+        tries.append(_ransac_focal(pixels, points, camera, tolerance_px, options))
+    found = [
+        PoseHypothesis(
+            cam_from_local=cam_from_local,
+            camera=lens,
+            camera_source=source,
+            inliers=reprojection_errors(pixels, points, lens, cam_from_local) < tolerance_px,
+            prior_focal_px=camera.focal_px,
+        )
+        for cam_from_local, lens in (found for found in tries if found is not None)
+    ]
+    return max(found, key=lambda pose: pose.count, default=None)
+
+
+def _guesses(camera: Camera, source: CameraSource) -> list[Camera]:
+    """Lenses that are tried as if they were known.
+
+    The focal length of a minimal sample is arbitrary where the scene is flat and seen from above; there any
+    focal length fits, and the refinement goes on from the guess.
+    """
+    factors = {"exif": (1.0, 0.87, 1.15), "estimated": (1.0, 0.5, 0.7, 1.4, 2.0)}
+    return [
+        camera if f == 1.0 else camera.with_focal(f * camera.focal_px) for f in factors.get(source, (1.0,))
+    ]
+
+
+def _ransac(
+    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+) -> tuple[Rigid3, Camera] | None:
+    pose, info = poselib.estimate_absolute_pose(
+        pixels,
+        points,
+        _poselib_camera(camera),
+        {
+            "max_reproj_error": tolerance_px,
+            "seed": options.seed,
+            "success_prob": options.confidence,
+            "min_iterations": 200,
+            "max_iterations": options.max_iterations,
+        },
+        {"loss_type": "CAUCHY", "loss_scale": 0.25 * tolerance_px},
+    )
+    if info["num_inliers"] < 4:
+        return None
+    w, x, y, z = pose.q
+    return Rigid3.from_quaternion([x, y, z, w], pose.t), camera
+
+
+def _ransac_focal(
+    pixels: FloatArray, points: FloatArray, camera: Camera, tolerance_px: float, options: PoseOptions
+) -> tuple[Rigid3, Camera] | None:
+    settings = pycolmap.AbsolutePoseEstimationOptions()
+    settings.estimate_focal_length = True
+    settings.ransac.max_error = tolerance_px
+    settings.ransac.random_seed = options.seed
+    settings.ransac.confidence = options.confidence
+    settings.ransac.max_num_trials = options.max_iterations
+    settings.ransac.min_num_trials = 200
+    working = camera.to_pycolmap()  # pycolmap writes the focal length into it
+    found = pycolmap.estimate_absolute_pose(pixels, points, working, settings)
+    if found is None or found["num_inliers"] < 4:
+        return None
+    focal = float(np.mean([working.params[i] for i in working.focal_length_idxs()]))
+    # 0.3 to 5 times the longer side is 118 to 11 degrees of view: outside lies no camera that SIFT serves.
+    if not 0.3 <= focal / max(camera.width, camera.height) <= 5.0:
+        return None
+    return _from_pycolmap(found["cam_from_world"]), Camera.from_pycolmap(working)
+
+
+def refine_pose(
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, options: PoseOptions, rounds: int = 2
+) -> PoseHypothesis:
+    """Robust refinement (Cauchy) on all matches within reach, then the inliers counted anew.
+
+    The lens is refined too where it is not known, within what lenses are like.
+
+    Args:
+        rounds: how often the matches within reach are chosen anew.
+    """
+    tolerance_px = options.tolerance_rel * max(start.camera.width, start.camera.height)
+    pose = start
+    for _ in range(rounds):
+        residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
+        near = residual < 2.0 * tolerance_px
+        if near.sum() < 4:
+            break
+        if pose.focal_is_free or pose.lens_prior is not None:
+            pose = _refine_with_lens(pixels[near], points[near], pose, tolerance_px, options)
+        else:
+            pose = _refine_known_lens(pixels, points, near, pose, tolerance_px)
+    residual = reprojection_errors(pixels, points, pose.camera, pose.cam_from_local)
+    return replace(pose, inliers=residual < tolerance_px)
+
+
+def _refine_known_lens(
+    pixels: FloatArray,
+    points: FloatArray,
+    near: NDArray[np.bool_],
+    start: PoseHypothesis,
+    tolerance_px: float,
+) -> PoseHypothesis:
+    settings = pycolmap.AbsolutePoseRefinementOptions()
+    settings.loss_function_scale = 0.25 * tolerance_px
+    found = pycolmap.refine_absolute_pose(
+        pycolmap.Rigid3d(start.cam_from_local.matrix()[:3]),
+        pixels,
+        points,
+        near,
+        start.camera.to_pycolmap(),
+        settings,
+    )
+    return start if found is None else replace(start, cam_from_local=_from_pycolmap(found["cam_from_world"]))
+
+
+def _refine_with_lens(
+    pixels: FloatArray, points: FloatArray, start: PoseHypothesis, tolerance_px: float, options: PoseOptions
+) -> PoseHypothesis:
+    prior = start.lens_prior
+    if prior is None:
+        priors = options.lens
+        rel = priors.exif_focal_rel if start.camera_source == "exif" else priors.unknown_focal_rel
+        prior = priors.around(start.camera, start.prior_focal_px, rel)
+    found = calibrate(pixels, points, start.cam_from_local, start.camera, prior, 0.25 * tolerance_px)
+    return replace(start, cam_from_local=found.cam_from_local, camera=found.camera, lens_prior=prior)
+
+
+def reprojection_errors(
+    pixels: FloatArray, points: FloatArray, camera: Camera, cam_from_local: Rigid3
+) -> FloatArray:
+    """(m,) distances in pixels, infinity for points behind the camera."""
+    difference = camera.project(cam_from_local.act(points)) - pixels
+    error = np.sqrt(np.einsum("ij,ij->i", difference, difference))
+    return np.where(np.isfinite(error), error, np.inf)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseUncertainty:
+    """Covariance of a pose, measurement part.
+
+    Attributes:
+        covariance: (6, 6), area frame's axes: rotation of the camera (rad) before displacement of its
+            centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C).
+        residual_rms_px: of the inliers.
+    """
+
+    covariance: FloatArray
+    residual_rms_px: float
+
+
+def pose_uncertainty(
+    pixels: FloatArray,
+    points: FloatArray,
+    point_covariance: FloatArray,
+    pose: PoseHypothesis,
+    options: PoseOptions,
+) -> PoseUncertainty:
+    """From the Jacobian of the inliers, scaled by the measured residuals; an estimated lens marginalised.
+
+    Args:
+        pixels, points: (k, 2), (k, 3) of the inliers only.
+        point_covariance: (k, 3, 3) in the area's frame.
+    """
+    lens = pose.lens_prior
+    jacobians = pixel_jacobians if lens is None else joint_jacobians
+    by_point, jacobian = jacobians(pose.camera, pose.cam_from_local, points)
+    residual = pose.camera.project(pose.cam_from_local.act(points)) - pixels
+    noise = np.eye(2) + by_point @ point_covariance @ by_point.transpose(0, 2, 1)
+    weight = np.linalg.inv(noise)
+    chi_square = float(np.einsum("ni,nij,nj->", residual, weight, residual))
+    # Chi-square per degree of freedom, times what the robust loss costs.
+    factor = chi_square / max(2 * len(points) - jacobian.shape[2], 1)
+    factor *= _price_of_robustness(residual, _loss_scale_px(pose.camera, options), jacobian.shape[2])
+    # Residuals of zero are test data; the floor is a hundredth of a pixel.
+    information = np.einsum("nij,nik,nkl->jl", jacobian, weight, jacobian) / max(factor, 1e-4)
+    if lens is not None:
+        information[6:, 6:] += np.diag(lens.information)
+    covariance = covariance_from_information(information)
+    if lens is not None and lens.dilution > 1.0:
+        by_lens = covariance[:6, 6:] @ np.linalg.solve(covariance[6:, 6:], covariance[6:, :6])
+        covariance[:6, :6] += (lens.dilution - 1.0) * by_lens
+    return PoseUncertainty(
+        covariance=covariance[:6, :6],
+        residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
+    )
+
+
+def _price_of_robustness(residual: FloatArray, scale_px: float, parameters: int) -> float:
+    """Variance of the Cauchy estimate over that of least squares, for residuals (k, 2) like these.
+
+    Asymptotic variance of an M-estimator, E[psi^2] / E[psi']^2, with the correction for the number of
+    estimated parameters (Huber, Robust Statistics, 1981, ch. 3 and 7.6). Above 1 for residuals as wide as
+    the loss. Far below it where most are small and a few lie at the edge of the tolerance, as matches
+    usually do: least squares would follow those few.
+    """
+    squared = np.sum(residual**2, axis=1)
+    spread = float(np.mean(squared))
+    if spread <= 0.0:
+        return 1.0
+    weight = 1.0 / (1.0 + squared / scale_px**2)
+    across, along = weight, weight - 2.0 * weight**2 * squared / scale_px**2
+    # Residuals much larger than the scale have hardly any slope left; beyond this the formula says nothing.
+    slope = max(float(np.mean(across + along)) / 2.0, 0.1)
+    variation = max(float(np.mean(across**2 + along**2)) / 2.0 / slope**2 - 1.0, 0.0)
+    few = 1.0 + parameters / residual.size * variation
+    # A dozen residuals may be small by luck; the lower bound keeps that from being taken for precision.
+    return float(np.clip(few**2 * np.mean(weight**2 * squared) / spread / slope**2, 0.1, 10.0))
+
+
+def _loss_scale_px(camera: Camera, options: PoseOptions) -> float:
+    """Scale of the Cauchy loss: a quarter of the inlier tolerance."""
+    return 0.25 * options.tolerance_rel * max(camera.width, camera.height)
+
+
+def _poselib_camera(camera: Camera) -> dict[str, Any]:
+    return {
+        "model": camera.model,
+        "width": camera.width,
+        "height": camera.height,
+        "params": list(camera.params),
+    }
+
+
+def _from_pycolmap(rigid: Any) -> Rigid3:
+    return Rigid3.from_matrix(rigid.matrix())

@@ -1,0 +1,237 @@
+"""What goes into a localisation and what comes out of it."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.geopose import GeoPose
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import GeoPrior
+from featuredb.maps.unplaced_map import OwnFrame
+from reloc.localise.lens_prior import QueryLensPrior
+
+Reason = Literal[
+    "NO_COVERAGE",
+    "TOO_FEW_FEATURES",
+    "TOO_FEW_MATCHES",
+    "TOO_FEW_INLIERS",
+    "AMBIGUOUS",
+    "CONTRADICTS_PRIOR",
+]
+REASONS: tuple[Reason, ...] = get_args(Reason)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocaliseRequest:
+    """What is known of a query besides its pixels.
+
+    Attributes:
+        camera: intrinsics for the image's full size; None: see the next two.
+        camera_prior: how well its intrinsics are known, which are then estimated with the pose; None:
+            exactly.
+        camera_is_exact: the intrinsics are the true ones, and not lent by a map: they are estimated with the
+            pose within what the map's own lenses leave open, which has bent the map.
+        camera_key: EXIF make/model/size/focal key (featuredb.features.exif); a map's camera with the same
+            key lends its calibrated intrinsics.
+        film: of a film that does not name its camera, `featuredb.features.film_lens.unnamed_model`; the
+            lenses that maps have of its shots are tried.
+        exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
+        prior: where the photo may have been taken; None: anywhere in the database.
+        beyond: a prior that was tried in vain; what it reaches is not tried again.
+        map_ids: only these maps; None: all active ones. A map without a place is named alone; it answers in
+            its own frame, and a prior does not count.
+        want_inliers: the answer carries pixels and UTM points of its inliers.
+    """
+
+    camera: Camera | None = None
+    camera_prior: QueryLensPrior | None = None
+    camera_is_exact: bool = False
+    camera_key: str | None = None
+    film: str | None = None
+    exif_focal_px: float | None = None
+    prior: GeoPrior | None = None
+    beyond: GeoPrior | None = None
+    map_ids: tuple[str, ...] | None = None
+    want_inliers: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Inliers:
+    """The matches that agree with the pose.
+
+    Attributes:
+        pixels: (k, 2) float64, keypoints of the query in full-size pixels.
+        points_utm: (k, 3) float64, easting, northing, height of the map points.
+        map_rows: (k,) int32, index into LocalisedPose.map_ids.
+    """
+
+    pixels: FloatArray
+    points_utm: FloatArray
+    map_rows: NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocalisedPose:
+    """A pose on Earth.
+
+    Attributes:
+        frame: local ENU frame in which the pose was computed.
+        cam_from_local: pose, `frame` to camera axes (x right, y down, z forward), metres.
+        covariance: (6, 6), axes true-north east-north-up at the camera: small rotation of the camera about
+            those axes (rad) before displacement of the camera centre (m). R_true = R(dtheta) R,
+            C_true = C + dC. Measurement noise scaled by the residuals, plus the map's own uncertainty.
+        camera: intrinsics used, full image size.
+        camera_source: request, map, exif or estimated.
+        epsg: UTM zone of `utm`.
+        utm: (3,) easting, northing, height of the camera centre, metres.
+        cam_from_utm_xyzw: rotation, grid axes (east, north, up) to camera axes.
+        geopose: the same as an OGC GeoPose.
+        height_datum: datum of the heights, as the maps have it.
+        horizontal_68_m, vertical_68_m, orientation_68_deg: radii that hold 68 % of the errors.
+        map_ids: maps whose points are among the inliers, most inliers first.
+        lineage: for each of map_ids, what placed it: method, generation, parents; from a `Localiser`, which
+            knows the other maps, too, also steps, anchors, drift_m, budget_m (featuredb.maps.lineage).
+        residual_rms_px: of the inliers, in full-size pixels.
+    """
+
+    frame: LocalFrame
+    cam_from_local: Rigid3
+    covariance: FloatArray
+    camera: Camera
+    camera_source: Literal["request", "map", "exif", "estimated"]
+    epsg: int
+    utm: FloatArray
+    cam_from_utm_xyzw: FloatArray
+    geopose: GeoPose
+    height_datum: str
+    horizontal_68_m: float
+    vertical_68_m: float
+    orientation_68_deg: float
+    map_ids: tuple[str, ...]
+    lineage: tuple[dict[str, Any], ...]
+    residual_rms_px: float
+    inliers: Inliers | None = None
+
+    def __post_init__(self) -> None:
+        for name, shape in (("covariance", (6, 6)), ("utm", (3,)), ("cam_from_utm_xyzw", (4,))):
+            object.__setattr__(self, name, frozen_array(f"LocalisedPose.{name}", getattr(self, name), shape))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseInMap:
+    """A pose in the own frame of a map without a place; it says nothing of where on Earth that is.
+
+    Attributes:
+        map_id: of the map.
+        frame: whether its unit is a metre, and whether its z is up.
+        cam_from_map: pose, own frame to camera axes (x right, y down, z forward), units of the frame.
+        covariance: (6, 6), axes of the own frame: small rotation of the camera about them (rad) before
+            displacement of the camera centre (units of the frame).
+        camera, camera_source, residual_rms_px: as in LocalisedPose.
+    """
+
+    map_id: str
+    frame: OwnFrame
+    cam_from_map: Rigid3
+    covariance: FloatArray
+    camera: Camera
+    camera_source: Literal["request", "map", "exif", "estimated"]
+    residual_rms_px: float
+
+    def __post_init__(self) -> None:
+        covariance = frozen_array("PoseInMap.covariance", self.covariance, (6, 6))
+        object.__setattr__(self, "covariance", covariance)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RunnerUp:
+    """The best pose elsewhere, which did not win.
+
+    Attributes:
+        inliers: its inlier count.
+        distance_m: from the winner's camera centre.
+        angle_deg: between the two orientations.
+        latitude_deg, longitude_deg: where it is.
+    """
+
+    inliers: int
+    distance_m: float
+    angle_deg: float
+    latitude_deg: float
+    longitude_deg: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """The figures behind a decision.
+
+    Attributes:
+        inliers: matches that agree with the pose.
+        log_nfa: -log10 of the expected number of as good poses among random matches.
+        coverage: share of a 10x10 grid over the image that holds inliers.
+        agreement: of the parts of the image where the map should be seen, the share that holds inliers.
+        spread: the same over the share that as many inliers would reach if they lay like the map's points.
+    """
+
+    inliers: int
+    log_nfa: float
+    coverage: float
+    agreement: float
+    spread: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocaliseResult:
+    """The answer to one query: a pose, or a reason why there is none. Never a fallback pose.
+
+    Attributes:
+        reason: None exactly when there is a pose, on Earth or in a map.
+        detail: one sentence for people.
+        pose: the accepted pose on Earth, or None.
+        in_map: the accepted pose in the own frame of a map without a place, which the request named, or None.
+        confidence: probability that the pose is right, in [0, 1]; 0 when not localised.
+        features, matches, inliers: counts: keypoints of the query, 2D-3D matches of the best cluster,
+            matches that agree with the best pose (also of a rejected one: evidence).
+        runner_up: the best other hypothesis, or None.
+        snapshot: version of the database that answered.
+        evidence: for the best pose, believed or not; None where no pose was found at all.
+        timings_ms: stage name -> milliseconds, in the order they ran, and their `total`.
+    """
+
+    reason: Reason | None
+    detail: str
+    pose: LocalisedPose | None
+    confidence: float
+    features: int
+    matches: int
+    inliers: int
+    runner_up: RunnerUp | None
+    snapshot: int
+    evidence: Evidence | None = None
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    in_map: PoseInMap | None = None
+
+    def __post_init__(self) -> None:
+        said = [value is not None for value in (self.reason, self.pose, self.in_map)]
+        if sum(said) != 1:
+            raise InvalidValueError(
+                "LocaliseResult: expected a reason, a pose on Earth or one in a map, found none or several"
+            )
+        if self.reason is not None and self.reason not in REASONS:
+            raise InvalidValueError(
+                f"LocaliseResult.reason: expected one of {REASONS}, found {self.reason!r}"
+            )
+        if not 0.0 <= self.confidence <= 1.0:
+            raise InvalidValueError(f"LocaliseResult.confidence: expected 0..1, found {self.confidence}")
+
+    @property
+    def status(self) -> Literal["localised", "localised_in_map", "not_localised"]:
+        if self.in_map is not None:
+            return "localised_in_map"
+        return "not_localised" if self.pose is None else "localised"

@@ -1,0 +1,381 @@
+"""The poses that clusters of map images give a photo, each with its matches and the evidence for it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.errors import InvalidValueError
+from featuredb.features.features import Features
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.index.area import Area
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.lens_uncertainty import LensUncertainty
+from featuredb.stage_clock import StageClock
+from reloc.localise.acceptance import (
+    agreement,
+    coverage,
+    expected_cells,
+    independent_inliers,
+    log_nfa,
+    spread,
+)
+from reloc.localise.candidates import Cluster, IndexedArea, find_clusters
+from reloc.localise.lens_prior import is_lens_of_a_map, seen_by_a_map
+from reloc.localise.matching import (
+    EXPECTED_DEG,
+    POSSIBLE_DEG,
+    ClusterMatcher,
+    Matches,
+    guided_matches,
+    visible_points,
+)
+from reloc.localise.options import LocaliseOptions
+from reloc.localise.pose import (
+    CameraSource,
+    PoseHypothesis,
+    estimate_pose,
+    refine_pose,
+    reprojection_errors,
+)
+from reloc.localise.result import Evidence, LocaliseRequest, Reason
+
+_MORE_BY_REFINING = 2  # times RANSAC's inliers
+_FEWEST_CELLS = 10  # of a hundred in which a photo should show the map; fewer say little of its agreement
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PoseCandidate:
+    """The best pose that one cluster gives, with its matches and the evidence for it."""
+
+    area: Area
+    pose: PoseHypothesis
+    matches: Matches
+    evidence: Evidence
+    rows: NDArray[np.intp]  # matches that are independent inliers
+
+    @property
+    def main_map(self) -> FeatureMap:
+        """The map with most inliers."""
+        rows = self.rows if len(self.rows) else slice(None)
+        return self.area.maps[int(np.bincount(self.area.point_map[self.matches.point[rows]]).argmax())]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Search:
+    """What the search found: candidates, best first, and how far it came."""
+
+    candidates: list[PoseCandidate]
+    matches: int
+    reason: Reason | None
+    detail: str
+
+
+def search(
+    features: Features,
+    request: LocaliseRequest,
+    areas: Sequence[IndexedArea],
+    options: LocaliseOptions,
+    clock: StageClock,
+) -> Search:
+    if len(features) < options.acceptance.min_inliers:
+        return _nothing(
+            "TOO_FEW_FEATURES", f"{len(features)} keypoints in the photo; it shows too little texture"
+        )
+    clusters = find_clusters(areas, features, request.prior, options.candidates, request.beyond)
+    clock.lap("candidates")
+    if not clusters:
+        return _nothing("NO_COVERAGE", "no map lies within reach of the prior")
+    tries = [ClusterMatcher(features, cluster, options.matching) for cluster in clusters]
+    candidates: list[PoseCandidate] = []
+    most = 0
+    while tries:
+        matcher, *tries = tries
+        found, count = _try_cluster(features, matcher, request, options, clock)
+        most = max(most, count)
+        candidates.extend(found)
+        if candidates and _settled(candidates, matcher.cluster, [t.cluster for t in tries], options):
+            break
+        tries = most_matched(tries, options)
+        clock.lap("matching")
+    candidates.sort(key=lambda c: (-c.evidence.log_nfa, -c.evidence.inliers))
+    if not candidates and most < options.pose.min_matches:
+        return _nothing("TOO_FEW_MATCHES", f"{most} matches between the photo and the maps", most)
+    return Search(candidates=candidates, matches=most, reason=None, detail="")
+
+
+def most_matched(tries: list[ClusterMatcher], options: LocaliseOptions) -> list[ClusterMatcher]:
+    """Of more clusters than may still be tried, those that match best, best first."""
+    take = options.candidates.max_clusters - 1
+    if len(tries) <= take:
+        return tries
+    matches = [len(matcher.matches(options.candidates.shortlist_features)) for matcher in tries]
+    order = np.argsort(-np.array(matches), kind="stable")
+    return [tries[i] for i in order[:take]]
+
+
+def _try_cluster(
+    features: Features,
+    matcher: ClusterMatcher,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    clock: StageClock,
+) -> tuple[list[PoseCandidate], int]:
+    """Poses of one cluster and the number of matches behind them.
+
+    The first features, which are the best spread, are matched alone; all of them only where that does not
+    settle it. Guided matching uses all of them in any case.
+    """
+    first = options.matching.first_features
+    for count in (first, len(features)) if first < len(features) else (len(features),):
+        matches = matcher.matches(count)
+        clock.lap("matching")
+        found = _poses(features, matcher.cluster, matches, request, options, clock)
+        if any(c.evidence.log_nfa > options.acceptance.settled_log_nfa for c in found):
+            break
+    return found, len(matches)
+
+
+def _settled(
+    candidates: list[PoseCandidate], cluster: Cluster, rest: list[Cluster], options: LocaliseOptions
+) -> bool:
+    """Whether the remaining clusters need not be tried.
+
+    So it is when a pose is sure and each of them has far fewer votes or lies around that very pose: its
+    images got their votes for seeing the same place, which the pose's own cluster holds already.
+    """
+    best = max(candidates, key=lambda c: c.evidence.log_nfa)
+    lines = options.acceptance
+    sure = best.evidence.log_nfa > lines.settled_log_nfa and best.evidence.spread >= lines.min_spread
+    return sure and all(other.score < 0.5 * cluster.score or _around(best, other) for other in rest)
+
+
+def _around(candidate: PoseCandidate, cluster: Cluster) -> bool:
+    """Whether the cluster's images look at what a camera at the candidate's pose may see."""
+    if cluster.area is not candidate.area:
+        return False
+    offset = cluster.area.image_scene[cluster.images] - candidate.pose.cam_from_local.center
+    reach = float(np.median(cluster.area.image_reach[cluster.images]))
+    return bool(np.median(np.linalg.norm(offset, axis=1)) <= 2.0 * reach)
+
+
+def _poses(
+    features: Features,
+    cluster: Cluster,
+    matches: Matches,
+    request: LocaliseRequest,
+    options: LocaliseOptions,
+    clock: StageClock,
+) -> list[PoseCandidate]:
+    """The cluster's best pose, and the best one among the matches that it leaves over."""
+    pose = _best_pose(
+        features, cluster.area, matches, camera_hypotheses(features, cluster.area, request), options
+    )
+    if pose is not None:
+        pose = _with_lens_prior(pose, cluster.area, matches, request)
+    clock.lap("pose")
+    if pose is None or pose.count < 4:
+        return []
+    if _is_hopeless(len(matches), pose, options):
+        return [_with_evidence(features, cluster, pose, matches, matches, options)]
+    best = _refined(features, cluster, matches, pose, options)
+    clock.lap("guided")
+    taken = np.isin(matches.point, best.matches.point[best.rows]) | pose.inliers
+    left = Matches(
+        feature=matches.feature[~taken], point=matches.point[~taken], distance=matches.distance[~taken]
+    )
+    # A photo has one lens, which the first pose has estimated.
+    rival = _best_pose(features, cluster.area, left, [(best.pose.camera, "request")], options)
+    clock.lap("pose")
+    if rival is None or rival.count < 4:
+        return [best]
+    second = _refined(features, cluster, left, rival, options)
+    clock.lap("guided")
+    source, focal_px = best.pose.camera_source, best.pose.prior_focal_px
+    return [
+        best,
+        replace(second, pose=replace(second.pose, camera_source=source, prior_focal_px=focal_px)),
+    ]
+
+
+def _with_lens_prior(
+    pose: PoseHypothesis, area: Area, matches: Matches, request: LocaliseRequest
+) -> PoseHypothesis:
+    """What is known of the lens: as the request says; of one that is known exactly, as the map shows it.
+
+    The map's own estimate of the same camera fits its points, which are bent by what that is off.
+    """
+    if not request.camera_is_exact:
+        return replace(pose, lens_prior=request.camera_prior)
+    counts = np.bincount(area.point_map[matches.point[pose.inliers]], minlength=len(area.maps))
+    uncertainty = LensUncertainty.of_provenance(area.maps[int(np.argmax(counts))].provenance)
+    if uncertainty is None:
+        return pose
+    own = None if request.camera_key is None else area.camera_for_key(request.camera_key)
+    own = None if own is None else _resampled(own, pose.camera.width, pose.camera.height)
+    if own is not None and is_lens_of_a_map(pose.camera, own, uncertainty):
+        return replace(pose, camera=own)
+    seen = seen_by_a_map(pose.camera, uncertainty)
+    return pose if seen is None else replace(pose, camera=seen[0], lens_prior=seen[1])
+
+
+def _is_hopeless(matches: int, pose: PoseHypothesis, options: LocaliseOptions) -> bool:
+    """Whether the pose would be refused with twice its inliers, too: refining and rivals would be idle.
+
+    What is refused costs most, since RANSAC ends early only where there is something to be found. Refining
+    adds a few to RANSAC's inliers; twice is out of reach.
+    """
+    width, height = pose.camera.width, pose.camera.height
+    tolerance_px = options.pose.tolerance_rel * max(width, height)
+    twice = min(_MORE_BY_REFINING * pose.count, matches)
+    sample = 4 if pose.focal_is_free else 3
+    return log_nfa(matches, twice, tolerance_px, width, height, sample) < options.acceptance.min_log_nfa
+
+
+def camera_hypotheses(
+    features: Features, area: Area, request: LocaliseRequest
+) -> list[tuple[Camera, CameraSource]]:
+    """Intrinsics to try: the request's; else map cameras of the same key, or film; else the focal is free.
+
+    Raises:
+        InvalidValueError: the request's camera is of another image size.
+    """
+    if request.camera is not None:
+        if (request.camera.width, request.camera.height) != (features.width, features.height):
+            raise InvalidValueError(
+                f"LocaliseRequest.camera: expected intrinsics for {features.width}x{features.height} pixels, "
+                f"found {request.camera.width}x{request.camera.height}; use Camera.scaled_to"
+            )
+        return [(request.camera, "request")]
+    if request.camera_key:
+        camera = area.camera_for_key(request.camera_key)
+        if camera is not None and (camera.width, camera.height) != (features.width, features.height):
+            camera = _resampled(camera, features.width, features.height)  # frames of films are made smaller
+        if camera is not None:
+            return [(camera, "map")]
+    if request.film:
+        of_film = area.cameras_of_film(request.film)
+        lent = [_resampled(camera, features.width, features.height) for camera in of_film]
+        if any(camera is not None for camera in lent):
+            return [(camera, "map") for camera in lent if camera is not None]
+    longer = max(features.width, features.height)
+    if request.exif_focal_px:
+        return [(Camera.from_focal(features.width, features.height, request.exif_focal_px), "exif")]
+    # 1.2 times the longer side (a 45-degree lens) only starts the estimate.
+    return [(Camera.from_focal(features.width, features.height, 1.2 * longer), "estimated")]
+
+
+def _resampled(camera: Camera, width: int, height: int) -> Camera | None:
+    """The lens for another size of its pictures; None where that is of another shape."""
+    try:
+        return camera.scaled_to(width, height)
+    except InvalidValueError:
+        return None
+
+
+def _best_pose(
+    features: Features,
+    area: Area,
+    matches: Matches,
+    cameras: list[tuple[Camera, CameraSource]],
+    options: LocaliseOptions,
+) -> PoseHypothesis | None:
+    pixels, points = pairs(features, area, matches)
+    found = [estimate_pose(pixels, points, camera, source, options.pose) for camera, source in cameras]
+    poses = [pose for pose in found if pose is not None]
+    return max(poses, key=lambda pose: pose.count) if poses else None
+
+
+def _refined(
+    features: Features, cluster: Cluster, matches: Matches, pose: PoseHypothesis, options: LocaliseOptions
+) -> PoseCandidate:
+    """Refine on matches looked for where the pose says they are; keep that only if it agrees with more."""
+    area = cluster.area
+    pixels, points = pairs(features, area, matches)
+    best, kept = refine_pose(pixels, points, pose, options.pose, rounds=1), matches
+    guided = guided_matches(
+        features, area, cluster.points, best.camera, best.cam_from_local, options.matching
+    )
+    if len(guided) >= 4:
+        pixels, points = pairs(features, area, guided)
+        again = refine_pose(pixels, points, best, options.pose)
+        if again.count >= best.count:
+            best, kept = again, guided
+    return _with_evidence(features, cluster, best, kept, matches, options)
+
+
+def _with_evidence(
+    features: Features,
+    cluster: Cluster,
+    pose: PoseHypothesis,
+    matches: Matches,
+    unguided: Matches,
+    options: LocaliseOptions,
+) -> PoseCandidate:
+    """The number of false alarms is that of the unguided matches: guided ones look where they are wanted.
+
+    Of those, only independent ones count, or a few places that match several times over would be believed.
+    """
+    area, width, height = cluster.area, pose.camera.width, pose.camera.height
+    tolerance_px = options.pose.tolerance_rel * max(width, height)
+    own = _independent(features, area, pose, matches, pose.inliers)
+    error = reprojection_errors(*pairs(features, area, unguided), pose.camera, pose.cam_from_local)
+    blind = _independent(features, area, pose, unguided, error < tolerance_px)
+    inlier_pixels = features.xy[matches.feature[own]]
+    expected_pixels = _expected(area, cluster.points.astype(np.int64), pose)
+    evidence = Evidence(
+        inliers=len(own),
+        log_nfa=log_nfa(
+            len(unguided),
+            len(blind),
+            tolerance_px,
+            width,
+            height,
+            sample=4 if pose.focal_is_free else 3,
+        ),
+        coverage=coverage(inlier_pixels, width, height),
+        agreement=agreement(inlier_pixels, expected_pixels, width, height),
+        spread=spread(inlier_pixels, expected_pixels, width, height),
+    )
+    return PoseCandidate(area=area, pose=pose, matches=matches, evidence=evidence, rows=own)
+
+
+def _expected(area: Area, points: NDArray[np.int64], pose: PoseHypothesis) -> FloatArray:
+    """Pixels of points that the photo should show: as the map has seen them, or else farther from it.
+
+    Where the map knows hardly anything from that side, what SIFT may still find is what there is to agree
+    with.
+    """
+    pixels = np.zeros((0, 2))
+    for beyond_deg in (EXPECTED_DEG, POSSIBLE_DEG):
+        visible = visible_points(area, points, pose.camera, pose.cam_from_local, beyond_deg)
+        pixels = pose.camera.project(pose.cam_from_local.act(area.points[visible]))
+        if expected_cells(pixels, pose.camera.width, pose.camera.height) >= _FEWEST_CELLS:
+            break
+    return pixels
+
+
+def _independent(
+    features: Features, area: Area, pose: PoseHypothesis, matches: Matches, inlier: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Rows of the inliers that the pose can see, each a measurement of its own.
+
+    A flat place fits a mirrored photo if one looks at it from under the ground: such inliers do not count.
+    """
+    rows = np.flatnonzero(inlier)
+    seen = visible_points(area, matches.point[rows], pose.camera, pose.cam_from_local, POSSIBLE_DEG)
+    rows = rows[np.isin(matches.point[rows], seen)]
+    pixels, points = pairs(features, area, matches)
+    gap_px = 0.002 * max(pose.camera.width, pose.camera.height)
+    return rows[independent_inliers(pixels[rows], points[rows], gap_px)]
+
+
+def pairs(features: Features, area: Area, matches: Matches) -> tuple[FloatArray, FloatArray]:
+    """Pixels (m, 2) and points (m, 3) of the matches, float64."""
+    return features.xy[matches.feature].astype(np.float64), area.points[matches.point]
+
+
+def _nothing(reason: Reason, detail: str, matches: int = 0) -> Search:
+    return Search(candidates=[], matches=matches, reason=reason, detail=detail)

@@ -1,0 +1,215 @@
+"""Pose and lens together, where the lens is not known: robust least squares with priors on the intrinsics.
+
+A photo of a nearly flat scene hardly tells focal length from height, nor a curved field from a bent lens.
+The priors keep the estimate where lenses are, and the covariance says what the photo could not tell.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from reloc.localise.jacobians import chain_to_pose
+from reloc.localise.lens_prior import QueryLensPrior, lens_of, whole_lens, with_lens
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Calibrated:
+    """Pose and camera together."""
+
+    cam_from_local: Rigid3
+    camera: Camera
+
+
+def calibrate(
+    pixels: FloatArray,
+    points: FloatArray,
+    start_pose: Rigid3,
+    start_camera: Camera,
+    prior: QueryLensPrior,
+    noise_px: float,
+) -> Calibrated:
+    """Refine pose and lens: as many parameters as the prior has.
+
+    Gauss-Newton with Cauchy weights; converges in a few steps from a RANSAC pose.
+
+    Args:
+        pixels, points: (k, 2), (k, 3), mostly inliers.
+        noise_px: residuals of this size are normal; scale of the Cauchy loss. How much the pixels count
+            against the priors follows from the residuals at the start.
+
+    Raises:
+        InvalidValueError: the camera is of another model.
+    """
+    camera = with_lens(start_camera, whole_lens(lens_of(start_camera))[: len(prior.mean)])
+    problem = LensProblem(
+        pixels=pixels,
+        points=points,
+        noise_px=noise_px,
+        trust=(noise_px / measured_noise_px(pixels, points, start_pose, camera, noise_px)) ** 2,
+        prior=prior,
+    )
+    pose, camera = _minimise(problem, start_pose, camera)
+    return Calibrated(cam_from_local=pose, camera=camera)
+
+
+def joint_jacobians(
+    camera: Camera, cam_from_local: Rigid3, points: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Derivatives of pixels by points (k, 2, 3), and by pose and lens (k, 2, 6 + n), n as in `lens_of`.
+
+    In closed form: pixel = (f, f (1 + aspect)) d(u, v) + c with (u, v) = (x, y) / z and Brown's distortion d.
+    """
+    lens = lens_of(camera)
+    focal, _, _, k1, aspect, k2, p1, p2 = whole_lens(lens)
+    in_camera = cam_from_local.act(points)
+    depth = in_camera[:, 2]
+    uv = in_camera[:, :2] / depth[:, None]
+    u, v = uv.T
+    squared = u * u + v * v
+    stretch, slope = 1.0 + (k1 + k2 * squared) * squared, 2.0 * (k1 + 2.0 * k2 * squared)
+    scale = focal * np.array([1.0, 1.0 + aspect])
+    first = np.stack([2.0 * u * v, squared + 2.0 * v * v], axis=1)  # by p1
+    second = np.stack([squared + 2.0 * u * u, 2.0 * u * v], axis=1)  # by p2
+    bent = stretch[:, None] * uv + p1 * first + p2 * second
+    across = slope * u * v + 2.0 * (p1 * u + p2 * v)
+    along_u = stretch + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
+    along_v = stretch + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v
+    by_uv = scale[:, None] * np.stack([along_u, across, across, along_v], axis=1).reshape(-1, 2, 2)
+    by_camera = np.concatenate([by_uv, -by_uv @ uv[:, :, None]], axis=2) / depth[:, None, None]
+    by_point, by_pose = chain_to_pose(by_camera, cam_from_local, points)
+    by_lens = [
+        bent * [1.0, 1.0 + aspect],
+        np.tile([1.0, 0.0], (len(points), 1)),
+        np.tile([0.0, 1.0], (len(points), 1)),
+        scale * squared[:, None] * uv,
+        focal * bent * [0.0, 1.0],
+        scale * (squared**2)[:, None] * uv,
+        scale * first,
+        scale * second,
+    ]
+    return by_point, np.concatenate([by_pose, np.stack(by_lens[: len(lens)], axis=2)], axis=2)
+
+
+def covariance_from_information(information: FloatArray) -> FloatArray:
+    """Inverse of an information matrix; what it leaves open gets a huge variance, never a small one."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-12))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+    return np.asarray(inverse * np.outer(scale, scale), dtype=np.float64)
+
+
+def measured_noise_px(
+    pixels: FloatArray, points: FloatArray, pose: Rigid3, camera: Camera, noise_px: float
+) -> float:
+    """Deviation of one coordinate by the median residual; between a tenth and twice what is normal."""
+    error = np.linalg.norm(camera.project(pose.act(points)) - pixels, axis=1)
+    error = error[np.isfinite(error)]
+    if len(error) == 0:
+        return noise_px
+    # 1.1774: median of the length of a two-dimensional unit Gaussian.
+    return float(np.clip(np.median(error) / 1.1774, 0.1 * noise_px, 2.0 * noise_px))
+
+
+def _minimise(problem: "LensProblem", pose: Rigid3, camera: Camera) -> tuple[Rigid3, Camera]:
+    """Levenberg-Marquardt. Cauchy weights make its steps too short, so longer ones are tried too."""
+    damping = 1e-4
+    cost = problem.cost(pose, camera)
+    for _ in range(20):
+        system = problem.linearise(pose, camera)
+        before = cost
+        while damping < 1e6:
+            # The floor keeps the matrix regular where no point says anything of a parameter.
+            diagonal = np.maximum(np.diag(system.information), 1e-9)
+            step: FloatArray = np.linalg.solve(
+                system.information + damping * np.diag(diagonal), system.gradient
+            ).astype(np.float64)
+            length, moved = problem.best_length(pose, camera, step)
+            if moved < cost:
+                pose, camera = _step(pose, camera, length * step)
+                cost, damping = moved, max(0.3 * damping, 1e-10)
+                break
+            damping *= 10.0
+        if before - cost < 1e-7 * before:
+            break
+    return pose, camera
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class NormalEquations:
+    """Normal equations of one Levenberg-Marquardt step: (6 + n, 6 + n) and (6 + n,)."""
+
+    information: FloatArray
+    gradient: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LensProblem:
+    """Measurements and priors; parameters are pose (6), then the lens as in `lens_of`."""
+
+    pixels: FloatArray
+    points: FloatArray
+    noise_px: float
+    trust: float  # of a pixel: variance that noise_px stands for over the measured one
+    prior: QueryLensPrior
+
+    def cost(self, pose: Rigid3, camera: Camera) -> float:
+        """Half the Cauchy loss in units of the noise plus half the priors' chi-square."""
+        return self.cost_of_pixels(pose, camera) + prior_cost(self.prior, camera)
+
+    def cost_of_pixels(self, pose: Rigid3, camera: Camera) -> float:
+        """Half the Cauchy loss in units of the noise."""
+        residual = camera.project(pose.act(self.points)) - self.pixels
+        squared = np.sum(residual**2, axis=1) / self.noise_px**2
+        squared = np.where(np.isfinite(squared), squared, 1e6)
+        return 0.5 * float(self.trust * np.log1p(squared).sum())
+
+    def best_length(self, pose: Rigid3, camera: Camera, step: FloatArray) -> tuple[float, float]:
+        """The best of the lengths 1, 2 and 4 of a step, and the cost there."""
+        length, cost = 1.0, self.cost(*_step(pose, camera, step))
+        for longer in (2.0, 4.0):
+            longer_cost = self.cost(*_step(pose, camera, longer * step))
+            if longer_cost >= cost:
+                break
+            length, cost = longer, longer_cost
+        return length, cost
+
+    def linearise(self, pose: Rigid3, camera: Camera) -> NormalEquations:
+        """Gauss-Newton with the Cauchy weights 1 / (1 + r^2 / s^2), and the prior."""
+        in_camera = pose.act(self.points)
+        # The derivatives reach a little beyond the point: on the fold of the distortion there are none.
+        front = (in_camera[:, 2] > 0.1) & np.isfinite(camera.project(in_camera * [1.001, 1.001, 1.0])).all(1)
+        _, jacobian = joint_jacobians(camera, pose, self.points[front])
+        residual = self.pixels[front] - camera.project(in_camera[front])
+        weight = self.trust / (self.noise_px**2 + np.sum(residual**2, axis=1))
+        information = np.einsum("nij,n,nik->jk", jacobian, weight, jacobian)
+        gradient = np.einsum("nij,n,ni->j", jacobian, weight, residual)
+        information[6:, 6:] += np.diag(self.prior.information)
+        gradient[6:] += (self.prior.mean - lens_of(camera)) * self.prior.information
+        return NormalEquations(information=information, gradient=gradient)
+
+
+def prior_cost(prior: QueryLensPrior, camera: Camera) -> float:
+    """Half the chi-square of a lens under what was known of it."""
+    return 0.5 * float(np.sum((lens_of(camera) - prior.mean) ** 2 * prior.information))
+
+
+def _step(pose: Rigid3, camera: Camera, delta: FloatArray) -> tuple[Rigid3, Camera]:
+    return pose_step(pose, delta[:6]), lens_step(camera, delta[6:])
+
+
+def pose_step(pose: Rigid3, delta: FloatArray) -> Rigid3:
+    """A pose moved by a rotation and a displacement (6,) of its centre about the local axes."""
+    rotation = pose.rotation @ so3_exp(delta[:3]).T
+    return Rigid3(rotation=rotation, translation=-rotation @ (pose.center + delta[3:]))
+
+
+def lens_step(camera: Camera, delta: FloatArray) -> Camera:
+    """A lens with other parameters, in the order of `lens_of`."""
+    lens = lens_of(camera)
+    moved = lens + delta
+    moved[0] = np.clip(moved[0], 0.7 * lens[0], 1.4 * lens[0])  # one step's reach
+    return with_lens(camera, moved)

@@ -1,0 +1,1 @@
+"""Contributed photos on their way from a query to the database."""

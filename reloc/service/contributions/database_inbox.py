@@ -1,0 +1,66 @@
+"""Contributed photos as a database keeps them: what of the query and of its answer goes with the photo."""
+
+from dataclasses import asdict
+from datetime import datetime
+from typing import Any
+
+from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.features.image_header import read_header
+from featuredb.store import Database
+from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidates import InboxCounts, contribute, count_candidates
+from reloc.wire.query import LocaliseReply, LocaliseWireRequest
+
+_ANSWER = {
+    "request_id", "status", "reason", "detail", "position", "utm", "height_datum", "covariance", "accuracy",
+    "confidence", "camera", "matches", "inliers", "residual_rms_px", "maps",
+}  # fmt: skip
+
+
+class DatabaseInbox:
+    """See `reloc.service.contributions.inbox.InboxStore`."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def write(self, contributions: list[Contribution]) -> None:
+        """Store them in one append.
+
+        Raises:
+            StoreError
+        """
+        contribute(self._database, contributions)
+
+    def counts(self) -> InboxCounts:
+        """How much is stored.
+
+        Raises:
+            StoreError
+        """
+        return count_candidates(self._database)
+
+
+def contribution_of(
+    data: bytes, request: LocaliseWireRequest, reply: LocaliseReply, received_at: datetime
+) -> Contribution:
+    """The row of a contributed photo out of its query, which has been answered and found valid."""
+    header = read_header(data)
+    asked = request.model_dump(mode="json", include={"request_id", "camera", "prior", "options"})
+    return Contribution(
+        image=data,
+        width=header.width,
+        height=header.height,
+        owner=request.owner or "",
+        licence=request.licence or "",
+        client_id=request.client_id or "",
+        received_at=received_at,
+        request={**asked, "exif": _told(read_exif(data, header))},
+        answer=reply.model_dump(mode="json", include=_ANSWER),
+        snapshot=reply.snapshot,
+    )
+
+
+def _told(exif: ExifInfo) -> dict[str, Any]:
+    """What the photo says about itself, without what it does not say."""
+    told = {name: value for name, value in asdict(exif).items() if value not in (None, "", ())}
+    return {name: value.isoformat() if isinstance(value, datetime) else value for name, value in told.items()}

@@ -1,0 +1,291 @@
+"""Contributed photos on their way from a query to the database: a bounded queue and one thread that writes.
+
+A query never waits for the store: a place in the queue is reserved before the answer is sent and used after
+it.
+What cannot be taken is refused with a reason, and the query is answered all the same.
+"""
+
+import logging
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from featuredb.store.candidate_states import Contribution
+from featuredb.store.candidates import InboxCounts
+from reloc.wire.query import ContributionReason
+from reloc.wire.server import ContributionStatus
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InboxOptions:
+    """Bounds of the inbox.
+
+    Attributes:
+        max_queue: photos that wait for the writing thread. It writes them together, in less than a second on
+            a disk; two workers answer some eight queries a second.
+        max_queued_bytes: of these photos, so that they cannot fill the memory.
+        max_owner_photos: photos of one owner that wait for growth; a day's walk has some hundreds, and one
+            owner cannot crowd out the others.
+        max_photos: photos of all owners that wait for growth.
+        max_stored_bytes: of all stored photos, whatever has become of them; some thousands of a drone's.
+        batch: photos that are written in one commit.
+        refresh_s: how old the counts may be by which the last three are judged.
+        retry_s: pauses before a failed write is tried again; after the last its photos are given up.
+    """
+
+    max_queue: int = 32
+    max_queued_bytes: int = 256 * 2**20
+    max_owner_photos: int = 2_000
+    max_photos: int = 20_000
+    max_stored_bytes: int = 40 * 2**30
+    batch: int = 8
+    refresh_s: float = 30.0
+    retry_s: tuple[float, ...] = (0.5, 2.0, 8.0, 30.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InboxRefusal:
+    """Why a photo is not taken."""
+
+    reason: ContributionReason
+    detail: str
+
+
+class InboxStore(Protocol):
+    """Where contributions go; the methods may take seconds and raise FeatureDbError."""
+
+    def write(self, contributions: list[Contribution]) -> None:
+        """Store them all."""
+        ...
+
+    def counts(self) -> InboxCounts:
+        """How much is stored."""
+        ...
+
+
+class Ticket:
+    """A place in the queue; either `submit` or `cancel` must be called, once."""
+
+    __slots__ = ("_inbox", "owner", "size")
+
+    def __init__(self, inbox: "Inbox", owner: str, size: int) -> None:
+        self._inbox = inbox
+        self.owner = owner
+        self.size = size
+
+    def submit(self, make: Callable[[], Contribution]) -> None:
+        """Give the photo; `make` is called by the writing thread."""
+        self._inbox._take(self, make)
+
+    def cancel(self) -> None:
+        """Give the place back."""
+        self._inbox._release(self)
+
+
+class Inbox:
+    """Takes photos from the workers; they share it."""
+
+    def __init__(self, store: InboxStore, options: InboxOptions | None = None) -> None:
+        self._store = store
+        self._options = options or InboxOptions()
+        self._changed = threading.Condition()
+        self._queue: deque[tuple[Ticket, Callable[[], Contribution]]] = deque()
+        self._reserved = self._reserved_bytes = 0  # places given out and not yet written
+        self._owners: Counter[str] = Counter()  # of these places
+        self._counts = InboxCounts(by_state={}, waiting_by_owner={}, stored_bytes=0)
+        self._counted_at = -1e9
+        self._limited = False  # someone was refused by the counts since they were taken
+        self._accepted = self._written = self._lost = 0
+        self._refused: Counter[str] = Counter()
+        self._error: str | None = None
+        self._closed = False
+        self._stop = threading.Event()  # ends the pauses between retries
+        self._thread = threading.Thread(target=self._run, name="inbox", daemon=True)
+
+    def start(self) -> None:
+        """Count what is there and begin to write. A store that fails is told by `status` and refusals."""
+        self._refresh()
+        self._thread.start()
+
+    def close(self, timeout_s: float) -> None:
+        """Write what is queued, at most for this long; take no more."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._stop.set()
+        self._thread.join(timeout_s)
+        with self._changed:
+            if self._queue:
+                logger.error(
+                    "contributions lost: the server stopped before the store took them",
+                    extra={"fields": {"event": "contributions_lost", "count": len(self._queue)}},
+                )
+
+    def reserve(self, owner: str, size: int) -> Ticket | InboxRefusal:
+        """A place for a photo of `size` bytes, or why there is none. Returns at once."""
+        with self._changed:
+            refusal = self._refusal(owner, size)
+            if refusal is not None:
+                self._refused[refusal.reason] += 1
+                return refusal
+            self._reserved += 1
+            self._reserved_bytes += size
+            self._owners[owner] += 1
+            return Ticket(self, owner, size)
+
+    def status(self) -> ContributionStatus:
+        """For `.../status`."""
+        with self._changed:
+            return ContributionStatus(
+                accepted=self._accepted,
+                refused=dict(sorted(self._refused.items())),
+                waiting=self._reserved,
+                written=self._written,
+                lost=self._lost,
+                error=self._error,
+            )
+
+    def _refusal(self, owner: str, size: int) -> InboxRefusal | None:
+        options, counts = self._options, self._counts
+        if self._error is not None or self._closed:
+            why = self._error or "the server is stopping"
+            return InboxRefusal(reason="STORE_FAILED", detail=f"the inbox cannot be written: {why}")
+        if self._reserved >= options.max_queue or self._reserved_bytes + size > options.max_queued_bytes:
+            return InboxRefusal(
+                reason="QUEUE_FULL",
+                detail=f"{self._reserved} contributed photos ({self._reserved_bytes} bytes) wait to be "
+                "stored; send it again in a few seconds",
+            )
+        mine = counts.waiting_by_owner.get(owner, 0) + self._owners[owner]
+        stored = counts.stored_bytes + self._reserved_bytes
+        refusal = None
+        if mine >= options.max_owner_photos:
+            refusal = InboxRefusal(
+                reason="OWNER_LIMIT",
+                detail=f"{mine} photos of this owner wait for growth, which is as many as one owner may have",
+            )
+        elif counts.waiting + self._reserved >= options.max_photos:
+            refusal = InboxRefusal(
+                reason="INBOX_FULL",
+                detail=f"{counts.waiting + self._reserved} photos wait for growth, which is the limit",
+            )
+        elif stored + size > options.max_stored_bytes:
+            refusal = InboxRefusal(
+                reason="INBOX_FULL",
+                detail=f"the stored photos take {stored} of {options.max_stored_bytes} bytes",
+            )
+        if refusal is not None:
+            self._limited = True
+            self._changed.notify()
+        return refusal
+
+    def _take(self, ticket: Ticket, make: Callable[[], Contribution]) -> None:
+        with self._changed:
+            self._queue.append((ticket, make))
+            self._accepted += 1
+            self._changed.notify()
+
+    def _release(self, ticket: Ticket) -> None:
+        with self._changed:
+            self._reserved -= 1
+            self._reserved_bytes -= ticket.size
+            self._owners[ticket.owner] -= 1
+            if not self._owners[ticket.owner]:
+                del self._owners[ticket.owner]
+
+    def _run(self) -> None:
+        while (batch := self._next()) is not None:
+            if batch:
+                self._write(batch)
+            self._refresh_if_old()
+
+    def _next(self) -> "list[tuple[Ticket, Callable[[], Contribution]]] | None":
+        """What waits, at most a batch; nothing when counts are due; None once closed and empty."""
+        with self._changed:
+            while not self._queue and not self._closed:
+                if self._limited or self._error is not None:
+                    self._changed.wait(self._options.refresh_s)
+                    return []
+                self._changed.wait()
+            if not self._queue:
+                return None
+            return [self._queue.popleft() for _ in range(min(len(self._queue), self._options.batch))]
+
+    def _write(self, batch: "list[tuple[Ticket, Callable[[], Contribution]]]") -> None:
+        tickets = [ticket for ticket, _ in batch]
+        contributions = [made for _, make in batch if (made := _made(make)) is not None]
+        written = self._write_with_retries(contributions) if contributions else False
+        with self._changed:
+            if written:
+                self._written += len(contributions)
+                self._lost += len(batch) - len(contributions)
+                waiting = Counter(self._counts.waiting_by_owner) + Counter(t.owner for t in tickets)
+                states = Counter(self._counts.by_state) + Counter(waiting=len(batch))
+                stored = self._counts.stored_bytes + sum(t.size for t in tickets)
+                self._counts = InboxCounts(
+                    by_state=dict(states), waiting_by_owner=dict(waiting), stored_bytes=stored
+                )
+            else:
+                self._lost += len(batch)
+        for ticket in tickets:
+            self._release(ticket)
+
+    def _write_with_retries(self, contributions: list[Contribution]) -> bool:
+        for pause_s in (*self._options.retry_s, None):
+            try:
+                self._store.write(contributions)
+            except Exception as error:
+                # A store may break in many ways; the thread must live on, or photos would be lost for ever.
+                logger.warning(
+                    "inbox: a write failed", exc_info=True, extra={"fields": {"event": "inbox_failed"}}
+                )
+                with self._changed:
+                    self._error = f"{type(error).__name__}: {error}"
+                if pause_s is None or self._stop.wait(pause_s):
+                    break
+            else:
+                with self._changed:
+                    self._error = None
+                return True
+        logger.error(
+            "contributions lost: the store does not take them",
+            extra={"fields": {"event": "contributions_lost", "count": len(contributions)}},
+        )
+        return False
+
+    def _refresh_if_old(self) -> None:
+        with self._changed:
+            due = time.monotonic() - self._counted_at >= self._options.refresh_s
+            # The counts matter to those who were refused by them, and while the store was failing.
+            wanted = self._limited or self._error is not None or self._written > 0
+        if due and wanted:
+            self._refresh()
+
+    def _refresh(self) -> None:
+        """Take new counts; a store that answers again is trusted again."""
+        try:
+            counts, error = self._store.counts(), None
+        except Exception as failure:  # as for a write
+            counts, error = None, f"{type(failure).__name__}: {failure}"
+            logger.warning(
+                "inbox: cannot be counted", exc_info=True, extra={"fields": {"event": "inbox_failed"}}
+            )
+        with self._changed:
+            self._counts = counts or self._counts
+            self._error = error
+            self._counted_at = time.monotonic()
+            self._limited = False
+
+
+def _made(make: Callable[[], Contribution]) -> Contribution | None:
+    """The contribution; one that cannot be made must not take the others with it."""
+    try:
+        return make()
+    except Exception:
+        logger.exception("contribution lost", extra={"fields": {"event": "contributions_lost", "count": 1}})
+        return None

@@ -1,0 +1,1 @@
+"""The trajectory of a film: as a value, written, drawn, read back."""

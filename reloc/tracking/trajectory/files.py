@@ -1,0 +1,282 @@
+"""A trajectory as a file: CSV, TUM, GeoJSON, KML, OGC GeoPose series, DJI's subtitles, or a drawing.
+
+The suffix chooses. Frames whose track is lost are rows without a pose in CSV, and gaps in all others. A file
+appears whole or not at all.
+"""
+
+import csv
+import io
+import json
+import os
+import secrets
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.geopose_documents import irregular_series
+from reloc.tracking.trajectory.own_frame_files import own_format
+from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPoint
+
+_POSE = (
+    *("easting", "northing", "height", "qx", "qy", "qz", "qw", "latitude", "longitude"),
+    *("heading_deg", "pitch_deg", "roll_deg", "epsg", "height_datum", "map_id"),
+)
+_AXES = ("re", "rn", "ru", "e", "n", "u")
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+CSV_COLUMNS = (
+    *("frame", "time_s", "state", "inliers"),
+    *_POSE,
+    *(f"cov_{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER),
+    "detail",
+)
+
+
+def write_trajectory(path: Path, trajectory: Trajectory) -> None:
+    """Write a trajectory; `.csv`, `.tum`, `.geojson`, `.kml`, `.json` (GeoPose series), `.srt`, `.png`.
+
+    One in the frame of a map without a place: `.csv`, `.json`, see `own_frame_files`.
+
+    Raises:
+        InvalidValueError: another suffix, or no frame has a pose and the format holds nothing else.
+    """
+    made = (own_format(path) if trajectory.is_in_map else _format(path))(trajectory)
+    content = made if isinstance(made, bytes) else made.encode()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_format(path: Path) -> None:
+    """Whether the suffix is one of those above.
+
+    Raises:
+        InvalidValueError: it is not.
+    """
+    _format(path)
+
+
+def csv_text(trajectory: Trajectory) -> str:
+    """One row a frame.
+
+    Angles are heading clockwise from true north, pitch upwards, roll to the right; qx .. qw turn grid axes
+    into camera axes (x right, y down, z forward); cov_* is the covariance, rad and m, axes true east, north,
+    up: rotation (re, rn, ru) before displacement (e, n, u).
+    """
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(CSV_COLUMNS)
+    for point in trajectory.points:
+        head = (point.index, f"{point.time_s:.6f}", point.state, point.inliers)
+        if point.pose is None:
+            rows.writerow((*head, *([""] * (len(_POSE) + len(_UPPER))), point.detail))
+            continue
+        pose = point.pose
+        angles = (f"{a:.5f}" for a in pose.geopose.heading_pitch_roll_deg)
+        rows.writerow(
+            (
+                *head,
+                *(f"{v:.4f}" for v in pose.utm),
+                *(f"{q:.9f}" for q in pose.cam_from_utm_xyzw),
+                *(f"{pose.geopose.latitude_deg:.10f}", f"{pose.geopose.longitude_deg:.10f}"),
+                *angles,
+                *(pose.epsg, pose.height_datum, pose.map_id),
+                *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
+                point.detail,
+            )
+        )
+    return out.getvalue()
+
+
+def tum_text(trajectory: Trajectory) -> str:
+    """TUM's format for evo and its like: time x y z qx qy qz qw, world from camera, world is the UTM grid."""
+    found = _known(trajectory, "TUM")
+    _one_datum(trajectory, found)
+    zones = {pose.epsg for _, pose in found}
+    if len(zones) > 1:
+        raise InvalidValueError(
+            f"{trajectory.source}: TUM files have one grid, and the track crosses from EPSG:{min(zones)} to "
+            f"EPSG:{max(zones)}; write CSV"
+        )
+    lines = [f"# EPSG:{found[0][1].epsg}, heights {found[0][1].height_datum}; time tx ty tz qx qy qz qw"]
+    for point, pose in found:
+        x, y, z, w = pose.cam_from_utm_xyzw
+        place = " ".join(f"{v:.4f}" for v in pose.utm)
+        lines.append(f"{point.time_s:.6f} {place} {-x:.9f} {-y:.9f} {-z:.9f} {w:.9f}")
+    return "\n".join(lines) + "\n"
+
+
+def geojson_text(trajectory: Trajectory) -> str:
+    """RFC 7946: a line for each stretch without loss, and a point for each frame.
+
+    Heights are those of the maps, in their datum, which is among the properties.
+    """
+    _known(trajectory, "GeoJSON")
+    features = []
+    for number, stretch in enumerate(trajectory.stretches()):
+        if len(stretch) > 1:
+            features.append(
+                {
+                    "type": "Feature",
+                    "geometry": {"type": "LineString", "coordinates": [_place(pose) for _, pose in stretch]},
+                    "properties": {
+                        "stretch": number,
+                        "from_s": stretch[0][0].time_s,
+                        "to_s": stretch[-1][0].time_s,
+                        "source": trajectory.source,
+                    },
+                }
+            )
+        for point, pose in stretch:
+            heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
+            sigma = np.sqrt(np.diag(pose.covariance)[3:])
+            features.append(
+                {
+                    "type": "Feature",
+                    "geometry": {"type": "Point", "coordinates": _place(pose)},
+                    "properties": {
+                        "frame": point.index,
+                        "time_s": round(point.time_s, 6),
+                        "state": point.state,
+                        "heading_deg": round(heading, 4),
+                        "pitch_deg": round(pitch, 4),
+                        "roll_deg": round(roll, 4),
+                        "sigma_enu_m": [round(float(v), 4) for v in sigma],
+                        "height_datum": pose.height_datum,
+                        "map_id": pose.map_id,
+                        "geopose": pose.geopose.to_json(),
+                    },
+                }
+            )
+    return json.dumps({"type": "FeatureCollection", "features": features}, indent=1) + "\n"
+
+
+def kml_text(trajectory: Trajectory) -> str:
+    """A line for each stretch without loss, for Google Earth and the like; heights as the maps have them."""
+    found = _known(trajectory, "KML")
+    _one_datum(trajectory, found)
+    marks = []
+    for number, stretch in enumerate(trajectory.stretches()):
+        places = " ".join(",".join(f"{v:.10g}" for v in _place(pose)) for _, pose in stretch)
+        name = f"{stretch[0][0].time_s:.2f} s to {stretch[-1][0].time_s:.2f} s"
+        marks.append(
+            f'<Placemark id="stretch{number}"><name>{name}</name><LineString>'
+            f"<altitudeMode>absolute</altitudeMode><coordinates>{places}</coordinates></LineString></Placemark>"
+        )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+        f"<name>{escape(trajectory.source)}</name><description>heights: {found[0][1].height_datum}"
+        "</description>\n" + "\n".join(marks) + "\n</Document></kml>\n"
+    )
+
+
+def geopose_text(trajectory: Trajectory) -> str:
+    """OGC GeoPose 1.0, Irregular Series; the outer frame is east-north-up at the first pose.
+
+    Translations are metres, rotations are quaternions x, y, z, w of the body (x forward, y left, z up). Times
+    are Unix milliseconds, or since the film's start where that is not known.
+    """
+    found = _known(trajectory, "GeoPose")
+    _one_datum(trajectory, found)
+    start_ms = 0.0 if trajectory.start is None else 1000.0 * trajectory.start.timestamp()
+    poses = [(round(start_ms + 1000.0 * point.time_s), pose.geopose) for point, pose in found]
+    return json.dumps(irregular_series(poses), indent=1) + "\n"
+
+
+def srt_text(trajectory: Trajectory) -> str:
+    """Subtitles in the manner of DJI's newer drones, which map programs and players read.
+
+    abs_alt is the height as the maps have it; angles are those of the camera.
+    """
+    found = _known(trajectory, "SRT")
+    _one_datum(trajectory, found)
+    times = [point.time_s for point in trajectory.points]
+    usual_s = float(np.median(np.diff(times))) if len(times) > 1 else 1 / 30
+    ends_s = [*times[1:], times[-1] + usual_s]
+    end_of = {point.index: end_s for point, end_s in zip(trajectory.points, ends_s, strict=True)}
+    blocks: list[str] = []
+    for point, pose in found:
+        if point.time_s < 0:
+            continue  # subtitles begin with the film
+        number, end_s = len(blocks) + 1, end_of[point.index]
+        heading, pitch, roll = pose.geopose.heading_pitch_roll_deg
+        clock = ""
+        if trajectory.start is not None:
+            when = trajectory.start + timedelta(seconds=point.time_s)
+            clock = f"{when:%Y-%m-%d %H:%M:%S}.{when.microsecond // 1000:03d}\n"
+        shown = f"{_srt_time(point.time_s)} --> {_srt_time(end_s)}"
+        blocks.append(
+            f"{number}\n{shown}\nFrameCnt: {point.index + 1}\n{clock}"
+            f"[latitude: {pose.geopose.latitude_deg:.8f}] [longitude: {pose.geopose.longitude_deg:.8f}] "
+            f"[abs_alt: {pose.utm[2]:.3f}] [gb_yaw: {(heading + 180.0) % 360.0 - 180.0:.3f} "
+            f"gb_pitch: {pitch:.3f} gb_roll: {roll:.3f}]\n"
+        )
+    return "\n".join(blocks)
+
+
+def png(trajectory: Trajectory) -> bytes:
+    """From above, and the bounds of each axis over time."""
+    from reloc.tracking.trajectory.plot import plot_png  # matplotlib takes a second to load
+
+    return plot_png(trajectory)
+
+
+_FORMATS: dict[str, Callable[[Trajectory], str | bytes]] = {
+    ".csv": csv_text,
+    ".tum": tum_text,
+    ".geojson": geojson_text,
+    ".kml": kml_text,
+    ".json": geopose_text,
+    ".srt": srt_text,
+    ".png": png,
+}
+
+
+def _format(path: Path) -> Callable[[Trajectory], str | bytes]:
+    if path.suffix.lower() not in _FORMATS:
+        raise InvalidValueError(
+            f"{path.name}: expected a name that ends in {', '.join(_FORMATS)}, found {path.suffix!r}"
+        )
+    return _FORMATS[path.suffix.lower()]
+
+
+def _known(trajectory: Trajectory, what: str) -> Sequence[tuple[TrajectoryPoint, EarthPose]]:
+    found = [(p, p.pose) for p in trajectory.points if p.pose is not None]
+    if not found:
+        reasons = {p.detail for p in trajectory.points if p.detail}
+        raise InvalidValueError(
+            f"{trajectory.source}: no frame has a pose, a {what} file would be empty"
+            + (f" ({sorted(reasons)[0]})" if reasons else "")
+        )
+    return found
+
+
+def _one_datum(trajectory: Trajectory, found: Sequence[tuple[TrajectoryPoint, EarthPose]]) -> None:
+    datums = sorted({pose.height_datum for _, pose in found})
+    if len(datums) > 1:
+        raise InvalidValueError(
+            f"{trajectory.source}: the track crosses from maps with heights {datums[0]} to {datums[1]}, "
+            "which this format cannot say; write CSV or GeoJSON, or name maps of one datum"
+        )
+
+
+def _place(pose: EarthPose) -> list[float]:
+    return [
+        round(pose.geopose.longitude_deg, 10),
+        round(pose.geopose.latitude_deg, 10),
+        round(float(pose.utm[2]), 4),
+    ]
+
+
+def _srt_time(time_s: float) -> str:
+    milliseconds = round(1000.0 * max(time_s, 0.0))
+    minutes, rest = divmod(milliseconds, 60_000)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours:02d}:{minutes:02d}:{rest // 1000:02d},{rest % 1000:03d}"

@@ -1,0 +1,101 @@
+"""A trajectory in the own frame of a map without a place, as a file: CSV or JSON.
+
+Its columns and keys are called otherwise than those of tracks on Earth, so that nobody takes it for one.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.rotation import quaternion_from_matrix
+from reloc.tracking.trajectory.values import OwnPose, Trajectory
+
+_AXES = ("rx", "ry", "rz", "x", "y", "z")
+_UPPER = [(i, j) for i in range(6) for j in range(i, 6)]
+_POSE = (
+    *("own_x", "own_y", "own_z", "own_qx", "own_qy", "own_qz", "own_qw"),
+    *("own_unit", "own_z_is_up", "unplaced_map"),
+    *(f"own_cov_{_AXES[i]}_{_AXES[j]}" for i, j in _UPPER),
+)
+OWN_CSV_COLUMNS = ("frame", "time_s", "state", "inliers", *_POSE, "detail")
+
+
+def own_csv_text(trajectory: Trajectory) -> str:
+    """One row a frame.
+
+    own_x .. own_z is the camera centre in the map's own frame, in own_unit (metre, or map_unit where nothing
+    tells the scale); own_qx .. own_qw turn the frame's axes into camera axes (x right, y down, z forward);
+    own_cov_* is the covariance, axes of the frame: rotation (rx, ry, rz) in rad before displacement.
+    """
+    out = io.StringIO()
+    rows = csv.writer(out, lineterminator="\n")
+    rows.writerow(OWN_CSV_COLUMNS)
+    for point in trajectory.points:
+        pose = [""] * len(_POSE) if point.in_map is None else _cells(point.in_map)
+        rows.writerow((point.index, f"{point.time_s:.6f}", point.state, point.inliers, *pose, point.detail))
+    return out.getvalue()
+
+
+def own_json_text(trajectory: Trajectory) -> str:
+    """An object that says that nothing of it is on Earth, with a list of frames; lost ones have no pose."""
+    first = next(point.in_map for point in trajectory.points if point.in_map is not None)
+    frames = [
+        {
+            "frame": point.index,
+            "time_s": round(point.time_s, 6),
+            "state": point.state,
+            "inliers": point.inliers,
+            "cam_from_own": None
+            if point.in_map is None
+            else {
+                "center": [round(float(v), 9) for v in point.in_map.cam_from_map.center],
+                "rotation_xyzw": [
+                    round(float(q), 9) for q in quaternion_from_matrix(point.in_map.cam_from_map.rotation)
+                ],
+                "covariance": point.in_map.covariance.tolist(),
+            },
+            "detail": point.detail,
+        }
+        for point in trajectory.points
+    ]
+    about = {
+        "on_earth": False,
+        "unplaced_map": first.map_id,
+        "own_unit": _unit(first),
+        "own_z_is_up": first.frame.upright,
+        "source": trajectory.source,
+    }
+    return json.dumps(about | {"frames": frames}, indent=1) + "\n"
+
+
+def own_format(path: Path) -> Callable[[Trajectory], str]:
+    """What writes a file of that name.
+
+    Raises:
+        InvalidValueError: it is a format of places on Earth, or none.
+    """
+    if path.suffix.lower() not in OWN_FORMATS:
+        raise InvalidValueError(
+            f"{path.name}: the track is in the frame of a map without a place: expected a name that ends in "
+            f"{' or '.join(OWN_FORMATS)}, found {path.suffix!r}"
+        )
+    return OWN_FORMATS[path.suffix.lower()]
+
+
+OWN_FORMATS: dict[str, Callable[[Trajectory], str]] = {".csv": own_csv_text, ".json": own_json_text}
+
+
+def _cells(pose: OwnPose) -> list[str]:
+    return [
+        *(f"{v:.9g}" for v in pose.cam_from_map.center),
+        *(f"{q:.9f}" for q in quaternion_from_matrix(pose.cam_from_map.rotation)),
+        *(_unit(pose), str(pose.frame.upright).lower(), pose.map_id),
+        *(f"{pose.covariance[i, j]:.6e}" for i, j in _UPPER),
+    ]
+
+
+def _unit(pose: OwnPose) -> str:
+    return "metre" if pose.frame.metric else "map_unit"

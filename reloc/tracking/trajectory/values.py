@@ -1,0 +1,155 @@
+"""The track of a video: where the camera was at each frame, how surely, or that it is not known.
+
+On Earth, or in the own frame of a map without a place. The two are different types in different fields, so
+that whoever writes places on Earth finds none in the second.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import groupby
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.geopose import GeoPose, geopose_from_camera
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.maps.unplaced_map import OwnFrame
+from reloc.tracking.ground import StandingInMap
+from reloc.tracking.tracker import TrackedFrame, TrackState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EarthPose:
+    """Where the camera was; conventions as in `reloc.localise.result.LocalisedPose`.
+
+    Attributes:
+        epsg: UTM zone of `utm`, (3,) easting, northing, height of the camera centre, metres.
+        height_datum: datum of all heights.
+        cam_from_utm_xyzw: (4,) rotation, grid axes (east, north, up) to camera axes.
+        geopose: the same as an OGC GeoPose.
+        covariance: (6, 6), true east-north-up at the camera: rotation (rad) before displacement (m), of the
+            frame's own measurement and of the map's placement.
+        map_id: of the map, or the scan, whose points most landmarks are.
+    """
+
+    epsg: int
+    utm: FloatArray
+    height_datum: str
+    cam_from_utm_xyzw: FloatArray
+    geopose: GeoPose
+    covariance: FloatArray
+    map_id: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OwnPose:
+    """Where the camera was in the own frame of a map without a place.
+
+    Attributes:
+        map_id: of the map. frame: whether its unit is a metre, and whether its z is up.
+        cam_from_map: own frame to camera axes (x right, y down, z forward), units of the frame.
+        covariance: (6, 6), axes of the own frame: rotation (rad) before displacement (units of the frame).
+    """
+
+    map_id: str
+    frame: OwnFrame
+    cam_from_map: Rigid3
+    covariance: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrajectoryPoint:
+    """One frame.
+
+    Attributes:
+        index: of the frame, from 0. time_s: on the film's own clock.
+        pose: on Earth; None where the track is lost, and then `detail` says why, or where it is `in_map`.
+        in_map: the pose in the frame of a map without a place.
+        inliers: landmarks that agree with the pose.
+    """
+
+    index: int
+    time_s: float
+    state: TrackState
+    pose: EarthPose | None = None
+    in_map: OwnPose | None = None
+    inliers: int = 0
+    detail: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pose is not None and self.in_map is not None:
+            raise InvalidValueError(f"TrajectoryPoint {self.index}: on Earth and in a map without a place")
+
+    @property
+    def found(self) -> bool:
+        """Whether the frame has a pose, of either kind."""
+        return self.pose is not None or self.in_map is not None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Trajectory:
+    """The frames of one video, in order.
+
+    Attributes:
+        source: name of the video. database, version: that was asked.
+        start: when the film's clock showed 0, timezone-aware; None: not known.
+    """
+
+    source: str
+    points: tuple[TrajectoryPoint, ...]
+    database: str = ""
+    version: int = -1
+    start: datetime | None = None
+
+    @property
+    def is_in_map(self) -> bool:
+        """Whether the poses are in the frame of a map without a place, and none is on Earth."""
+        return any(point.in_map is not None for point in self.points)
+
+    def times_found(self) -> list[tuple[float, float]]:
+        """First and last time of each run of frames with poses of either kind, seconds."""
+        runs = (list(run) for found, run in groupby(self.points, key=lambda p: p.found) if found)
+        return [(run[0].time_s, run[-1].time_s) for run in runs]
+
+    def stretches(self) -> Iterator[list[tuple[TrajectoryPoint, EarthPose]]]:
+        """Runs of frames with poses on Earth, between those that are lost."""
+        for known, points in groupby(self.points, key=lambda p: p.pose is not None):
+            if known:
+                yield [(p, p.pose) for p in points if p.pose is not None]
+
+
+def point_of(frame: TrackedFrame) -> TrajectoryPoint:
+    """A tracked frame on Earth, or in its map where that has no place."""
+    pose = _pose(frame)
+    return TrajectoryPoint(
+        index=frame.index,
+        time_s=frame.time_s,
+        state=frame.state,
+        pose=pose if isinstance(pose, EarthPose) else None,
+        in_map=pose if isinstance(pose, OwnPose) else None,
+        inliers=frame.inliers,
+        detail=frame.detail,
+    )
+
+
+def _pose(frame: TrackedFrame) -> EarthPose | OwnPose | None:
+    ground, pose = frame.ground, frame.cam_from_local
+    if pose is None or ground is None or frame.rows is None or frame.covariance is None:
+        return None
+    stands = ground.standing(frame.rows, pose.center, frame.covariance)
+    if isinstance(stands, StandingInMap):
+        return OwnPose(
+            map_id=stands.map_id, frame=stands.frame, cam_from_map=pose, covariance=stands.covariance
+        )
+    return EarthPose(
+        epsg=stands.epsg,
+        utm=ground.frame.utm_from_enu(pose.center, stands.epsg),
+        height_datum=stands.height_datum,
+        cam_from_utm_xyzw=quaternion_from_matrix(
+            pose.rotation @ ground.frame.grid_from_enu(pose.center, stands.epsg).T
+        ),
+        geopose=geopose_from_camera(pose, ground.frame),
+        covariance=stands.covariance,
+        map_id=stands.map_id,
+    )
