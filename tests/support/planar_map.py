@@ -66,7 +66,8 @@ def planar_map(
 ) -> FeatureMap:
     """The map of a field whose middle lies `east_m` east of (EASTING, NORTHING), made from nine views."""
     frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
-    poses, found = _seen(texture_seed)
+    texture = field_texture(texture_seed)
+    poses, found = _seen(texture.tobytes(), texture.shape)
     ground = [_on_ground(f.xy, pose) for f, pose in zip(found, poses, strict=True)]
     points, rows = _tracks(ground, [f.scale for f in found])
     point_index = np.concatenate(rows)
@@ -113,9 +114,9 @@ def planar_map(
 
 
 @cache  # seconds, and many tests begin with the field of one seed
-def _seen(texture_seed: int) -> tuple[tuple[Rigid3, ...], tuple[Features, ...]]:
-    """The nine views, and the keypoints of each."""
-    texture = field_texture(texture_seed)
+def _seen(content: bytes, shape: tuple[int, ...]) -> tuple[tuple[Rigid3, ...], tuple[Features, ...]]:
+    """The nine views of a texture, and the keypoints of each."""
+    texture = np.frombuffer(content, dtype=np.uint8).reshape(shape)
     poses = tuple(
         view(e, n, 45.0, tilt, heading)
         for (e, n), tilt, heading in zip(
