@@ -53,7 +53,7 @@ class PictureShear:
 def shear_words(size: float) -> str:
     """A shear and its likely cause, for people."""
     return (
-        f"the pictures are sheared by {size:.2%} (root mean square), as by a rolling shutter while the "
+        f"the pictures are sheared by {size:.3%} (root mean square), as by a rolling shutter while the "
         "camera moves, or by software that stabilises a film"
     )
 
