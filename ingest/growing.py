@@ -10,8 +10,8 @@ from pathlib import Path
 from featuredb.errors import FeatureDbError
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database
-from featuredb.store.candidate_states import Candidate
-from featuredb.store.candidates import list_candidates, refuse
+from featuredb.store.candidates.photos import list_candidates, refuse
+from featuredb.store.candidates.states import Candidate
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from featuredb.features.exif import read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.simworld.scoring import PoseError, pose_error
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database

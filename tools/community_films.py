@@ -23,9 +23,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from featuredb.simworld.airborne import scan_town
-from featuredb.simworld.scan_file import write_scan
-from featuredb.simworld.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_file import write_scan
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures

@@ -53,14 +53,14 @@ from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
-from featuredb.simworld.airborne import scan_town
+from featuredb.simworld.camera.photograph import take_photo
+from featuredb.simworld.camera.sensor import SensorOptions
+from featuredb.simworld.camera.shot import look_pose
 from featuredb.simworld.flight import FlightOptions, survey
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.ortho import make_ortho
-from featuredb.simworld.photograph import take_photo
-from featuredb.simworld.scan_options import AirborneScanOptions
-from featuredb.simworld.sensor import SensorOptions
-from featuredb.simworld.shot import look_pose
-from featuredb.simworld.town import make_town
+from featuredb.simworld.town.town import make_town
 
 Floats = NDArray[np.float64]
 Gray = NDArray[np.uint8]

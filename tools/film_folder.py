@@ -16,9 +16,9 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.texture import Image8
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.world import WorldOptions
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from tools.film_scripts import HEIGHT, RATE_HZ, WIDTH, Kind, Piece, Script

@@ -24,7 +24,7 @@ import laspy
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.features.exif import read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

@@ -23,8 +23,8 @@ from featuredb.geometry.rotation import rotation_angle
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.truth import Truth, read_truth
 from featuredb.store import Database
-from featuredb.store.candidate_states import Contribution, candidate_id_of
-from featuredb.store.candidates import contribute
+from featuredb.store.candidates.photos import contribute
+from featuredb.store.candidates.states import Contribution, candidate_id_of
 from ingest.growing import GrowingOptions
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.map_places import drift_m, places_of

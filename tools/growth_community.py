@@ -29,9 +29,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from featuredb.lidar.add import add_scan
-from featuredb.simworld.airborne import scan_town
-from featuredb.simworld.photograph import render_depth
-from featuredb.simworld.scan_file import write_scan
+from featuredb.simworld.camera.photograph import render_depth
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_file import write_scan
 from featuredb.store import Database
 from featuredb.store.scans import has_scans
 from ingest.growing import grow_candidates

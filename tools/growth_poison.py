@@ -34,7 +34,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
-from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.camera.photograph import render_depth
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growing import GrowingOptions, grow_candidates

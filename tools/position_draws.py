@@ -24,7 +24,7 @@ import numpy as np
 from scipy.stats import chi2
 from threadpoolctl import threadpool_limits
 
-from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.geometry.rigid3 import Rigid3

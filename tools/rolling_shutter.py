@@ -24,15 +24,15 @@ import numpy as np
 from PIL import ExifTags, Image
 from scipy.stats import chi2
 
-from featuredb.features.exif_write import rational
+from featuredb.features.exif.write import rational
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.exif import exif_of
-from featuredb.simworld.sensor import jpeg_bytes
-from featuredb.simworld.shot import Device, Shot
+from featuredb.simworld.camera.exif import exif_of
+from featuredb.simworld.camera.sensor import jpeg_bytes
+from featuredb.simworld.camera.shot import Device, Shot
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.store import Database
 from tools.figures import add_json_option, write_figures

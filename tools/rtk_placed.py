@@ -21,12 +21,12 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif_gps_write import GpsFields, with_gps
+from featuredb.features.exif.gps_write import GpsFields, with_gps
 from featuredb.features.image_header import read_header
 from featuredb.features.jpeg_segments import with_app1
 from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.photograph import render_depth
 from featuredb.simworld.truth import TrueImage, Truth
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 from featuredb.store import Database

@@ -21,11 +21,11 @@ from pathlib import Path
 
 import numpy as np
 
-from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.geo.utm import geodetic_from_utm, utm_epsg, utm_from_geodetic
 from featuredb.store import Database
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import contribute
+from featuredb.store.candidates.photos import contribute
+from featuredb.store.candidates.states import Contribution
 from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
 from tools.made_maps import copied, photo_names

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from featuredb.features.exif import read_exif
-from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
+from featuredb.features.exif.angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
+from featuredb.features.exif.read import read_exif
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.geometry.rigid3 import Rigid3

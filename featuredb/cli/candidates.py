@@ -8,7 +8,7 @@ from typing import Any
 
 from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
 from featuredb.errors import CandidateNotFoundError, InvalidValueError
-from featuredb.store.candidate_states import CANDIDATE_STATES, Candidate
+from featuredb.store.candidates.states import CANDIDATE_STATES, Candidate
 
 _SHOWN_ID = 12  # hex digits of an id in a table: enough to tell some millions of photos apart
 _SHORTEST_ID = 8
@@ -40,7 +40,7 @@ def register(subparsers: Any) -> None:
 
 def run_candidates(args: argparse.Namespace) -> int:
     """List the inbox, or withdraw."""
-    from featuredb.store.candidates import list_candidates, withdraw
+    from featuredb.store.candidates.photos import list_candidates, withdraw
 
     database = open_database(args)
     candidates = list_candidates(database)

@@ -42,55 +42,55 @@ class Format:
 
 
 def _colmap(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.colmap import write_colmap
+    from featuredb.export.formats.colmap import write_colmap
 
     return write_colmap(job, text=args.text)
 
 
 def _las(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.las import write_las_files
+    from featuredb.export.formats.las import write_las_files
 
     return write_las_files(job, compressed=args.format == "laz")
 
 
 def _ply(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.ply import write_ply_files
+    from featuredb.export.formats.ply import write_ply_files
 
     return write_ply_files(job)
 
 
 def _geojson(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.geojson import write_geojson
+    from featuredb.export.formats.geojson import write_geojson
 
     return write_geojson(job)
 
 
 def _kml(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.kml import write_kml
+    from featuredb.export.formats.kml import write_kml
 
     return write_kml(job)
 
 
 def _geopose(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.geopose import write_geopose
+    from featuredb.export.formats.geopose import write_geopose
 
     return write_geopose(job)
 
 
 def _opensfm(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.opensfm import write_opensfm
+    from featuredb.export.formats.opensfm import write_opensfm
 
     return write_opensfm(job)
 
 
 def _kapture(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.kapture import write_kapture
+    from featuredb.export.formats.kapture import write_kapture
 
     return write_kapture(job)
 
 
 def _exif(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.exif import write_exif
+    from featuredb.export.formats.exif import write_exif
 
     if args.photos is None:
         raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")

@@ -15,6 +15,6 @@ def shot_model(model: str, shot: int) -> str:
 
 
 def is_of_film(camera_key: str, film: str) -> bool:
-    """Whether an EXIF key (`featuredb.features.exif.camera_key`) is of some shot of a film's model."""
+    """Whether an EXIF key (`featuredb.features.exif.read.camera_key`) is of some shot of a film's model."""
     start = f"{UNNAMED_MAKE}|{film}".lower()
     return camera_key.startswith((f"{start}|", f"{start} {_SHOT} "))

@@ -10,7 +10,7 @@ import zlib
 from dataclasses import dataclass
 
 from featuredb.errors import ImageError, InvalidValueError
-from featuredb.features.tiff_ifd import Ifd, TiffReader
+from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
 
 IMAGE_ERROR_CODES = (
     "unreadable",  # the file could not be opened or is not a regular file

@@ -15,9 +15,9 @@ from featuredb.errors import GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
 from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
-from featuredb.lidar.dsm import is_raster, open_dsm, read_dsm
+from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
+from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.intensity import stretch_of
-from featuredb.lidar.las import ScanFile, open_scan_file, read_points
 from featuredb.lidar.levels import finest_level
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.ortho import open_ortho

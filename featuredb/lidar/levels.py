@@ -53,7 +53,7 @@ def order_by_level(utm: FloatArray, finest: int) -> LevelOrder:
         utm: (n, 3) float64 metres, n >= 1; a block of at most a tile in plan and 2 km in height.
         finest: number of the last level.
     """
-    loops: Any = compiled_module("featuredb.render.level_loops")
+    loops: Any = compiled_module("featuredb.render.loops.level_loops")
     cell_m = COARSEST_SPACING_M / 2.0**finest
     # Nodes of level 0 are the largest cells of the grid: counting from their corners keeps the grid the same
     # for all.

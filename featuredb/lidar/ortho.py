@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geo.raster_crs import raster_from_utm
 from featuredb.geometry.arrays import FloatArray
+from featuredb.lidar.formats.ortho_image import OrthoImage as OrthoImage
+from featuredb.lidar.formats.ortho_image import open_ortho as open_ortho
+from featuredb.lidar.formats.ortho_image import sample_ortho
 from featuredb.lidar.nadir_view import NadirOptions, point_spacing_m, seen_from_above
-from featuredb.lidar.ortho_image import OrthoImage as OrthoImage
-from featuredb.lidar.ortho_image import open_ortho as open_ortho
-from featuredb.lidar.ortho_image import sample_ortho
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -57,7 +57,7 @@ def outlier_ratio(xyz: FloatArray, core: int, reach_m: float, options: OutlierOp
     Returns:
         (core,) float64; infinity for a point with less than `options.fewest` neighbours in reach.
     """
-    loops: Any = compiled_module("featuredb.render.level_loops")
+    loops: Any = compiled_module("featuredb.render.loops.level_loops")
     local = (xyz - xyz.min(axis=0)).astype(np.float32)
     # Asking for neighbours in the order of space is three times faster than in that of most files.
     order = np.argsort(loops.morton_codes(local, np.zeros(3), reach_m / _SORTED_CELLS), kind="stable")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from featuredb.geo.tiles import TILE_SIZE_M, tile_bounds, tile_of
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.las import NOISE_CLASSES, RawPoints
+from featuredb.lidar.formats.las import NOISE_CLASSES, RawPoints
 
 SPILLED = np.dtype(
     [

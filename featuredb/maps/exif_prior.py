@@ -1,6 +1,6 @@
 """A photo's EXIF position as the prior that ingest and localisation take."""
 
-from featuredb.features.exif import ExifInfo
+from featuredb.features.exif.read import ExifInfo
 from featuredb.maps.feature_map import GeoPrior
 
 

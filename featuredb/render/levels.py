@@ -95,7 +95,7 @@ def point_spacing(xyz: ArrayLike) -> NDArray[np.float32]:
 
 
 def _spacing(codes: NDArray[np.int64], cell_m: float) -> NDArray[np.float32]:
-    loops = compiled_module("featuredb.render.level_loops")
+    loops = compiled_module("featuredb.render.loops.level_loops")
     spacing: NDArray[np.float32] = loops.spacing_of_codes(codes, cell_m, _NEIGHBOURS)
     return spacing
 
@@ -113,7 +113,7 @@ def _order(
     points: NDArray[np.float32], options: DetailLevelOptions
 ) -> tuple[NDArray[np.int64], CloudNodes, NDArray[np.float32]]:
     """The rows in drawing order, the nodes, and the spacing around each row in that order."""
-    loops = compiled_module("featuredb.render.level_loops")
+    loops = compiled_module("featuredb.render.loops.level_loops")
     origin = points.min(axis=0).astype(np.float64)
     extent = float((points.max(axis=0) - origin).max())
     by_code, codes, cell_m = _sorted_by_code(points, origin, extent)
@@ -143,7 +143,7 @@ def _sorted_by_code(
     points: NDArray[np.float32], origin: NDArray[np.float64], extent: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], float]:
     """Rows by Morton code, their codes, and the codes' cell edge: the scan's own spacing in metres."""
-    loops = compiled_module("featuredb.render.level_loops")
+    loops = compiled_module("featuredb.render.loops.level_loops")
     # Codes may not overflow, and float32 has no finer steps than this either.
     finest_m = max(extent, 1e-3) / (2**_CODE_BITS - 1)
     codes = loops.morton_codes(points, origin, finest_m)
@@ -166,7 +166,7 @@ def _sorted_by_code(
 
 def _level_count(codes: NDArray[np.int64], extent: float, cell_m: float, coarsest_points: int) -> int:
     """The number of the finest level, when level 0 has at most that many points."""
-    loops = compiled_module("featuredb.render.level_loops")
+    loops = compiled_module("featuredb.render.loops.level_loops")
     finest = 0
     while finest < _CODE_BITS and loops.occupied(codes, 3 * finest) > coarsest_points:
         finest += 1

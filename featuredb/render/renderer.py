@@ -80,7 +80,7 @@ def _painted(
     paint: NDArray[np.uint32], cloud: PointCloud, attributes: bool, threads: int
 ) -> tuple[NDArray[np.uint8] | None, NDArray[np.uint8] | None]:
     """Colours (h, w, 3) and intensity (h, w), those that the cloud has and that are wanted."""
-    loops = compiled_module("featuredb.render.picture_loops")
+    loops = compiled_module("featuredb.render.loops.picture_loops")
     with_rgb, with_intensity = (
         attributes and cloud.rgb is not None,
         attributes and cloud.intensity is not None,

@@ -43,7 +43,7 @@ def shaded_relief(rendering: Rendering, options: ReliefOptions | None = None) ->
         MissingExtraError: numba is not installed.
     """
     options = options or ReliefOptions()
-    loops = compiled_module("featuredb.render.relief_loops")
+    loops = compiled_module("featuredb.render.loops.relief_loops")
     x, y = pixel_rays(rendering.camera)
     azimuth, elevation = np.radians([options.light_azimuth_deg, options.light_elevation_deg])
     to_light = np.array(

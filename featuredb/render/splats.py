@@ -94,7 +94,7 @@ def project_points(
     attributes: bool = True,
 ) -> ProjectedPoints:
     """Where the points of the nodes `rows` fall into the picture, and with `attributes` their paint."""
-    loops = compiled_module("featuredb.render.draw_loops")
+    loops = compiled_module("featuredb.render.loops.draw_loops")
     nodes, by_run = cloud.nodes, cloud.spacing_m is None
     runs = np.column_stack([nodes.start[rows], nodes.count[rows]])
     ends = np.cumsum(runs[:, 1])
@@ -134,7 +134,7 @@ def draw_splats(
 
     Where a surface is given, splats lie in it; else they face the camera.
     """
-    loops = compiled_module("featuredb.render.draw_loops")
+    loops = compiled_module("featuredb.render.loops.draw_loops")
     known = surface or BlockPlanes.unknown()
 
     def draw_part(part: slice) -> NDArray[np.uint64]:

@@ -53,7 +53,7 @@ class Surfaces:
 
 def surfaces_of(splats: Splats, planes: BlockPlanes, focal_px: float, threads: int) -> Surfaces:
     """What each pixel shows of its own point, at its depth between the points."""
-    loops = compiled_module("featuredb.render.picture_loops")
+    loops = compiled_module("featuredb.render.loops.picture_loops")
     shape = splats.nearest.shape
     nearness, apart, depth = (np.empty(shape, np.float32) for _ in range(3))
     index, paint = np.empty(shape, np.int32), np.empty(shape, np.uint32)
@@ -84,7 +84,7 @@ def close_holes(
     straight silhouette is left where it is by a closing, so the surface does not grow over what lies
     behind it. The pixel may be empty, or show a point farther off through the surface.
     """
-    loops = compiled_module("featuredb.render.hole_loops")
+    loops = compiled_module("featuredb.render.loops.hole_loops")
     s, reach = surfaces, options.reach_per_spacing
     radii = _radii(splats, reach, focal_px)
     closed = _closings(s.nearness, radii, threads)
@@ -114,7 +114,7 @@ def close_holes(
 
 def apart_px(splats: Splats, focal_px: float) -> NDArray[np.float32]:
     """Distance between points in pixels, of a sixteenth of the pixels that show any."""
-    loops = compiled_module("featuredb.render.draw_loops")
+    loops = compiled_module("featuredb.render.loops.draw_loops")
     part = splats.nearest[::4, ::4]
     seen = splats.points.seen[(part[part != loops.NOTHING] & np.uint64(0xFFFFFFFF)).astype(np.int64)]
     apart: NDArray[np.float32] = seen[:, 3] / seen[:, 2] * np.float32(focal_px)
@@ -123,7 +123,7 @@ def apart_px(splats: Splats, focal_px: float) -> NDArray[np.float32]:
 
 def block_planes(splats: Splats, typical_px: float, threads: int) -> BlockPlanes:
     """The surfaces that the points in view lie on, which are `typical_px` apart in the picture."""
-    loops = compiled_module("featuredb.render.plane_loops")
+    loops = compiled_module("featuredb.render.loops.plane_loops")
     height, width = splats.nearest.shape
     side = max(int(np.ceil(_BLOCK_PER_SPACING * typical_px)), _SMALLEST_BLOCK_PX)
     stride = 2 if typical_px < _DENSE_PX else 1
@@ -164,7 +164,7 @@ def _closings(nearness: NDArray[np.float32], radii: NDArray[np.int32], threads: 
 
 def _widest_m(apart_m: NDArray[np.float32], radii: NDArray[np.int32], threads: int) -> NDArray[np.float32]:
     """The largest distance between points within each of k radii of tiles: (k, tiles down, tiles across)."""
-    loops = compiled_module("featuredb.render.hole_loops")
+    loops = compiled_module("featuredb.render.loops.hole_loops")
     tile = loops.TILE_PX
     in_tile = np.empty((-(-apart_m.shape[0] // tile), -(-apart_m.shape[1] // tile)), np.float32)
     over_rows(lambda first, end: loops.widest_in_tiles(apart_m, in_tile, first, end), len(in_tile), threads)

@@ -9,8 +9,8 @@ import numpy as np
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.scene import Scene, Street
-from featuredb.simworld.shot import Device, Shot, look_pose
+from featuredb.simworld.camera.shot import Device, Shot, look_pose
+from featuredb.simworld.town.scene import Scene, Street
 
 GpsError = Literal["realistic", "rtk", "none"]
 

@@ -14,11 +14,11 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.days import DayOptions, another_day
-from featuredb.simworld.photograph import render_view
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.texture import Image8
-from featuredb.simworld.town import WATER_LEVEL_M
+from featuredb.simworld.camera.photograph import render_view
+from featuredb.simworld.town.days import DayOptions, another_day
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.town.town import WATER_LEVEL_M
 
 _TRUE_ORTHO_HEIGHT_M = 60_000.0  # from up there nothing leans by more than centimetres
 _LEAN_MARGIN_M = 12.0  # what an aerial photo shows beyond its part: terrain and the rays' slant

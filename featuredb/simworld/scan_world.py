@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Literal
 
 from featuredb.extras import require
-from featuredb.simworld.airborne import scan_town
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.ortho import OrthoOptions, make_ortho
-from featuredb.simworld.scan_options import AirborneScanOptions
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.town import make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import make_town
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 
 SCAN_FILE, ORTHO_FILE = "scan.laz", "ortho.tif"
@@ -108,8 +108,8 @@ def write_lidar(
         OSError: the folder cannot be written.
     """
     require(*_NEEDS)
-    from featuredb.lidar.geotiff import write_geotiff
-    from featuredb.simworld.scan_file import write_scan
+    from featuredb.lidar.formats.geotiff import write_geotiff
+    from featuredb.simworld.laser.scan_file import write_scan
 
     Path(folder).mkdir(parents=True, exist_ok=True)
     for scene, scan_name, ortho_name in (

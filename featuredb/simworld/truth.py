@@ -12,8 +12,8 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.shot import Shot
+from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.town.scene import Scene
 
 TRUTH_FILE = "truth.json"
 _VERSION = 1

@@ -14,6 +14,9 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.simworld import negatives
+from featuredb.simworld.camera.photograph import photo_bytes, take_photo
+from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
+from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import (
     FlightOptions,
     pedestrians,
@@ -22,11 +25,8 @@ from featuredb.simworld.flight import (
     visitors,
 )
 from featuredb.simworld.negatives import NEGATIVE_KINDS, NegativeKind
-from featuredb.simworld.photograph import photo_bytes, take_photo
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.sensor import SensorOptions, jpeg_bytes
-from featuredb.simworld.shot import Shot
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.truth import Truth, read_truth, true_image, write_truth
 
 Progress = Callable[[int, int], None]

@@ -7,8 +7,8 @@ from datetime import UTC, datetime, timedelta
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from featuredb.store.candidate_events import has_candidates
-from featuredb.store.candidate_upkeep import growth_tables, named_writes, superfluous_images
+from featuredb.store.candidates.events import has_candidates
+from featuredb.store.candidates.upkeep import growth_tables, named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows, write_time
 from featuredb.store.database import Database

@@ -13,7 +13,7 @@ import duckdb
 import pyarrow as pa
 
 from featuredb.errors import StoreError
-from featuredb.store.candidate_upkeep import growth_tables
+from featuredb.store.candidates.upkeep import growth_tables
 from featuredb.store.database import Database
 from featuredb.store.encode import map_rows_table
 from featuredb.store.scans import points_dataset, scan_rows, scan_rows_table

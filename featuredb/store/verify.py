@@ -12,9 +12,9 @@ from featuredb.errors import FeatureDbError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
-from featuredb.store.candidate_events import has_candidates
-from featuredb.store.candidate_upkeep import check_canaries, check_candidates, growth_tables, named_writes
-from featuredb.store.candidates import count_candidates
+from featuredb.store.candidates.events import has_candidates
+from featuredb.store.candidates.photos import count_candidates
+from featuredb.store.candidates.upkeep import check_canaries, check_candidates, growth_tables, named_writes
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place

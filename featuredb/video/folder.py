@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ImageError, VideoError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb, probe
-from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.video.film import Video, VideoFrame, VideoInfo, VideoOptions, VideoReport, chosen, fitted_size
 
 _SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp"})

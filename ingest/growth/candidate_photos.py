@@ -9,8 +9,8 @@ from typing import Any
 from featuredb.errors import CandidateNotFoundError, InvalidValueError
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
-from featuredb.store.candidate_states import Candidate
-from featuredb.store.candidates import list_candidates, load_images
+from featuredb.store.candidates.photos import list_candidates, load_images
+from featuredb.store.candidates.states import Candidate
 from ingest.executor import Progress, no_progress
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder

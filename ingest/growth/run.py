@@ -14,7 +14,7 @@ from pathlib import Path
 
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database, Snapshot
-from featuredb.store.candidates import mark_used
+from featuredb.store.candidates.photos import mark_used
 from ingest.colmap.bridge import Model
 from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest

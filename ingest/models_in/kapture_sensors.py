@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.errors import IngestError, InvalidValueError
-from featuredb.features.exif_gps import (
+from featuredb.features.exif.gps import (
     DEFAULT_SIGMA_HORIZONTAL_M,
     DEFAULT_SIGMA_VERTICAL_M,
     RANGE_ERROR_M,

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import IngestError, InvalidValueError
-from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera

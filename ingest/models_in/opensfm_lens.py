@@ -1,4 +1,4 @@
-"""Lenses of OpenSfM as this system's: the way back of `featuredb.export.opensfm_camera`.
+"""Lenses of OpenSfM as this system's: the way back of `featuredb.export.formats.opensfm_camera`.
 
 Reference: OpenSfM, doc/source/geometry.rst. Lengths are over the longer side of the image, the principal
 point counts from its middle.

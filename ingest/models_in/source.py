@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from featuredb.errors import IngestError
-from featuredb.export.colmap import DATABASE
+from featuredb.export.formats.colmap import DATABASE
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import GeoPrior
 from ingest.models_in.colmap_database import open_features

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from featuredb.errors import GeodesyError
-from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
+from featuredb.features.exif.angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
 from featuredb.geo.projected import SurveyCrs, geodetic_from_survey, survey_crs
 from featuredb.geometry.camera_angles import CameraAngles
 

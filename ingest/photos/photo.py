@@ -5,7 +5,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Literal
 
-from featuredb.features.exif_gps import AltitudeReference
+from featuredb.features.exif.gps import AltitudeReference
 from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.maps.feature_map import GeoPrior
 
@@ -26,7 +26,7 @@ class Photo:
         orientation: EXIF orientation 1..8; features and cameras are in the pixels as stored, the
             orientation is kept for display only.
         make, model: camera maker and model from EXIF, "" where absent.
-        camera_key: photos with equal keys share one set of intrinsics (see featuredb.features.exif); ""
+        camera_key: photos with equal keys share one set of intrinsics (see featuredb.features.exif.read); ""
             where the photo names no camera (who it shares with then: ingest.photos.cameras).
         focal_px: focal length from EXIF in pixels of the stored image, or None.
         capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, DecodeLimits, decode_gray, probe, read_image_bytes
-from featuredb.features.exif import read_exif
-from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import check_signature
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior

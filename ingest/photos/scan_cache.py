@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from featuredb.features.exif import ExifInfo
+from featuredb.features.exif.read import ExifInfo
 from featuredb.geometry.camera_angles import CameraAngles
 from ingest.workspace import write_json
 

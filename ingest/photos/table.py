@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from featuredb.errors import IngestError
-from featuredb.features.exif_angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG, MOST_PITCH_DEG
+from featuredb.features.exif.angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG, MOST_PITCH_DEG
 from featuredb.geometry.camera_angles import CameraAngles
 from ingest.photos.geo_txt import COLUMNS as GEO_TXT_COLUMNS
 from ingest.photos.geo_txt import read_geo_txt

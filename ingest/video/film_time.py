@@ -8,7 +8,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.video.telemetry.text import parse_wall_clock
+from featuredb.video.telemetry.formats.text import parse_wall_clock
 from featuredb.video.telemetry.values import Telemetry
 
 # Hours that zones are ahead of UTC (IANA's tz database): whole and half ones from -12 to 14, and those of

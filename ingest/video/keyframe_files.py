@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
-from featuredb.features.exif_write import gps_directory
+from featuredb.features.exif.write import gps_directory
 from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
 from featuredb.video.frames import open_video

@@ -274,7 +274,7 @@ def _answer_all(
 
 def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRequest]":
     """Ask for each image once, and find the lens that all photos of a camera agree on; says it on stderr."""
-    from featuredb.features.exif import read_exif
+    from featuredb.features.exif.read import read_exif
     from reloc.cli.query_arguments import as_arguments
     from reloc.shared_lens import lenses_of_cameras, views_of
 

@@ -14,7 +14,7 @@ from featuredb.errors import (
     UnplacedBesideOthersError,
 )
 from featuredb.features.decode import DecodeLimits, decode_gray
-from featuredb.features.exif import read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.geometry.camera import Camera
 from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior

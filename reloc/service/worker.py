@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 
 from featuredb.stage_clock import StageClock
-from featuredb.store.candidate_states import candidate_id_of
+from featuredb.store.candidates.states import candidate_id_of
 from reloc.service.contributions.database_inbox import contribution_of
 from reloc.service.contributions.inbox import Inbox, InboxRefusal
 from reloc.service.handler import answer_query

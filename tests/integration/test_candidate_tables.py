@@ -10,8 +10,8 @@ import pytest
 from featuredb.errors import StoreError
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
-from featuredb.store.candidate_events import append_events
-from featuredb.store.candidates import contribute, list_candidates, withdraw
+from featuredb.store.candidates.events import append_events
+from featuredb.store.candidates.photos import contribute, list_candidates, withdraw
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum
@@ -128,7 +128,7 @@ def test_images_without_an_event_are_orphans(database: Database, monkeypatch: py
         raise StoreError("power cut")
 
     with monkeypatch.context() as broken:
-        broken.setattr("featuredb.store.candidates.append_events", crash)
+        broken.setattr("featuredb.store.candidates.photos.append_events", crash)
         with pytest.raises(StoreError, match="power cut"):
             contribute(database, [contribution(2)])
     assert [c.candidate_id for c in list_candidates(database)] == [one]

@@ -10,7 +10,7 @@ import pytest
 from featuredb.cli.main import main
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from featuredb.store.candidates import contribute, list_candidates, mark_used, refuse
+from featuredb.store.candidates.photos import contribute, list_candidates, mark_used, refuse
 from tests.support.command_line import only_command
 from tests.support.contributions import contribution
 from tests.support.maps import random_map

@@ -19,8 +19,8 @@ import pytest
 from pyproj import Transformer
 
 from featuredb.errors import ExportError
-from featuredb.export.colmap import write_colmap
-from featuredb.export.colmap_model import keypoint_rows
+from featuredb.export.formats.colmap import write_colmap
+from featuredb.export.formats.colmap_model import keypoint_rows
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.features.extractor import extract
@@ -269,7 +269,7 @@ def test_names_that_repeat_are_told_apart(tmp_path: Path, field_map: FeatureMap)
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from featuredb.export import colmap
+from featuredb.export.formats import colmap
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.store import Database

@@ -21,15 +21,15 @@ from PIL import ExifTags, Image
 
 from featuredb.cli.main import main
 from featuredb.errors import ExportError, InvalidValueError
-from featuredb.export.exif import with_pose, write_exif
+from featuredb.export.formats.exif import with_pose, write_exif
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.features.exif import parse_exif, read_exif
-from featuredb.features.exif_gps_write import GpsFields, with_gps
+from featuredb.features.exif.gps_write import GpsFields, with_gps
+from featuredb.features.exif.read import parse_exif, read_exif
+from featuredb.features.exif.tiff_ifd import TiffReader
+from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.image_header import read_header
-from featuredb.features.tiff_ifd import TiffReader
-from featuredb.features.xmp_write import with_properties
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tests.support import planar_map as field
@@ -277,7 +277,7 @@ def test_a_drones_photo_keeps_its_makers_note_and_picture(shared_data: Path, sho
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from featuredb.export.exif import write_exif
+from featuredb.export.formats.exif import write_exif
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.store import Database

@@ -12,8 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from featuredb.errors import ExportError
+from featuredb.export.formats.kapture import kapture_names, write_kapture, write_map
 from featuredb.export.job import ExportJob
-from featuredb.export.kapture import kapture_names, write_kapture, write_map
 from featuredb.export.selection import Selection
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.store import Database

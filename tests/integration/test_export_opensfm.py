@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from featuredb.errors import ExportError
+from featuredb.export.formats.opensfm import write_opensfm
+from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.job import ExportJob
-from featuredb.export.opensfm import write_opensfm
-from featuredb.export.opensfm_camera import opensfm_camera
 from featuredb.export.selection import Selection
 from featuredb.geometry.camera import Camera
 from featuredb.store import Database

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from featuredb.export.geojson import write_geojson
-from featuredb.export.geopose import write_geopose
+from featuredb.export.formats.geojson import write_geojson
+from featuredb.export.formats.geopose import write_geopose
+from featuredb.export.formats.kml import write_kml
 from featuredb.export.job import ExportJob
-from featuredb.export.kml import write_kml
 from featuredb.export.selection import Selection
 from featuredb.export.shots import pose_covariance, shots_of
 from featuredb.geo.geopose import BODY_FROM_CAM
@@ -217,10 +217,10 @@ def test_the_same_maps_give_the_same_bytes(tmp_path: Path, field_map: FeatureMap
 _KILLED = """
 import os, signal, sys
 from pathlib import Path
-from featuredb.export.geojson import write_geojson
-from featuredb.export.geopose import write_geopose
+from featuredb.export.formats.geojson import write_geojson
+from featuredb.export.formats.geopose import write_geopose
 from featuredb.export.job import ExportJob
-from featuredb.export.kml import write_kml
+from featuredb.export.formats.kml import write_kml
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 database = Database.open(sys.argv[1])

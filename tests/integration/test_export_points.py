@@ -16,12 +16,12 @@ from pyproj import CRS
 
 from featuredb.cli.main import main
 from featuredb.errors import ExportError, InvalidValueError
+from featuredb.export.formats.las import write_las_files
+from featuredb.export.formats.ply import ROW, write_ply_files
 from featuredb.export.job import ExportJob
-from featuredb.export.las import write_las_files
-from featuredb.export.ply import ROW, write_ply_files
 from featuredb.export.selection import Selection
 from featuredb.geo.crs import scan_crs
-from featuredb.lidar.las_stream import LasStream, offset_and_step
+from featuredb.lidar.formats.las_stream import LasStream, offset_and_step
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from tests.support.command_line import only_command
@@ -180,7 +180,7 @@ _KILLED = """
 import os, signal, sys
 from pathlib import Path
 from featuredb.export.job import ExportJob
-from featuredb.export.las import write_las_files
+from featuredb.export.formats.las import write_las_files
 from featuredb.export.selection import Selection
 from featuredb.store import Database
 database = Database.open(sys.argv[1])

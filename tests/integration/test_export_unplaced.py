@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from featuredb.cli.main import main
-from featuredb.export.ply import ROW
+from featuredb.export.formats.ply import ROW
 from featuredb.store import Database
 from featuredb.store.verify import verify
 from tests.support.maps import random_map, random_unplaced_map

@@ -14,7 +14,7 @@ from PIL import Image
 
 from featuredb.errors import ImageError
 from featuredb.features.decode import DecodeLimits, decode_gray, decode_rgb
-from featuredb.features.exif import read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.features.image_header import IMAGE_ERROR_CODES
 from ingest.photos.scan import ScanOptions, scan_folder
 

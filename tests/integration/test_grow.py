@@ -17,8 +17,8 @@ from featuredb.errors import StoreError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.features import Features
 from featuredb.store import Database
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import contribute, list_candidates
+from featuredb.store.candidates.photos import contribute, list_candidates
+from featuredb.store.candidates.states import Contribution
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.trust.confirmation import ConfirmationOptions

@@ -12,7 +12,7 @@ import pytest
 
 from featuredb.cli.main import main
 from featuredb.errors import IngestError
-from featuredb.export.kapture import write_map
+from featuredb.export.formats.kapture import write_map
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import UnplacedMap

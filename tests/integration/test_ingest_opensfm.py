@@ -11,7 +11,7 @@ import pytest
 
 from featuredb.cli.main import main
 from featuredb.errors import IngestError
-from featuredb.export.opensfm import write_map
+from featuredb.export.formats.opensfm import write_map
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.maps.unplaced_map import UnplacedMap

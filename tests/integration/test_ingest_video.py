@@ -10,7 +10,7 @@ from PIL import Image
 
 from featuredb.cli.main import main
 from featuredb.errors import TelemetryError
-from featuredb.features.exif import read_exif
+from featuredb.features.exif.read import read_exif
 from featuredb.geo.geopose import geopose_from_camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database

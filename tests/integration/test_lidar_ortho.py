@@ -14,7 +14,7 @@ from rasterio.transform import Affine
 from featuredb.errors import GeodesyError, InvalidValueError, ScanFileError
 from featuredb.geo.crs import scan_crs, utm_transform
 from featuredb.geometry.arrays import FloatArray
-from featuredb.lidar.geotiff import write_geotiff
+from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.nadir_view import NadirOptions
 from featuredb.lidar.ortho import ColourOptions, colour_by_ortho, open_ortho
 
@@ -204,7 +204,7 @@ def test_large_images_are_read_in_parts(tmp_path: Path, monkeypatch: pytest.Monk
     utm = points()
     ortho = open_ortho(write(tmp_path / "o.tif", picture()))
     whole = colour_by_ortho(utm, EPSG, None, ortho, FINE)
-    monkeypatch.setattr("featuredb.lidar.ortho_image._MAX_READ_PX", 5000)
+    monkeypatch.setattr("featuredb.lidar.formats.ortho_image._MAX_READ_PX", 5000)
     parts = colour_by_ortho(utm, EPSG, None, ortho, FINE)
     np.testing.assert_array_equal(parts[1], whole[1])
     np.testing.assert_allclose(parts[0].astype(int), whole[0], atol=1)

@@ -26,7 +26,7 @@ from featuredb.errors import (
 )
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.lidar.add import Progress, add_scan
-from featuredb.lidar.geotiff import write_geotiff
+from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.load import LoadOptions, load_cloud, scan_frame
 from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
 from featuredb.lidar.work import work_folder

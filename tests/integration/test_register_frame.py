@@ -14,10 +14,10 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from featuredb.simworld.airborne import scan_town
-from featuredb.simworld.photograph import render_view
-from featuredb.simworld.scan_options import AirborneScanOptions
-from featuredb.simworld.town import make_town
+from featuredb.simworld.camera.photograph import render_view
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.town.town import make_town
 from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame

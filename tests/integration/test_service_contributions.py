@@ -12,8 +12,8 @@ from PIL import Image
 from featuredb.errors import InvalidValueError, ServiceError, StoreError
 from featuredb.features.decode import DecodeLimits
 from featuredb.store import Database
-from featuredb.store.candidate_states import candidate_id_of
-from featuredb.store.candidates import InboxCounts, list_candidates
+from featuredb.store.candidates.photos import InboxCounts, list_candidates
+from featuredb.store.candidates.states import candidate_id_of
 from reloc.client import PriorRequest
 from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.contributions.inbox import Inbox, InboxOptions

@@ -23,7 +23,7 @@ from featuredb.geo.utm import geodetic_from_utm
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion
 from featuredb.store import Database
-from featuredb.store.candidates import list_candidates
+from featuredb.store.candidates.photos import list_candidates
 from reloc.client import CameraRequest, Client, PriorRequest
 from reloc.overlay import project_utm
 from reloc.service.options import ServeOptions

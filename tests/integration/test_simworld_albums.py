@@ -12,8 +12,8 @@ import pytest
 from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
+from featuredb.simworld.camera.photograph import render_view
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.photograph import render_view
 from featuredb.simworld.truth import read_truth
 from ingest.photos.table import read_table
 from tools.worlds.album_files import TABLE_FILES, read_facts

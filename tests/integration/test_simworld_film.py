@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from featuredb.errors import InvalidValueError
-from featuredb.simworld.photograph import render_depth
+from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.frames import VideoOptions, open_video
 from featuredb.video.telemetry.read import read_telemetry

@@ -16,16 +16,14 @@ from featuredb.cli import simworld as command
 from featuredb.errors import GeodesyError, InvalidValueError, MissingExtraError
 from featuredb.geo.crs import scan_crs
 from featuredb.geo.wkt import utm_wkt
-from featuredb.lidar.geotiff import write_geotiff
-from featuredb.lidar.las_writer import write_las
+from featuredb.lidar.formats.geotiff import write_geotiff
+from featuredb.lidar.formats.las_writer import write_las
 from featuredb.simworld import scan_world
-from featuredb.simworld.airborne import scan_town
-from featuredb.simworld.days import DayOptions
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.ground import paint_ground
+from featuredb.simworld.laser.airborne import scan_town
+from featuredb.simworld.laser.scan_file import write_scan
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.ortho import Ortho, OrthoOptions, make_ortho
-from featuredb.simworld.scan_file import write_scan
-from featuredb.simworld.scan_options import AirborneScanOptions
 from featuredb.simworld.scan_world import (
     ScanWorld,
     ScanWorldOptions,
@@ -33,8 +31,10 @@ from featuredb.simworld.scan_world import (
     write_lidar,
     write_scan_world,
 )
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.town import make_town
+from featuredb.simworld.town.days import DayOptions
+from featuredb.simworld.town.ground import paint_ground
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import make_town
 from featuredb.simworld.world import WorldOptions, town_of
 
 OPTIONS = ScanWorldOptions(

@@ -13,9 +13,9 @@ from PIL import ExifTags, Image
 from featuredb.cli import simworld as command
 from featuredb.errors import InvalidValueError
 from featuredb.geo.utm import utm_from_geodetic
+from featuredb.simworld.camera.photograph import render_depth
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.negatives import NEGATIVE_KINDS
-from featuredb.simworld.photograph import render_depth
 from featuredb.simworld.truth import TrueImage
 from featuredb.simworld.world import World, WorldOptions, open_world, town_of, write_world
 

@@ -12,7 +12,7 @@ from deltalake import DeltaTable
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary
-from featuredb.store.candidates import contribute, mark_used, refuse
+from featuredb.store.candidates.photos import contribute, mark_used, refuse
 from featuredb.store.tables import CANARIES, CANDIDATE_TABLES, LIDAR_TABLES
 from featuredb.store.tables import TABLES as MAP_TABLES
 from schemas import load_schema, schema_names

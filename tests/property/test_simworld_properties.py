@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import ExifTags
 
-from featuredb.simworld.exif import exif_of
+from featuredb.simworld.camera.exif import exif_of
+from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import drone_device
-from featuredb.simworld.shot import Shot, look_pose
 
 
 @settings(deadline=None, max_examples=60)

@@ -6,8 +6,8 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from featuredb.store.canaries import KnownPose
-from featuredb.store.candidate_states import Candidate, Contribution
-from featuredb.store.candidates import list_candidates, load_images
+from featuredb.store.candidates.photos import list_candidates, load_images
+from featuredb.store.candidates.states import Candidate, Contribution
 from featuredb.store.database import Database
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING
 

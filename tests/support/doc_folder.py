@@ -23,10 +23,10 @@ import numpy as np
 from PIL import Image
 
 from featuredb.cli.main import main
-from featuredb.simworld.airborne import AirborneScan, scan_town
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.scan_file import write_scan
-from featuredb.simworld.scan_options import AirborneScanOptions
+from featuredb.simworld.laser.airborne import AirborneScan, scan_town
+from featuredb.simworld.laser.scan_file import write_scan
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.truth import Truth
 from featuredb.simworld.world import World, WorldOptions, town_of, write_world
 from featuredb.store import Database

@@ -15,7 +15,7 @@ from featuredb.errors import (
 )
 from featuredb.store import Database
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image, remove_canary
-from featuredb.store.candidates import (
+from featuredb.store.candidates.photos import (
     contribute,
     count_candidates,
     list_candidates,

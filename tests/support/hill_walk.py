@@ -11,8 +11,8 @@ from PIL import ExifTags, Image
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import contribute
+from featuredb.store.candidates.photos import contribute
+from featuredb.store.candidates.states import Contribution
 from ingest.growing import GrowingOptions
 from ingest.growth.run import GrowthOptions
 from ingest.growth.trust.confirmation import ConfirmationOptions

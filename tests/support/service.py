@@ -15,8 +15,8 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import quaternion_from_matrix
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import InboxCounts
+from featuredb.store.candidates.photos import InboxCounts
+from featuredb.store.candidates.states import Contribution
 from reloc.client import Client
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.options import LocaliseOptions

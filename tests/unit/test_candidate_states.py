@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from featuredb.errors import InvalidValueError
-from featuredb.store.candidate_states import (
+from featuredb.store.candidates.states import (
     candidate_id_of,
     candidate_of,
     contributors_of,

@@ -12,8 +12,8 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from featuredb.features.exif import ExifInfo, camera_key, parse_exif, read_exif
-from featuredb.features.exif_gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M
+from featuredb.features.exif.read import ExifInfo, camera_key, parse_exif, read_exif
 from featuredb.geometry.camera_angles import CameraAngles, cam_from_enu
 from featuredb.maps.exif_prior import prior_from_exif
 

@@ -6,8 +6,8 @@ import time
 import pytest
 
 from featuredb.errors import StoreError
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import InboxCounts
+from featuredb.store.candidates.photos import InboxCounts
+from featuredb.store.candidates.states import Contribution
 from reloc.service.contributions.inbox import Inbox, InboxOptions, InboxRefusal, Ticket
 from tests.support.contributions import contribution
 from tests.support.service import Gate, MemoryInbox

@@ -19,15 +19,8 @@ LONG_MODULES = {
     "reloc/tracking/tracker.py",
 }
 FULL_FOLDERS = {
-    "featuredb/export",
     "featuredb/export/dataset",
-    "featuredb/features",
     "featuredb/geo",
-    "featuredb/lidar",
-    "featuredb/render",
-    "featuredb/simworld",
-    "featuredb/store",
-    "featuredb/video/telemetry",
     "ingest/register/anchor",
     "ingest/register/frame",
 }

@@ -7,7 +7,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.features.film_lens import is_of_film, shot_model, unnamed_model
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.shot import look_pose
+from featuredb.simworld.camera.shot import look_pose
 from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import LensWalkOptions, PoseFitOptions
 from reloc.tracking.pose_fit import FittedPose, LensSigmas, fit_pose

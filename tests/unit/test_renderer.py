@@ -14,17 +14,17 @@ from featuredb.geometry.rays import pixel_rays
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
-from featuredb.render.draw_loops import project
 from featuredb.render.lens import lens_numbers
 from featuredb.render.levels import build_cloud
+from featuredb.render.loops.draw_loops import project
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.shading import ReliefOptions, shaded_relief
 from featuredb.render.splats import SplatOptions
 from featuredb.render.surfaces import SurfaceOptions
-from featuredb.simworld.raster import render as cast_rays
-from featuredb.simworld.scene import Ellipsoids, Faces
-from featuredb.simworld.shot import look_pose
-from featuredb.simworld.solids import box, face
+from featuredb.simworld.camera.raster import render as cast_rays
+from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.town.scene import Ellipsoids, Faces
+from featuredb.simworld.town.solids import box, face
 
 FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
 CAMERA = Camera(model="OPENCV", width=320, height=240, params=(240, 242, 163, 118, -0.08, 0.03, 1e-3, -7e-4))
@@ -287,10 +287,10 @@ def test_relief_sees_no_slope_across_a_step() -> None:
 
 
 def test_without_numba_the_message_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "featuredb.render.level_loops", raising=False)
+    monkeypatch.delitem(sys.modules, "featuredb.render.loops.level_loops", raising=False)
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(MissingExtraError, match=r"featuredb\[lidar\]"):
-        compiled_module("featuredb.render.level_loops")
+        compiled_module("featuredb.render.loops.level_loops")
 
 
 def test_a_cloud_without_spacings_is_drawn_by_its_nodes() -> None:

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld import strip as classes
-from featuredb.simworld.airborne import AirborneScan, scan_town
-from featuredb.simworld.days import DayOptions, another_day
-from featuredb.simworld.echoes import RANGE_RESOLUTION_M
-from featuredb.simworld.reflectance import scene_reflectance
-from featuredb.simworld.scan_options import AirborneScanOptions
-from featuredb.simworld.scene import Faces, Scene, texture_index
-from featuredb.simworld.town import BUILDING_ID, TREE_ID, make_town
+from featuredb.simworld.laser import strip as classes
+from featuredb.simworld.laser.airborne import AirborneScan, scan_town
+from featuredb.simworld.laser.echoes import RANGE_RESOLUTION_M
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.town.days import DayOptions, another_day
+from featuredb.simworld.town.reflectance import scene_reflectance
+from featuredb.simworld.town.scene import Faces, Scene, texture_index
+from featuredb.simworld.town.town import BUILDING_ID, TREE_ID, make_town
 
 OPTIONS = AirborneScanOptions(
     seed=3, height_m=300.0, max_scan_angle_deg=14.0, margin_m=5.0, birds=1e-3, multipath=1e-3

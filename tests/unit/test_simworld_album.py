@@ -9,11 +9,11 @@ import pytest
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.simworld.camera.photograph import render_depth, render_view
+from featuredb.simworld.camera.raster import render
 from featuredb.simworld.flight import FlightOptions, received_positions, survey
-from featuredb.simworld.photograph import render_depth, render_view
-from featuredb.simworld.raster import render
-from featuredb.simworld.scene import Ellipsoids, Scene
-from featuredb.simworld.town import make_town
+from featuredb.simworld.town.scene import Ellipsoids, Scene
+from featuredb.simworld.town.town import make_town
 from tools.worlds.community import CommunityOptions, plan_community
 from tools.worlds.edits import Edit, edited, edited_camera
 from tools.worlds.geotags import GeotagOptions, Tagging, geotag_at, give_geotags

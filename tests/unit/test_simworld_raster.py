@@ -8,13 +8,13 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rays import pixel_rays
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.raster import render
-from featuredb.simworld.scene import SKY_ID, TEXTURES, Ellipsoids, Faces, Scene
-from featuredb.simworld.shading import Look
-from featuredb.simworld.shot import look_pose
-from featuredb.simworld.solids import box, face
-from featuredb.simworld.texture import Texture
-from featuredb.simworld.town import make_town
+from featuredb.simworld.camera.raster import render
+from featuredb.simworld.camera.shading import Look
+from featuredb.simworld.camera.shot import look_pose
+from featuredb.simworld.town.scene import SKY_ID, TEXTURES, Ellipsoids, Faces, Scene
+from featuredb.simworld.town.solids import box, face
+from featuredb.simworld.town.texture import Texture
+from featuredb.simworld.town.town import make_town
 
 CAMERAS = (
     Camera(model="OPENCV", width=320, height=240, params=(240, 242, 163, 118, -0.08, 0.03, 0.001, -0.0007)),

@@ -9,7 +9,9 @@ from PIL import ExifTags
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.utm import meridian_convergence_deg
-from featuredb.simworld.exif import exif_of
+from featuredb.simworld.camera.exif import exif_of
+from featuredb.simworld.camera.photograph import moving_cars
+from featuredb.simworld.camera.sensor import SensorOptions, expose
 from featuredb.simworld.flight import (
     FlightOptions,
     drone_device,
@@ -18,14 +20,12 @@ from featuredb.simworld.flight import (
     survey_half_extent,
     visitors,
 )
-from featuredb.simworld.materials import FACADE_LENGTH_M, town_textures, water_texture
-from featuredb.simworld.noise import fractal, periodic
-from featuredb.simworld.photograph import moving_cars
-from featuredb.simworld.scene import Faces, Scene
-from featuredb.simworld.sensor import SensorOptions, expose
-from featuredb.simworld.solids import car, instances
-from featuredb.simworld.texture import Texture
-from featuredb.simworld.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
+from featuredb.simworld.town.materials import FACADE_LENGTH_M, town_textures, water_texture
+from featuredb.simworld.town.noise import fractal, periodic
+from featuredb.simworld.town.scene import Faces, Scene
+from featuredb.simworld.town.solids import car, instances
+from featuredb.simworld.town.texture import Texture
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, TOWN_PLACE, make_town
 
 SIZE = (200.0, 180.0)
 

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.gpmf import TimedPacket, has_positions, read_gpmf
-from featuredb.video.telemetry.klv import MAX_DEPTH, numbers, parse_klv
+from featuredb.video.telemetry.formats.gpmf import TimedPacket, has_positions, read_gpmf
+from featuredb.video.telemetry.formats.klv import MAX_DEPTH, numbers, parse_klv
 from featuredb.video.telemetry.read import read_telemetry
 from featuredb.video.telemetry.tracks import read_tracks
 from tests.support.telemetry_files import device, gps5, gps9, klv, nest, write_mp4

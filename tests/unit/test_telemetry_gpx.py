@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.gpx import read_gpx
+from featuredb.video.telemetry.formats.gpx import read_gpx
 
 LAWS = settings(deadline=None, max_examples=120, derandomize=True)
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from featuredb.errors import TelemetryError
-from featuredb.video.telemetry.srt import read_srt
-from featuredb.video.telemetry.text import parse_wall_clock
+from featuredb.video.telemetry.formats.srt import read_srt
+from featuredb.video.telemetry.formats.text import parse_wall_clock
 
 LAWS = settings(deadline=None, max_examples=150, derandomize=True)
 

@@ -20,12 +20,12 @@ from PIL import ExifTags, Image
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.exif import exif_of
-from featuredb.simworld.photograph import take_photo
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.sensor import SensorOptions, jpeg_bytes
-from featuredb.simworld.shot import Shot
-from featuredb.simworld.texture import Image8
+from featuredb.simworld.camera.exif import exif_of
+from featuredb.simworld.camera.photograph import take_photo
+from featuredb.simworld.camera.sensor import SensorOptions, jpeg_bytes
+from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.texture import Image8
 from featuredb.simworld.truth import TRUTH_FILE, TrueImage, Truth, true_image, write_truth
 from tools.worlds.album_files import AlbumFact, Geotag, write_facts, write_tables
 from tools.worlds.edits import Edit, edited, edited_camera

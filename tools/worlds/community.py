@@ -13,10 +13,10 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.shot import Shot, look_pose
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from tools.worlds.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit

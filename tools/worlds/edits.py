@@ -9,7 +9,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.texture import Image8
+from featuredb.simworld.town.texture import Image8
 
 EditKind = Literal[
     "resized", "cropped", "bordered", "watermarked", "mirrored", "pasted", "moved", "painted_over", "warped"

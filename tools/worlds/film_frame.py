@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.look import scene_look
-from featuredb.simworld.photograph import moving_cars
-from featuredb.simworld.raster import render
-from featuredb.simworld.scene import Faces, Scene
-from featuredb.simworld.sensor import SensorOptions, expose
-from featuredb.simworld.texture import Image8
+from featuredb.simworld.camera.look import scene_look
+from featuredb.simworld.camera.photograph import moving_cars
+from featuredb.simworld.camera.raster import render
+from featuredb.simworld.camera.sensor import SensorOptions, expose
+from featuredb.simworld.town.scene import Faces, Scene
+from featuredb.simworld.town.texture import Image8
 
 _GLITTER_HZ = 5.0  # how often the water looks new
 _BANDS = 12  # of rows, where they are not exposed at once

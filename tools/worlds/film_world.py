@@ -26,10 +26,10 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.sensor import SensorOptions
-from featuredb.simworld.texture import Image8
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.camera.sensor import SensorOptions
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.texture import Image8
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from featuredb.simworld.world import WorldOptions, town_of
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from tools.worlds.film_frame import Exposure, draw_frame

@@ -7,8 +7,8 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.shot import Shot
+from featuredb.simworld.camera.shot import Shot
+from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.scene import (
+from featuredb.simworld.town.scene import (
     TEXTURES,
     Building,
     Ellipsoids,
@@ -21,8 +21,8 @@ from featuredb.simworld.scene import (
     Scene,
     texture_index,
 )
-from featuredb.simworld.solids import face
-from featuredb.simworld.town import BUILDING_ID
+from featuredb.simworld.town.solids import face
+from featuredb.simworld.town.town import BUILDING_ID
 
 Rect = tuple[float, float, float, float]
 

@@ -5,8 +5,8 @@ from typing import Literal
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.camera import Camera
-from featuredb.simworld.sensor import SensorOptions
-from featuredb.simworld.shot import Device
+from featuredb.simworld.camera.sensor import SensorOptions
+from featuredb.simworld.camera.shot import Device
 from tools.worlds.album import ExifPolicy
 from tools.worlds.edits import Edit
 

@@ -24,8 +24,8 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.town import OTHER_TOWN_PLACE, make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
 from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
 from tools.worlds.album_files import Geotag
 from tools.worlds.edits import Edit

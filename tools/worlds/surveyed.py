@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from featuredb.simworld.days import DayOptions, another_day
 from featuredb.simworld.flight import FlightOptions, survey
-from featuredb.simworld.scene import Scene
+from featuredb.simworld.town.days import DayOptions, another_day
+from featuredb.simworld.town.scene import Scene
 from tools.worlds.album import PlannedPhoto
 from tools.worlds.album_files import AlbumFact, Geotag
 

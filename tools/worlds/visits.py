@@ -7,7 +7,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.simworld.shot import Device
+from featuredb.simworld.camera.shot import Device
 from tools.worlds.people import Person, stored_upright, zoomed
 from tools.worlds.sights import Sight, Surroundings, look_at
 

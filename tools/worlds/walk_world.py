@@ -14,10 +14,10 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
-from featuredb.simworld.scene import Scene
-from featuredb.simworld.shot import Shot
-from featuredb.simworld.town import make_town
+from featuredb.simworld.town.scene import Scene
+from featuredb.simworld.town.town import make_town
 from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.geotags import geotag_at

@@ -22,7 +22,7 @@ MAX_SAMPLES = 2_000_000
 MAX_WARNINGS = 20
 
 # Metres of one standard deviation per axis for a dilution of precision of 1: the user equivalent range error
-# of a single-frequency receiver, the same as for photos (`featuredb.features.exif_gps`).
+# of a single-frequency receiver, the same as for photos (`featuredb.features.exif.gps`).
 RANGE_ERROR_M = 3.0
 # Radius of 68 % of a circular normal distribution, in deviations of one axis: sqrt(-2 ln 0.32).
 RADIUS_68 = 1.5096

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from featuredb.errors import TelemetryError
 from featuredb.video.telemetry.assemble import MAX_WARNINGS
-from featuredb.video.telemetry.csv_table import read_csv
-from featuredb.video.telemetry.gpmf import has_positions, read_gpmf
-from featuredb.video.telemetry.gpx import read_gpx
-from featuredb.video.telemetry.srt import read_srt, telemetry_of_blocks
-from featuredb.video.telemetry.srt_blocks import has_times
-from featuredb.video.telemetry.srt_fields import looks_like_telemetry
-from featuredb.video.telemetry.text import decode_text, read_bytes
+from featuredb.video.telemetry.formats.csv_table import read_csv
+from featuredb.video.telemetry.formats.gpmf import has_positions, read_gpmf
+from featuredb.video.telemetry.formats.gpx import read_gpx
+from featuredb.video.telemetry.formats.srt import read_srt, telemetry_of_blocks
+from featuredb.video.telemetry.formats.srt_blocks import has_times
+from featuredb.video.telemetry.formats.srt_fields import looks_like_telemetry
+from featuredb.video.telemetry.formats.text import decode_text, read_bytes
 from featuredb.video.telemetry.tracks import TelemetryTracks, read_tracks
 from featuredb.video.telemetry.values import Telemetry
 

@@ -13,9 +13,9 @@ from featuredb.errors import TelemetryError, VideoError
 from featuredb.video.film import VideoOptions
 from featuredb.video.opening import open_input, opening_of
 from featuredb.video.telemetry.assemble import check_count
-from featuredb.video.telemetry.gpmf import TimedPacket
-from featuredb.video.telemetry.srt_blocks import Subtitle, plain_text
-from featuredb.video.telemetry.text import decode_text
+from featuredb.video.telemetry.formats.gpmf import TimedPacket
+from featuredb.video.telemetry.formats.srt_blocks import Subtitle, plain_text
+from featuredb.video.telemetry.formats.text import decode_text
 
 # GPMF is some 10 to 30 kB a second: five hours and more.
 MAX_TRACK_BYTES = 512 * 1024 * 1024

@@ -4,11 +4,11 @@ from dataclasses import asdict
 from datetime import datetime
 from typing import Any
 
-from featuredb.features.exif import ExifInfo, read_exif
+from featuredb.features.exif.read import ExifInfo, read_exif
 from featuredb.features.image_header import read_header
 from featuredb.store import Database
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import InboxCounts, contribute, count_candidates
+from featuredb.store.candidates.photos import InboxCounts, contribute, count_candidates
+from featuredb.store.candidates.states import Contribution
 from reloc.wire.query import LocaliseReply, LocaliseWireRequest
 
 _ANSWER = {

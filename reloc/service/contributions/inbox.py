@@ -13,8 +13,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from featuredb.store.candidate_states import Contribution
-from featuredb.store.candidates import InboxCounts
+from featuredb.store.candidates.photos import InboxCounts
+from featuredb.store.candidates.states import Contribution
 from reloc.wire.query import ContributionReason
 from reloc.wire.server import ContributionStatus
 

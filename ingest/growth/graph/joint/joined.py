@@ -155,7 +155,7 @@ def _key(feature_map: FeatureMap, camera_id: int) -> str:
 
 
 def _tells_focal(key: str) -> bool:
-    """Whether an EXIF key (`featuredb.features.exif.camera_key`) has a focal length in it."""
+    """Whether an EXIF key (`featuredb.features.exif.read.camera_key`) has a focal length in it."""
     return re.search(r"\|f\d+(\||$)", key) is not None
 
 

@@ -1,0 +1,1 @@
+"""What is written for other systems, a module a format."""

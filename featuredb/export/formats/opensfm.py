@@ -1,0 +1,153 @@
+"""OpenSfM and OpenDroneMap: a folder for each map as OpenSfM leaves it when it has reconstructed.
+
+`reconstruction.json` has cameras, shots and points in the topocentric frame of `reference_lla.json`, which is
+the map's own local frame; `tracks.csv` the observations; `shots.geojson` the shots as ODM's report has them;
+`georeference.json` what OpenSfM has no room for.
+"""
+
+import json
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
+from featuredb.export.formats.colmap_model import image_names
+from featuredb.export.formats.opensfm_camera import opensfm_camera
+from featuredb.export.georeference import GEOREFERENCE, georeference_text
+from featuredb.export.job import Exported, ExportJob, write_json
+from featuredb.export.shots import PosedPhoto, shots_of
+from featuredb.export.tally import folder_for_each_map
+from featuredb.geometry.rotation import so3_log
+from featuredb.maps.feature_map import FeatureMap, MapImage
+
+_TRACKS_VERSION = "OPENSFM_TRACKS_VERSION_v1"
+
+
+def write_opensfm(job: ExportJob) -> Exported:
+    """Write every selected map to `job.out`/<map>.
+
+    Raises:
+        ExportError: nothing is selected, there is something at `job.out`, or a lens that OpenSfM cannot have.
+    """
+    return folder_for_each_map(job, write_map)
+
+
+def write_map(folder: Path, feature_map: FeatureMap) -> None:
+    """One map to a new folder; see `write_opensfm`."""
+    folder.mkdir()
+    names = image_names(feature_map)
+    reference = _reference(feature_map)
+    with (folder / "reconstruction.json").open("w", encoding="utf-8", newline="\n") as out:
+        _write_reconstruction(out, feature_map, names)
+    write_json(folder / "reference_lla.json", reference)
+    with (folder / "tracks.csv").open("w", encoding="utf-8", newline="\n") as out:
+        _write_tracks(out, feature_map, names)
+    shots = {
+        "type": "FeatureCollection",
+        "features": [
+            _odm_shot(shot, image, feature_map, name)
+            for shot, image, name in zip(shots_of(feature_map), feature_map.images, names, strict=True)
+        ],
+    }
+    write_json(folder / "shots.geojson", shots)
+    (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
+    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
+
+
+def _reference(feature_map: FeatureMap) -> dict[str, float]:
+    frame = feature_map.frame
+    return {"latitude": frame.latitude_deg, "longitude": frame.longitude_deg, "altitude": frame.height_m}
+
+
+def _write_reconstruction(out: IO[str], feature_map: FeatureMap, names: list[str]) -> None:
+    """A list of one reconstruction; points line by line, for there may be millions."""
+    cameras = {_camera_id(k): opensfm_camera(camera) for k, camera in enumerate(feature_map.cameras)}
+    shots = {name: _shot(image, feature_map) for image, name in zip(feature_map.images, names, strict=True)}
+    head: dict[str, Any] = {"cameras": cameras, "shots": shots}
+    head |= {"biases": {}, "rig_cameras": {}, "rig_instances": {}}
+    head["reference_lla"] = _reference(feature_map)
+    out.write("[" + json.dumps(head, allow_nan=False, ensure_ascii=False)[:-1] + ', "points": {')
+    separator = "\n"
+    for row, (xyz, rgb) in enumerate(
+        zip(feature_map.points_local().tolist(), feature_map.points.rgb.tolist(), strict=True)
+    ):
+        point = json.dumps({"color": [float(c) for c in rgb], "coordinates": xyz}, allow_nan=False)
+        out.write(f'{separator}"{row}": {point}')
+        separator = ",\n"
+    out.write("}}]\n")
+
+
+def _shot(image: MapImage, feature_map: FeatureMap) -> dict[str, Any]:
+    """World to camera as an angle-axis vector and a translation; the position as the photo itself says it."""
+    shot: dict[str, Any] = {
+        "rotation": so3_log(image.cam_from_local.rotation).tolist(),
+        "translation": image.cam_from_local.translation.tolist(),
+        "camera": _camera_id(image.camera_id),
+        "orientation": 1,
+        "capture_time": 0.0,
+    }
+    gps = image.gps
+    if gps is not None and gps.height_m is not None:
+        said = feature_map.frame.enu_from_geodetic((gps.latitude_deg, gps.longitude_deg, gps.height_m))
+        shot |= {"gps_position": said.tolist(), "gps_dop": gps.sigma_horizontal_m}
+    if image.capture_time is not None and image.capture_time.tzinfo is not None:
+        shot["capture_time"] = image.capture_time.timestamp()
+    return shot
+
+
+def _write_tracks(out: IO[str], feature_map: FeatureMap, names: list[str]) -> None:
+    """Image, track, keypoint, x, y, size in normalised coordinates, and the point's colour."""
+    out.write(_TRACKS_VERSION + "\n")
+    seen = feature_map.observations
+    name_of = {image.image_id: name for image, name in zip(feature_map.images, names, strict=True)}
+    size_of = {
+        image.image_id: (
+            feature_map.cameras[image.camera_id].width,
+            feature_map.cameras[image.camera_id].height,
+        )
+        for image in feature_map.images
+    }
+    sizes = np.array([size_of[i] for i in seen.image_id.tolist()], dtype=np.float64).reshape(-1, 2)
+    longer = sizes.max(axis=1, initial=1.0)
+    xy = (seen.xy - sizes / 2.0) / longer[:, None]
+    for row, (image, point) in enumerate(zip(seen.image_id.tolist(), seen.point_index.tolist(), strict=True)):
+        x, y, scale = float(xy[row, 0]), float(xy[row, 1]), float(seen.scale[row]) / float(longer[row])
+        red, green, blue = feature_map.points.rgb[point].tolist()
+        out.write(
+            f"{name_of[image]}\t{point}\t{row}\t{x:.10g}\t{y:.10g}\t{scale:.8g}\t{red}\t{green}\t{blue}\n"
+        )
+
+
+def _odm_shot(shot: PosedPhoto, image: MapImage, feature_map: FeatureMap, name: str) -> dict[str, Any]:
+    """As ODM writes it: position in UTM, rotation against the grid's axes."""
+    camera = opensfm_camera(shot.camera)
+    center = image.cam_from_local.center
+    utm = feature_map.frame.utm_from_enu(center, feature_map.epsg)
+    grid_from_local = feature_map.frame.grid_from_enu(center, feature_map.epsg)
+    place = shot.geopose
+    return {
+        "type": "Feature",
+        "properties": {
+            "filename": name,
+            "camera": _camera_id(image.camera_id),
+            "focal": camera.get("focal", camera.get("focal_x")),
+            "width": shot.camera.width,
+            "height": shot.camera.height,
+            "capture_time": 0.0 if shot.unix_ms is None else shot.unix_ms / 1000.0,
+            "translation": utm.tolist(),
+            "rotation": so3_log(image.cam_from_local.rotation @ grid_from_local.T).tolist(),
+            "epsg": feature_map.epsg,
+            "height_datum": feature_map.height_datum,
+            "owner": shot.owner,
+            "licence": shot.licence,
+        },
+        "geometry": {
+            "type": "Point",
+            "coordinates": [place.longitude_deg, place.latitude_deg, place.height_m],
+        },
+    }
+
+
+def _camera_id(index: int) -> str:
+    return f"camera {index}"

@@ -1,0 +1,1 @@
+"""What image files say of a photo: EXIF, GPS, angles; read, and written."""

@@ -1,0 +1,317 @@
+"""What a photo says about itself: EXIF and the XMP that DJI's drones add. EXIF 3.0 (CIPA DC-008-2023).
+
+Nothing here raises on bad metadata: a wrong value becomes None, with a line in `ExifInfo.warnings`.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta, timezone
+
+from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.exif.angles import XMP_ANGLES, camera_angles
+from featuredb.features.exif.gps import (
+    DEFAULT_SIGMA_HORIZONTAL_M,
+    DEFAULT_SIGMA_VERTICAL_M,
+    AltitudeReference,
+    finer_position,
+    gps_altitude,
+    gps_position,
+    gps_sigmas,
+    gps_time,
+)
+from featuredb.features.exif.tiff_ifd import Ifd, TiffReader
+from featuredb.features.image_header import ImageHeader, read_header
+from featuredb.geometry.camera_angles import CameraAngles
+
+# Diagonal of the 24 x 36 mm frame to which "35 mm equivalent" refers (CIPA DCG-001).
+FULL_FRAME_DIAGONAL_MM = 43.2666
+# Wider than this a photo is a crop in height of its sensor, whose own shape is 4:3 (phones, drones) or
+# 3:2; the equivalent focal length is that of the sensor. 4:3 is assumed; were it 3:2, 4 % would be lost.
+_CROPPED_ASPECT = 1.6
+# From a circular fisheye to a long telephoto lens, in units of the longer side.
+_FOCAL_RANGE = (0.1, 40.0)
+_MAX_TEXT = 200
+_MAX_WARNINGS = 20
+
+_XMP_NAMES = {  # by namespace, which Autel writes without "-dji", and some Pix4D's with a small letter
+    "drone(?:-dji)?": (
+        *XMP_ANGLES["drone-dji"],
+        *("RelativeAltitude", "AbsoluteAltitude", "RtkFlag", "RtkStdLat", "RtkStdLon", "RtkStdHgt"),
+        *("GpsLatitude", "GpsLongitude", "GpsLongtitude"),
+    ),
+    "drone-parrot": XMP_ANGLES["drone-parrot"],
+    "[Cc]amera": (  # Pix4D's, which Parrot, senseFly and others write
+        *XMP_ANGLES["Camera"],
+        *("GPSXYAccuracy", "GPSZAccuracy", "IMUYawAccuracy", "IMUPitchAccuracy", "IMURollAccuracy"),
+    ),
+}
+_XMP_TAGS = "|".join(f"{space}:(?:{'|'.join(names)})" for space, names in _XMP_NAMES.items())
+_XMP_VALUE = re.compile(
+    rf"({_XMP_TAGS})\s*(?:=\s*[\"']|>)\s*([+-]?\d{{1,9}}(?:\.\d{{0,12}})?)\s*[\"'<]".encode()
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExifInfo:
+    """Metadata of one photo; None or "" where absent or wrong.
+
+    Attributes:
+        width, height: size of the stored image, pixels.
+        make, model, serial: camera maker, model, body serial number.
+        orientation: EXIF orientation 1..8.
+        focal_px: focal length in pixels of the image as stored.
+        capture_time: when taken; timezone-aware only where the photo gives its offset.
+        gps_time: time of the position fix, UTC.
+        latitude_deg, longitude_deg: WGS84 degrees, both or none.
+        altitude_m: metres above `altitude_reference`, which for drones is often neither.
+        sigma_horizontal_m, sigma_vertical_m: one standard deviation per axis of the position.
+        sigma_source: what the deviations come from: rtk, stated, positioning_error, dop or default.
+        relative_altitude_m, absolute_altitude_m: DJI: above take-off, and as in EXIF.
+        angles: how the camera was turned.
+        artist, copyright: attribution.
+        warnings: what was wrong, for people.
+    """
+
+    width: int = 0
+    height: int = 0
+    make: str = ""
+    model: str = ""
+    serial: str = ""
+    orientation: int = 1
+    focal_px: float | None = None
+    capture_time: datetime | None = None
+    gps_time: datetime | None = None
+    latitude_deg: float | None = None
+    longitude_deg: float | None = None
+    altitude_m: float | None = None
+    altitude_reference: AltitudeReference = "unknown"
+    sigma_horizontal_m: float = DEFAULT_SIGMA_HORIZONTAL_M
+    sigma_vertical_m: float = DEFAULT_SIGMA_VERTICAL_M
+    sigma_source: str = "default"
+    relative_altitude_m: float | None = None
+    absolute_altitude_m: float | None = None
+    angles: CameraAngles | None = None
+    artist: str = ""
+    copyright: str = ""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def camera_key(self) -> str:
+        """Name of the intrinsics shared with other photos of the same camera, "" where it is unknown."""
+        return camera_key(self.make, self.model, self.width, self.height, self.focal_px, self.serial)
+
+
+def read_exif(data: bytes, header: ImageHeader | None = None) -> ExifInfo:
+    """Metadata of the image file in `data`.
+
+    Args:
+        data: the whole file.
+        header: of `probe`, where the caller has it already.
+    """
+    if header is None:
+        try:
+            header = read_header(data)
+        except ImageError as error:
+            return ExifInfo(warnings=(f"no metadata: {error}",))
+    tiff = data[slice(*header.exif)] if header.exif else b""
+    xmp = data[slice(*header.xmp)] if header.xmp else b""
+    return parse_exif(tiff, xmp, header.width, header.height)
+
+
+def parse_exif(tiff: bytes, xmp: bytes, width: int, height: int) -> ExifInfo:
+    """Metadata from the TIFF stream of EXIF and the XMP packet (either may be empty).
+
+    Args:
+        tiff: from the byte order mark on, without the prefix "Exif".
+        xmp: XML text.
+        width, height: of the stored image, pixels; the focal length is given for these.
+    """
+    main, exif, gps, warnings = _directories(tiff)
+    values = _xmp_values(xmp)
+    position = finer_position(gps_position(gps, warnings), values)
+    altitude, reference = gps_altitude(gps, warnings) if position else (None, "unknown")
+    orientation = _orientation(main, warnings)
+    sigma_h, sigma_v, source = gps_sigmas(gps, values, warnings)
+    return ExifInfo(
+        width=width,
+        height=height,
+        make=main.text(271)[:_MAX_TEXT],
+        model=main.text(272)[:_MAX_TEXT],
+        serial=exif.text(42033)[:_MAX_TEXT],
+        orientation=orientation,
+        focal_px=_focal_px(exif, width, height, warnings),
+        capture_time=_capture_time(main, exif, warnings),
+        gps_time=gps_time(gps, warnings),
+        latitude_deg=position[0] if position else None,
+        longitude_deg=position[1] if position else None,
+        altitude_m=altitude,
+        altitude_reference=reference,
+        sigma_horizontal_m=sigma_h,
+        sigma_vertical_m=sigma_v,
+        sigma_source=source,
+        relative_altitude_m=values.get("RelativeAltitude"),
+        absolute_altitude_m=values.get("AbsoluteAltitude"),
+        angles=camera_angles(gps, values, main.text(271), orientation, warnings),
+        artist=main.text(315)[:_MAX_TEXT],
+        copyright=main.text(33432)[:_MAX_TEXT],
+        warnings=tuple(warnings[:_MAX_WARNINGS]),
+    )
+
+
+def camera_key(
+    make: str, model: str, width: int, height: int, focal_px: float | None, serial: str = ""
+) -> str:
+    """Name of the intrinsics that a photo shares with others of the same camera; "" for an unknown camera.
+
+    The focal length counts to three digits, so that zoom positions differ and rounding does not.
+    """
+    if not (make.strip() or model.strip()):
+        return ""
+    focal = f"{focal_px:.3g}" if focal_px else "unknown"
+    parts = [make.strip(), model.strip(), f"{width}x{height}", f"f{float(focal):.0f}" if focal_px else focal]
+    return "|".join([*parts, serial.strip()] if serial.strip() else parts).lower()
+
+
+def _directories(tiff: bytes) -> tuple[Ifd, Ifd, Ifd, list[str]]:
+    """The main, EXIF and GPS directories. Only these three are read, so there are no cycles to follow."""
+    warnings: list[str] = []
+    empty = Ifd()
+    if not tiff:
+        return empty, empty, empty, warnings
+    try:
+        reader = TiffReader(tiff)
+    except InvalidValueError as error:
+        return empty, empty, empty, [f"EXIF: {error}"]
+    main = reader.read(reader.first_offset)
+    found = [main]
+    for pointer in (34665, 34853):
+        found.append(reader.read(main.number(pointer)) if pointer in main.values else empty)
+    for name, ifd in zip(("EXIF main", "EXIF", "EXIF GPS"), found, strict=True):
+        warnings += [f"{name}: {warning}" for warning in ifd.warnings]
+    return found[0], found[1], found[2], warnings
+
+
+def _orientation(main: Ifd, warnings: list[str]) -> int:
+    value = main.number(274)
+    if value is None or value in (1, 2, 3, 4, 5, 6, 7, 8):
+        return int(value or 1)
+    if value != 0:  # 0 is a common way to say nothing
+        warnings.append(f"EXIF: orientation {value} is not in 1..8")
+    return 1
+
+
+def _positive(ifd: Ifd, tag: int) -> float | None:
+    value = ifd.number(tag)
+    return value if value is not None and math.isfinite(value) and value > 0 else None
+
+
+def _focal_px(exif: Ifd, width: int, height: int, warnings: list[str]) -> float | None:
+    """Focal length in stored pixels: by the sensor's resolution, else by the 35 mm equivalent.
+
+    The first is exact where cameras write it (Canon, Nikon, Sony), the second is rounded to whole
+    millimetres. Where both are there and disagree by a quarter, the first was spoilt by some program.
+    """
+    frame = _original_frame(exif, width, height, warnings)
+    if frame is None:
+        return None
+    full_width, full_height, scale = frame
+    by_sensor = _focal_by_sensor(exif, full_width, warnings)
+    equivalent_mm = _positive(exif, 41989)
+    by_equivalent = None
+    if equivalent_mm is not None:
+        longer, shorter = max(full_width, full_height), min(full_width, full_height)
+        diagonal = 1.25 * longer if longer / shorter > _CROPPED_ASPECT else math.hypot(longer, shorter)
+        by_equivalent = equivalent_mm / FULL_FRAME_DIAGONAL_MM * diagonal
+    focal = by_sensor or by_equivalent
+    if by_sensor and by_equivalent and not 0.8 < by_sensor / by_equivalent < 1.25:
+        warnings.append(
+            f"EXIF: focal length by sensor resolution ({by_sensor:.0f} px) and by 35 mm equivalent "
+            f"({by_equivalent:.0f} px) disagree; the second is taken"
+        )
+        focal = by_equivalent
+    if focal is None:
+        return None
+    low, high = (limit * max(full_width, full_height) for limit in _FOCAL_RANGE)
+    if not low <= focal <= high:
+        warnings.append(f"EXIF: a focal length of {focal:.0f} px for {width}x{height} is absurd")
+        return None
+    return focal * scale
+
+
+def _original_frame(
+    exif: Ifd, width: int, height: int, warnings: list[str]
+) -> tuple[float, float, float] | None:
+    """Width and height when the photo was taken, and the scale from then to the stored pixels."""
+    if width <= 0 or height <= 0:
+        return None
+    full_width, full_height = _positive(exif, 40962), _positive(exif, 40963)
+    if not full_width or not full_height or full_width > 1e6 or full_height > 1e6:
+        return width, height, 1.0
+    if (full_width > full_height) != (width > height):  # turned without telling EXIF
+        full_width, full_height = full_height, full_width
+    sx, sy = width / full_width, height / full_height
+    if abs(sx / sy - 1.0) < 0.02:  # a change of shape below rounding to whole pixels of small copies
+        return full_width, full_height, (sx + sy) / 2
+    if sx == 1.0 or sy == 1.0:  # cropped along one side, at full resolution
+        return full_width, full_height, 1.0
+    warnings.append(
+        f"EXIF: the photo was taken with {full_width:.0f}x{full_height:.0f} pixels and is stored with "
+        f"{width}x{height}: cropped and scaled, so that its focal length is unknown"
+    )
+    return None
+
+
+def _focal_by_sensor(exif: Ifd, full_width: float, warnings: list[str]) -> float | None:
+    focal_mm, resolution = _positive(exif, 37386), _positive(exif, 41486)
+    zoom = _positive(exif, 41988)
+    # Units: 2 inch, 3 cm; 4 mm and 5 micrometre are older cameras' own.
+    unit_mm = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}.get(int(_positive(exif, 41488) or 2))
+    if not focal_mm or not resolution or not unit_mm or (zoom and zoom > 1.01):
+        return None
+    pixels_per_mm = resolution / unit_mm
+    sensor_mm = full_width / pixels_per_mm
+    if not 2.0 < sensor_mm < 70.0:  # phones from 3 mm, medium format 54 mm
+        warnings.append(f"EXIF: a sensor {sensor_mm:.3g} mm wide is absurd, its resolution is not used")
+        return None
+    return focal_mm * pixels_per_mm
+
+
+def _capture_time(main: Ifd, exif: Ifd, warnings: list[str]) -> datetime | None:
+    """The first readable of original, digitised and file time, with fraction and offset."""
+    for ifd, tag, fraction_tag, offset_tag in (
+        (exif, 36867, 37521, 36881),
+        (exif, 36868, 37522, 36882),
+        (main, 306, 37520, 36880),
+    ):
+        text = ifd.text(tag)
+        if not text or not text.strip(" :0"):
+            continue
+        try:
+            time = datetime.strptime(text[:19], "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            warnings.append(f"EXIF: {text[:30]!r} is not a time")
+            continue
+        fraction = re.fullmatch(r"\d{1,9}", exif.text(fraction_tag))
+        if fraction:
+            time += timedelta(seconds=float("0." + fraction[0]))
+        return _with_offset(time, exif.text(offset_tag), warnings)
+    return None
+
+
+def _with_offset(time: datetime, text: str, warnings: list[str]) -> datetime:
+    if not text:
+        return time
+    match = re.fullmatch(r"([+-])(\d\d):(\d\d)", text)
+    minutes = int(match[2]) * 60 + int(match[3]) if match else 0
+    if text == "Z":
+        return time.replace(tzinfo=UTC)
+    if not match or minutes > 14 * 60:
+        warnings.append(f"EXIF: {text[:20]!r} is not an offset from UTC")
+        return time
+    return time.replace(tzinfo=timezone(timedelta(minutes=-minutes if match[1] == "-" else minutes)))
+
+
+def _xmp_values(xmp: bytes) -> dict[str, float]:
+    """Numbers of drones' namespaces, written as attributes or as elements."""
+    return {m[1].decode().split(":")[1]: float(m[2]) for m in _XMP_VALUE.finditer(xmp)}

@@ -1,0 +1,115 @@
+"""Rasters of heights (DSM, DEM): a cell is a point, so that a place without a scan has a ground as well."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from featuredb.errors import ScanFileError
+from featuredb.file_digest import file_sha256
+from featuredb.lidar.formats.las import LONGEST_COORDINATE, UNCLASSIFIED, RawPoints, ScanFile
+from featuredb.lidar.formats.ortho_image import import_rasterio
+
+SUFFIXES = (".tif", ".tiff")
+_MAGIC = (b"II*\x00", b"MM\x00*", b"II+\x00", b"MM\x00+")  # TIFF and BigTIFF
+
+
+def is_raster(path: Path) -> bool:
+    """Whether a file is a TIFF, by its first bytes."""
+    if not path.is_file():
+        return path.suffix.lower() in SUFFIXES
+    with path.open("rb") as stream:
+        return stream.read(4) in _MAGIC
+
+
+def open_dsm(path: Path) -> ScanFile:
+    """What a raster of heights says, its box, and how many of its cells have a height.
+
+    Raises:
+        ScanFileError: no file, not a raster of heights, without a place on Earth, or without a height.
+        MissingExtraError: the packages of the extra `lidar` are not installed.
+    """
+    if not path.is_file():
+        raise ScanFileError(f"{path}: expected a GeoTIFF of heights, found no file; check the path")
+    with _opened(path) as file:
+        _check(path, file)
+        wkt = file.crs.to_wkt() if file.crs else None
+    points, low, high = 0, np.full(3, np.inf), np.full(3, -np.inf)
+    for part in read_dsm(path, 1_000_000):
+        if len(part):
+            points += len(part)
+            low, high = np.minimum(low, part.xyz.min(axis=0)), np.maximum(high, part.xyz.max(axis=0))
+    if not points:
+        raise ScanFileError(f"{path}: expected heights, found a raster in which every cell is empty")
+    return ScanFile(
+        path=path,
+        sha256=file_sha256(path),
+        size_bytes=path.stat().st_size,
+        version="",
+        points=points,
+        low=low,
+        high=high,
+        wkt=wkt,
+        geo_keys=None,
+        wkt_counts=True,
+    )
+
+
+def read_dsm(path: Path, chunk_points: int) -> Iterator[RawPoints]:
+    """The middles of the cells that have a height, in the raster's CRS, about `chunk_points` at a time.
+
+    Raises:
+        ScanFileError: the file is broken.
+    """
+    from rasterio.windows import Window
+
+    with _opened(path) as file:
+        rows = max(1, chunk_points // file.width)
+        scale, offset = file.scales[0], file.offsets[0]
+        for top in range(0, file.height, rows):
+            window = Window(0, top, file.width, min(rows, file.height - top))
+            heights = file.read(1, window=window, masked=True).astype(np.float64)
+            known = ~np.ma.getmaskarray(heights) & np.isfinite(heights.data)
+            row, column = np.nonzero(known)
+            x, y = file.transform @ (column + 0.5, row + top + 0.5)
+            xyz = np.stack([x, y, heights.data[known] * scale + offset], axis=1)
+            if not (np.abs(xyz) < LONGEST_COORDINATE).all():
+                raise ScanFileError(
+                    f"{path}: expected coordinates and heights below 1e9, found others from row {top} on; "
+                    "say which value means 'no height', e.g. by gdal_edit.py -a_nodata"
+                )
+            yield RawPoints(
+                xyz=xyz,
+                rgb=None,
+                intensity=np.zeros(len(xyz), np.uint16),
+                classification=np.full(len(xyz), UNCLASSIFIED, np.uint8),
+                withheld=np.zeros(len(xyz), np.bool_),
+            )
+
+
+def _check(path: Path, file: Any) -> None:
+    if file.count != 1 or file.dtypes[0] == "uint8" or np.dtype(file.dtypes[0]).kind not in "iuf":
+        raise ScanFileError(
+            f"{path}: expected one band of heights of 16 bits or more, found {file.count} of "
+            f"{file.dtypes[0]}; a picture colours a scan: --ortho {path.name}"
+        )
+    if file.transform.is_identity or file.transform.determinant == 0:
+        raise ScanFileError(
+            f"{path}: the raster is not geo-referenced (no transform from cells to coordinates); expected a "
+            "GeoTIFF, or a raster with its world file"
+        )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """The open file; what GDAL finds wrong is a ScanFileError."""
+    rasterio = import_rasterio()
+    try:
+        with rasterio.open(path) as file:
+            yield file
+    except rasterio.errors.RasterioError as error:
+        raise ScanFileError(
+            f"{path}: expected a raster that GDAL reads, e.g. a GeoTIFF: {error}; fetch it again"
+        ) from error

@@ -1,0 +1,1 @@
+"""The laser scanner of the simulated world: beams, echoes, strips, the scan and its file."""

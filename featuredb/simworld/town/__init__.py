@@ -1,0 +1,1 @@
+"""The simulated town: what stands where, and of what material it is."""

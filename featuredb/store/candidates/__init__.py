@@ -1,0 +1,1 @@
+"""Contributed photos in the store: the tables `candidates` and `candidate_images`."""

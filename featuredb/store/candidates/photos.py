@@ -1,0 +1,276 @@
+"""Contributed photos: the tables `candidates` (events, only appended to) and `candidate_images` (bytes).
+
+Bytes are written first, the event that names them last; bytes without an event are invisible, and vacuum
+takes them. The tables are made by the first contribution; a database without them has none. Rollback of the
+maps leaves the events alone, but changes what they mean: a photo used by a map which is gone waits again.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+import pyarrow as pa
+import pyarrow.dataset as ds
+
+from featuredb.errors import CandidateNotFoundError, StoreError
+from featuredb.store.candidates.events import (
+    after,
+    append_events,
+    by_candidate,
+    has_candidates,
+    live_maps,
+    not_found,
+    note_events,
+    read_events,
+)
+from featuredb.store.candidates.states import (
+    CONTRIBUTED,
+    REFUSED,
+    REOPENED,
+    USED,
+    WITHDRAWN,
+    Candidate,
+    CandidateState,
+    Contribution,
+    candidate_id_of,
+    candidate_of,
+    standing_of,
+)
+from featuredb.store.commits import new_write_id
+from featuredb.store.database import Database
+from featuredb.store.delta import Table
+from featuredb.store.encode import Row
+from featuredb.store.snapshot import Snapshot
+from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
+
+_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "owner")
+_LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InboxCounts:
+    """How much there is.
+
+    Attributes:
+        by_state: number of candidates in each state that occurs.
+        waiting_by_owner: number of waiting candidates of each (first) owner.
+        stored_bytes: of all images that are kept: those that are not withdrawn.
+    """
+
+    by_state: dict[str, int]
+    waiting_by_owner: dict[str, int]
+    stored_bytes: int
+
+    @property
+    def waiting(self) -> int:
+        return self.by_state.get("waiting", 0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WithdrawReport:
+    """What a withdrawal did.
+
+    Attributes:
+        candidates: ids of the photos whose bytes are gone now.
+        files: data files that were removed from the disk or bucket.
+        used_by: living maps that were built with one of them; they keep its features, not its pixels.
+    """
+
+    candidates: tuple[str, ...]
+    files: tuple[str, ...]
+    used_by: tuple[str, ...]
+
+
+def contribute(database: Database, contributions: Sequence[Contribution]) -> list[str]:
+    """Take photos in, in one append; returns their ids in the order given.
+
+    What is there already (the same bytes by the same owner) is left alone; the same bytes by another owner
+    are noted as given by that one, too.
+
+    Raises:
+        StoreError: the store failed; none of them is visible.
+    """
+    if not has_candidates(database):
+        for name in reversed(CANDIDATE_TABLES):  # `candidates` last: where it is, the other is, too
+            Table.create(database.table_url(name), SPECS[name], database.storage_options)
+    ids = [candidate_id_of(c.image) for c in contributions]
+    known = read_events(database, columns=_ORDER, candidate_ids=set(ids))
+    owners = _owners(known)
+    write_id = new_write_id(datetime.now(UTC))
+    images: dict[str, bytes] = {}
+    rows: list[Row] = []
+    for candidate_id, contribution in zip(ids, contributions, strict=True):
+        mine = owners.setdefault(candidate_id, set())
+        if contribution.owner in mine:
+            continue
+        if not mine:
+            images[candidate_id] = contribution.image
+        mine.add(contribution.owner)
+        at = after(known, {candidate_id}, contribution.received_at.astimezone(UTC))
+        row = {"candidate_id": candidate_id, "event": CONTRIBUTED, "happened_at": at}
+        rows.append({**_contribution_row(contribution), **row})
+    if images:
+        columns = {"candidate_id": list(images), "write_id": [write_id] * len(images)}
+        table = pa.table({**columns, "image": list(images.values())}, schema=SPECS[CANDIDATE_IMAGES].schema)
+        database.table(CANDIDATE_IMAGES).append(table)
+    append_events(database, rows, write_id)
+    return ids
+
+
+def mark_used(database: Database, candidate_ids: Iterable[str], map_id: str) -> None:
+    """Note that a map is built with these photos. Call it before the map is committed: it counts only while
+    the map lives, so that a crash in between neither loses photos nor uses them twice.
+
+    Raises:
+        CandidateNotFoundError, StoreError
+    """
+    note_events(database, {c: {"event": USED, "map_id": map_id} for c in candidate_ids})
+
+
+def refuse(database: Database, reasons: Mapping[str, tuple[str, str]]) -> None:
+    """Refuse photos for good, each (by id) with a reason code and a sentence.
+
+    Raises:
+        CandidateNotFoundError, StoreError: also where a reason is missing.
+    """
+    for candidate_id, (code, reason) in reasons.items():
+        if not code.strip() or not reason.strip():
+            raise StoreError(f"refuse candidate {candidate_id}: expected a reason code and a reason")
+    note_events(
+        database,
+        {c: {"event": REFUSED, "reason_code": code, "reason": why} for c, (code, why) in reasons.items()},
+    )
+
+
+def reopen(database: Database, candidate_ids: Iterable[str], reason: str) -> None:
+    """Let refused photos wait again.
+
+    Raises:
+        CandidateNotFoundError, StoreError: also where one is withdrawn.
+    """
+    wanted = list(candidate_ids)
+    withdrawn = [c.candidate_id for c in list_candidates(database, state="withdrawn")]
+    if gone := sorted(set(wanted) & set(withdrawn)):
+        raise StoreError(f"candidate {', '.join(gone)} is withdrawn; only its owner can give it again")
+    note_events(database, {c: {"event": REOPENED, "reason": reason} for c in wanted})
+
+
+def withdraw(database: Database, candidate_ids: Iterable[str], reason: str) -> WithdrawReport:
+    """Delete the bytes of photos, as their owner asks: from the table and from the disk or bucket, at once.
+
+    Hash, owner, licence and events stay, so that it is known what was withdrawn. Running it again finishes
+    what a crash has interrupted.
+
+    Raises:
+        CandidateNotFoundError, StoreError: also where no reason is given.
+    """
+    if not reason.strip():
+        raise StoreError("withdraw: expected a reason, for those who will ask later")
+    wanted = list(dict.fromkeys(candidate_ids))
+    found = {c.candidate_id: c for c in list_candidates(database)}
+    event: Row = {"event": WITHDRAWN, "reason_code": "OWNER", "reason": reason}
+    pending = [c for c in wanted if c not in found or found[c].state != "withdrawn"]
+    note_events(database, dict.fromkeys(pending, event))
+    files = delete_images(database, wanted) if wanted else []
+    used_by = {m for c in wanted for m in found[c].used_by}
+    return WithdrawReport(candidates=tuple(wanted), files=tuple(files), used_by=tuple(sorted(used_by)))
+
+
+def delete_images(database: Database, candidate_ids: Iterable[str]) -> list[str]:
+    """Remove bytes from the table and the files that held them; returns the files' paths."""
+    table = database.table(CANDIDATE_IMAGES)
+    table.delete_rows("candidate_id", candidate_ids)
+    # Only files that the log has dropped: a writer at work has files of which the log does not know yet.
+    removed = database.table(CANDIDATE_IMAGES).vacuum(timedelta(0), dry_run=False, untracked=False)
+    return [f"{CANDIDATE_IMAGES}/{path}" for path in removed]
+
+
+def list_candidates(
+    database: Database, *, state: CandidateState | None = None, snapshot: Snapshot | None = None
+) -> list[Candidate]:
+    """The contributed photos, oldest first.
+
+    Args:
+        state: only those in this state.
+        snapshot: whose maps decide what is used; None: the newest.
+    """
+    live = live_maps(database, snapshot)
+    found = [candidate_of(events, live) for events in by_candidate(read_events(database)).values()]
+    wanted = [c for c in found if state is None or c.state == state]
+    return sorted(wanted, key=lambda c: (c.received_at, c.candidate_id))
+
+
+def count_candidates(database: Database) -> InboxCounts:
+    """How many there are in each state, how many wait of each owner, and how many bytes they take."""
+    live = live_maps(database, None)
+    states: Counter[str] = Counter()
+    owners: Counter[str] = Counter()
+    stored = 0
+    for events in by_candidate(read_events(database, columns=_LIGHT)).values():
+        given = next(e for e in events if e["event"] == CONTRIBUTED)
+        state = standing_of(events, live).state
+        states[state] += 1
+        if state == "waiting":
+            owners[given["owner"]] += 1
+        if state != "withdrawn":
+            stored += given["size_bytes"]
+    return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
+
+
+def load_images(database: Database, candidate_ids: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    """Id and bytes of photos, one in memory at a time.
+
+    Raises:
+        CandidateNotFoundError: no such photo, or it was withdrawn.
+        StoreError: they cannot be read, or are not those that were contributed.
+    """
+    table = database.table(CANDIDATE_IMAGES) if has_candidates(database) else None
+    for candidate_id in candidate_ids:
+        if table is None:
+            raise not_found([candidate_id])
+        mine = ds.field("candidate_id") == candidate_id
+        try:
+            dataset = table.dataset([("candidate_id", "=", candidate_id)])
+            found = dataset.to_table(["image"], filter=mine, use_threads=False)["image"]
+        except (OSError, pa.ArrowException) as error:
+            raise StoreError(
+                f"candidate {candidate_id}: cannot read its image ({error}); run `featuredb verify`"
+            ) from error
+        if not len(found):
+            raise CandidateNotFoundError(
+                f"candidate {candidate_id} has no image; it was never there, or was withdrawn"
+            )
+        image: bytes = found[0].as_py()
+        if hashlib.sha256(image).hexdigest()[:32] != candidate_id:
+            raise StoreError(f"candidate {candidate_id}: its image is not the one that was contributed")
+        yield candidate_id, image
+
+
+def _owners(events: Iterable[Row]) -> dict[str, set[str]]:
+    """For each candidate that is there and not withdrawn: its owners."""
+    owners: dict[str, set[str]] = {}
+    for event in events:
+        if event["event"] == CONTRIBUTED:
+            owners.setdefault(event["candidate_id"], set()).add(event["owner"])
+        elif event["event"] == WITHDRAWN:
+            owners.pop(event["candidate_id"], None)
+    return owners
+
+
+def _contribution_row(contribution: Contribution) -> Row:
+    return {
+        "owner": contribution.owner,
+        "licence": contribution.licence,
+        "client_id": contribution.client_id,
+        "sha256": hashlib.sha256(contribution.image).hexdigest(),
+        "size_bytes": len(contribution.image),
+        "width": contribution.width,
+        "height": contribution.height,
+        "snapshot": contribution.snapshot,
+        "answer_status": str(contribution.answer.get("status", "")),
+        "request": json.dumps(dict(contribution.request), sort_keys=True, allow_nan=False),
+        "answer": json.dumps(dict(contribution.answer), sort_keys=True, allow_nan=False),
+    }

@@ -1,0 +1,118 @@
+"""Upkeep of contributed photos and known queries: what `vacuum` may remove and what `verify` looks at."""
+
+import hashlib
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+import pyarrow as pa
+
+from featuredb.errors import FeatureDbError
+from featuredb.store.canaries import has_canaries, list_canaries, load_canary_image
+from featuredb.store.candidates.events import by_candidate, has_candidates, live_maps, read_events
+from featuredb.store.candidates.states import CONTRIBUTED, REFUSED, REOPENED, USED, WITHDRAWN, standing_of
+from featuredb.store.commits import write_time
+from featuredb.store.database import Database
+from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
+
+_EVENTS = (CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN)
+_COLUMNS = (
+    "candidate_id", "write_id", "event_index", "event", "happened_at", "sha256", "map_id", "reason_code",
+    "reason",
+)  # fmt: skip
+
+
+def growth_tables(database: Database) -> tuple[str, ...]:
+    """Those of the tables made on first use, scans apart, that exist."""
+    return (
+        *(CANDIDATE_TABLES if has_candidates(database) else ()),
+        *((CANARIES,) if has_canaries(database) else ()),
+    )
+
+
+def named_writes(database: Database) -> set[str]:
+    """Write ids of the events, which are those of the images that they name."""
+    events = read_events(database, columns=("candidate_id", "write_id", "event_index", "happened_at"))
+    return {event["write_id"] for event in events}
+
+
+def superfluous_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
+    """Candidates whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
+
+    Bytes that were written within `grace` stay: somebody may be giving the photo again just now.
+    """
+    if not has_candidates(database):
+        return set()
+    live = live_maps(database, None)
+    found = set()
+    for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
+        state = standing_of(events, live).state
+        if state == "withdrawn" or (state == "refused" and now - events[-1]["happened_at"] >= history):
+            found.add(candidate_id)
+    columns = ["candidate_id", "write_id"]
+    stored = database.table(CANDIDATE_IMAGES).dataset().to_table(columns, use_threads=False).to_pylist()
+    fresh = {row["candidate_id"] for row in stored if now - write_time(row["write_id"]) < grace}
+    return (found & {row["candidate_id"] for row in stored}) - fresh
+
+
+def check_candidates(database: Database) -> Iterator[tuple[str, str]]:
+    """What is wrong with contributed photos: where, and what. Reads every image once."""
+    if not has_candidates(database):
+        return
+    try:
+        events = read_events(database, columns=_COLUMNS)
+        live = live_maps(database, None)
+        digests = dict(_stored_digests(database))
+    except (FeatureDbError, OSError, pa.ArrowException) as error:
+        yield "candidates", f"cannot be read: {' '.join(str(error).split())[:300]}"
+        return
+    whole = by_candidate(events)
+    for event in events:
+        where = f"candidate {event['candidate_id']}"
+        if event["event"] not in _EVENTS:
+            yield where, f"an event {event['event']!r} that is none of {', '.join(_EVENTS)}"
+        elif event["candidate_id"] not in whole:
+            yield where, f"an event {event['event']!r} of a photo that nobody contributed"
+    for candidate_id, own in whole.items():
+        where, state = f"candidate {candidate_id}", standing_of(own, live).state
+        expected = next(e["sha256"] for e in own if e["event"] == CONTRIBUTED)
+        if not str(expected).startswith(candidate_id):
+            yield where, f"its id is not the beginning of its hash {expected}"
+        if candidate_id not in digests:
+            if state in ("waiting", "used"):
+                yield where, f"it is {state}, but its image is not there"
+        elif state == "withdrawn":
+            yield where, "it is withdrawn, but its image is still there; withdraw it again"
+        elif digests[candidate_id] != expected:
+            yield where, "its image is not the one that was contributed: hashes differ"
+
+
+def check_canaries(database: Database) -> Iterator[tuple[str, str]]:
+    """What is wrong with known queries: where, and what. Reads every image once."""
+    try:
+        canaries = list_canaries(database)
+    except FeatureDbError as error:
+        yield "canaries", f"cannot be read: {error}"
+        return
+    names = [canary.name for canary in canaries]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        yield f"canary {name}", "there are several of this name"
+    for canary in canaries:
+        try:
+            load_canary_image(database, canary)
+        except FeatureDbError as error:
+            yield f"canary {canary.name}", str(error)
+
+
+def _stored_digests(database: Database) -> Iterator[tuple[str, str]]:
+    """Candidate and SHA-256 of each stored image, one in memory at a time."""
+    dataset = database.table(CANDIDATE_IMAGES).dataset()
+    batches = dataset.to_batches(
+        columns=["candidate_id", "image"],
+        batch_size=1,
+        batch_readahead=1,
+        fragment_readahead=1,
+        use_threads=False,
+    )
+    for batch in batches:
+        for candidate_id, image in zip(batch["candidate_id"], batch["image"], strict=True):
+            yield candidate_id.as_py(), hashlib.sha256(image.as_buffer()).hexdigest()

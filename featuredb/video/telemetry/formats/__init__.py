@@ -1,0 +1,1 @@
+"""Files and tracks of telemetry, a module or a few for each format."""

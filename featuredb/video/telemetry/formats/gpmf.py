@@ -1,0 +1,244 @@
+"""Telemetry of GoPro cameras and of GoPro's drone Karma: the packets of their metadata track.
+
+| stream | rate | what is used |
+|---|---|---|
+| GPS9 (HERO11, 13, MAX2) | 10 Hz | latitude, longitude, height, day, second, DOP and fix of every sample |
+| GPS5 (HERO5 to 11) | 18 Hz | latitude, longitude, height; GPSF, GPSP and GPSU once a packet |
+| Karma's GLPI, GPRI, ATTD, SYST | 4 Hz | `gpmf_karma.py` |
+
+A camera that writes several is read by the first of them. Everything else (ACCL, GYRO, CORI, GRAV, ...) is
+skipped. GoPro's heights: without the entry GPSA they are above the ellipsoid (the parser's author, issue 4 of
+gopro/gpmf-parser: UBX-M8030, "height above the ellipsoid"), with GPSA "MSLV" above a mean sea level that
+nobody names, hence "unknown"; so are GPS9's without GPSA.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+
+import numpy as np
+
+from featuredb.errors import TelemetryError
+from featuredb.geo.datum import HeightDatum
+from featuredb.geometry.arrays import FloatArray
+from featuredb.video.telemetry.assemble import RANGE_ERROR_M, About, SampleTable, assemble, check_count
+from featuredb.video.telemetry.formats.gpmf_karma import boot_to_utc, karma_samples
+from featuredb.video.telemetry.formats.gpmf_streams import Stream, first_number, scaled, streams_of
+from featuredb.video.telemetry.formats.klv import Klv
+from featuredb.video.telemetry.values import Telemetry
+
+_EPOCH_2000_S = datetime(2000, 1, 1, tzinfo=UTC).timestamp()
+_MIN_FIX = 2  # 0 no fix, 2 in two dimensions, 3 in three
+_FIX_3D = 3
+# GPSP is a dilution of precision in hundredths. u-blox receivers report that of position (PDOP), which is not
+# smaller than the horizontal one: times the range error it errs to the careful side.
+_GPSP_UNIT = 0.01
+_GPSU = re.compile(r"([0-9]{12})(?:\.([0-9]{1,3}))?")
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPacket:
+    """One packet of the metadata track: begin and duration in seconds of the video, and its bytes."""
+
+    start_s: float
+    duration_s: float
+    data: bytes
+
+
+@dataclass(slots=True)
+class Decoded:
+    """The samples of one packet.
+
+    Attributes:
+        columns: (n,) arrays by the names of `SampleTable`, without times.
+        count: n.
+        clock_at_start_s: UTC of the packet's first sample where the samples have no clock of their own.
+        datum: of the heights.
+        warnings: what was found odd.
+    """
+
+    columns: dict[str, FloatArray]
+    count: int
+    clock_at_start_s: float = float("nan")
+    datum: HeightDatum = "unknown"
+    warnings: list[str] = field(default_factory=list)
+
+
+def has_positions(packets: Sequence[TimedPacket]) -> bool:
+    """Whether a track has a stream of positions at all; cameras without a receiver write the rest."""
+    return any(key in packet.data for packet in packets for key in (b"GPS9", b"GPS5", b"GLPI"))
+
+
+def read_gpmf(packets: Sequence[TimedPacket], origin: str = "GPMF track") -> Telemetry:
+    """The telemetry of a GPMF track's packets, in the order of time.
+
+    The samples of a packet are spread evenly over its duration: GPMF has no times of its own. The last packet
+    is often not full; its samples keep the usual distance.
+
+    Raises:
+        TelemetryError: no packet can be read, none has a GPS stream, or no sample has a position.
+    """
+    warnings: list[str] = []
+    parsed = _parse_packets(packets, origin, warnings)
+    offset = _karma_clock(parsed, warnings)
+    readers: tuple[tuple[str, Callable[[list[Stream]], Decoded | None]], ...] = (
+        ("GPS9", _gps9),
+        ("GPS5", _gps5),
+        ("Karma GLPI", lambda streams: _karma(streams, offset)),
+    )
+    source, decoded = next(
+        ((name, found) for name, reader in readers if (found := _decode(parsed, reader, warnings))), ("", [])
+    )
+    if not decoded:
+        keys = sorted({key for _, streams in parsed for stream in streams for key in stream})
+        raise TelemetryError(
+            f"{origin}: expected a stream GPS9, GPS5 or GLPI, found none (entries: {', '.join(keys)[:300]}); "
+            "was GPS switched off?"
+        )
+    table = _timed(decoded, origin)
+    datums = {samples.datum for _, samples in decoded}
+    for _, samples in decoded:
+        warnings += [line for line in samples.warnings if line not in warnings]
+    about = About(
+        source=f"GPMF {source}",
+        origin=origin,
+        clock="utc",
+        height_datum=datums.pop() if len(datums) == 1 else "unknown",
+        warnings=warnings,
+    )
+    return assemble(table, about)
+
+
+def _parse_packets(
+    packets: Sequence[TimedPacket], origin: str, warnings: list[str]
+) -> list[tuple[TimedPacket, list[Stream]]]:
+    parsed = []
+    reasons = []
+    for packet in packets:
+        try:
+            parsed.append((packet, streams_of(packet.data)))
+        except TelemetryError as error:
+            reasons.append(str(error))
+    if not parsed:
+        reason = f" ({reasons[0]})" if reasons else ""
+        raise TelemetryError(f"{origin}: none of {len(packets)} packets can be read{reason}")
+    if reasons:
+        warnings.append(f"{len(reasons)} of {len(packets)} packets are damaged and left out ({reasons[0]})")
+    return parsed
+
+
+def _karma_clock(parsed: list[tuple[TimedPacket, list[Stream]]], warnings: list[str]) -> float:
+    try:
+        return boot_to_utc([streams for _, streams in parsed])
+    except TelemetryError as error:
+        warnings.append(f"Karma's clock cannot be read ({error})")
+        return float("nan")
+
+
+def _decode(
+    parsed: list[tuple[TimedPacket, list[Stream]]],
+    reader: Callable[[list[Stream]], Decoded | None],
+    warnings: list[str],
+) -> list[tuple[TimedPacket, Decoded]]:
+    decoded, reasons = [], []
+    for packet, streams in parsed:
+        try:
+            samples = reader(streams)
+        except TelemetryError as error:
+            reasons.append(str(error))
+            continue
+        if samples is not None and samples.count:
+            decoded.append((packet, samples))
+    if reasons:
+        warnings.append(f"the GPS stream of {len(reasons)} packets cannot be read ({reasons[0]})")
+    return decoded
+
+
+def _timed(decoded: list[tuple[TimedPacket, Decoded]], origin: str) -> SampleTable:
+    """All samples with their times."""
+    check_count(sum(samples.count for _, samples in decoded), origin)
+    steps = [packet.duration_s / samples.count for packet, samples in decoded]
+    usual = float(np.median(steps))
+    table = SampleTable()
+    for row, (packet, samples) in enumerate(decoded):
+        step = min(steps[row], usual) if row == len(decoded) - 1 else steps[row]
+        after: FloatArray = step * np.arange(samples.count, dtype=np.float64)
+        columns: dict[str, FloatArray] = {
+            "clock_s": samples.clock_at_start_s + after,
+            **samples.columns,
+            "times_s": packet.start_s + after,
+        }
+        table.extend(columns, samples.count)
+    return table
+
+
+def _gps9(streams: list[Stream]) -> Decoded | None:
+    """Latitude, longitude, height, two speeds, days since 2000, second of the day, DOP, fix."""
+    for stream in streams:
+        values = scaled(stream, "GPS9", 9)
+        if values is None:
+            continue
+        fix, dop = values[:, 8], values[:, 7]
+        columns = _fixed(values, fix, dop)
+        columns["clock_s"] = np.where(
+            fix >= _MIN_FIX, _EPOCH_2000_S + 86_400.0 * values[:, 5] + values[:, 6], np.nan
+        )
+        datum, warnings = _datum(stream, "unknown")
+        return Decoded(columns, len(values), datum=datum, warnings=warnings)
+    return None
+
+
+def _gps5(streams: list[Stream]) -> Decoded | None:
+    """Latitude, longitude, height, two speeds; fix, dilution and time once for the packet."""
+    for stream in streams:
+        values = scaled(stream, "GPS5", 5)
+        if values is None:
+            continue
+        datum, warnings = _datum(stream, "ellipsoidal")
+        fix = first_number(stream, "GPSF")
+        if np.isnan(fix):
+            warnings.append("GPS5 without its fix status (GPSF): whether positions are fresh is not known")
+            fix = _FIX_3D
+        n = len(values)
+        columns = _fixed(values, np.full(n, fix), np.full(n, _GPSP_UNIT * first_number(stream, "GPSP")))
+        start = _utc(stream.get("GPSU")) if fix >= _MIN_FIX else float("nan")
+        return Decoded(columns, n, start, datum, warnings)
+    return None
+
+
+def _fixed(values: FloatArray, fix: FloatArray, dop: FloatArray) -> dict[str, FloatArray]:
+    """Positions of samples with a fix, heights of those with a fix in three dimensions."""
+    known, deep = fix >= _MIN_FIX, fix >= _FIX_3D
+    return {
+        "latitude_deg": np.where(known, values[:, 0], np.nan),
+        "longitude_deg": np.where(known, values[:, 1], np.nan),
+        "height_m": np.where(deep, values[:, 2], np.nan),
+        "sigma_m": np.where(known & (dop > 0.0), RANGE_ERROR_M * dop, np.nan),
+    }
+
+
+def _datum(stream: Stream, without: HeightDatum) -> tuple[HeightDatum, list[str]]:
+    entry = stream.get("GPSA")
+    if entry is None:
+        return without, []
+    return "unknown", [f"heights are above {entry.text()[:8]!r} (GPSA), whose geoid is not named"]
+
+
+def _utc(entry: Klv | None) -> float:
+    """Seconds since 1970 of yymmddhhmmss.sss, NaN where it is none."""
+    match = _GPSU.fullmatch(entry.text()) if entry is not None else None
+    if match is None:
+        return float("nan")
+    try:
+        whole = datetime.strptime(f"20{match[1]}", "%Y%m%d%H%M%S").replace(tzinfo=UTC)
+    except ValueError:
+        return float("nan")
+    return whole.timestamp() + float(f"0.{match[2] or 0}")
+
+
+def _karma(streams: list[Stream], offset_s: float) -> Decoded | None:
+    columns = karma_samples(streams, offset_s)
+    if columns is None:
+        return None
+    return Decoded(columns, len(columns["latitude_deg"]))

@@ -1,0 +1,172 @@
+"""Telemetry that DJI's (and Autel's) drones write as subtitles: .SRT files, or a track of subtitles.
+
+The time of a sample is the time at which its block is shown first. Drones of the older dialects write one
+block a second and do not say when within it the receiver was read, so that places lag by up to a second;
+estimating that is left to those who see the pictures. The clock is the drone's local time, zone not known.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Sequence
+
+import numpy as np
+
+from featuredb.errors import TelemetryError
+from featuredb.geometry.arrays import FloatArray
+from featuredb.video.telemetry.assemble import (
+    About,
+    SampleTable,
+    assemble,
+    check_count,
+    resolution_of_decimals,
+)
+from featuredb.video.telemetry.axis_order import ThirdValue, decide_order
+from featuredb.video.telemetry.formats.srt_blocks import Subtitle, is_cut_off, lacks_words, split_blocks
+from featuredb.video.telemetry.formats.srt_fields import BlockFields, looks_like_telemetry, parse_block
+from featuredb.video.telemetry.formats.text import decode_text, parse_wall_clock
+from featuredb.video.telemetry.values import Telemetry
+
+# Coarser than what any receiver of these drones does: worth telling.
+_COARSE_M = 5.0
+
+
+def read_srt(data: bytes, origin: str = "subtitles") -> Telemetry:
+    """The telemetry of a drone's subtitle file.
+
+    Args:
+        data: the file's bytes, UTF-8 or UTF-16, any line ends.
+        origin: its name, for messages.
+
+    Raises:
+        TelemetryError: no subtitles, no telemetry in them, no position, or an order of coordinates that
+            cannot be told.
+    """
+    if not data.strip():
+        raise TelemetryError(f"{origin}: the file is empty; was the recording interrupted?")
+    return telemetry_of_blocks(split_blocks(decode_text(data)), origin)
+
+
+def telemetry_of_blocks(blocks: Sequence[Subtitle], origin: str) -> Telemetry:
+    """The telemetry of subtitles that were read already; arguments and errors as for `read_srt`."""
+    check_count(len(blocks), origin)
+    if not any(looks_like_telemetry(block.text) for block in blocks):
+        raise TelemetryError(
+            f"{origin}: {len(blocks)} subtitles, none with a drone's telemetry (expected words like GPS(...) "
+            f"or [latitude: ...]){_sample_of(blocks)}"
+        )
+    parsed = [parse_block(block.text) for block in blocks]
+    warnings: list[str] = []
+    whole = _whole_blocks(blocks, parsed, warnings)
+    if not whole:
+        raise TelemetryError(f"{origin}: its only subtitle is cut off; was the recording interrupted?")
+    blocks, parsed = [blocks[row] for row in whole], [parsed[row] for row in whole]
+    clocks = _clocks(blocks)
+    times, in_video_time = _times(blocks, clocks, origin, warnings)
+    step_m = resolution_of_decimals(max((fields.decimals for fields in parsed), default=-1))
+    _place_pairs(parsed, origin, warnings)
+    _tell_heights(parsed, warnings)
+    if step_m > _COARSE_M:
+        warnings.append(f"coordinates are written in steps of {step_m:.0f} m")
+    table = SampleTable()
+    for time, clock, fields in zip(times, clocks, parsed, strict=True):
+        table.add({**fields.row, "times_s": time, "clock_s": clock})
+    dialects = list(dict.fromkeys(fields.dialect for fields in parsed if fields.dialect))
+    if len(dialects) > 1:
+        warnings.append(f"{len(dialects)} dialects in one file: recordings of several drones were joined")
+    about = About(
+        source="SRT, " + " + ".join(dialects),
+        origin=origin,
+        clock="local",
+        in_video_time=in_video_time,
+        from_first=not in_video_time,
+        resolution_m=step_m,
+        warnings=warnings,
+    )
+    return assemble(table, about)
+
+
+def _sample_of(blocks: Sequence[Subtitle]) -> str:
+    text = next((block.text for block in blocks if block.text), "")
+    return f"; the first says {text[:60]!r}" if text else ""
+
+
+def _whole_blocks(blocks: Sequence[Subtitle], parsed: list[BlockFields], warnings: list[str]) -> list[int]:
+    """Rows of the blocks without a cut-off last one. Damaged ones before it stay, without what they lost."""
+    rows = list(range(len(blocks)))
+    last = blocks[-1].text
+    # A cut may have left a block that looks like another kind: then it is compared with the one before it.
+    kinds = [fields.dialect for fields in parsed[:-1] if fields.dialect]
+    kind = parsed[-1].dialect if parsed[-1].dialect in kinds or not kinds else kinds[-1]
+    same = [block.text for block, fields in zip(blocks[:-1], parsed, strict=False) if fields.dialect == kind]
+    same = [text for text in same if not is_cut_off(text)]
+    if is_cut_off(last) or lacks_words(last, same):
+        warnings.append("the last block is cut off and left out")
+        rows.pop()
+    damaged = sum(is_cut_off(blocks[row].text) for row in rows)
+    if damaged:
+        warnings.append(f"{damaged} of {len(blocks)} blocks are damaged; what is left of them is used")
+    return rows
+
+
+def _clocks(blocks: Sequence[Subtitle]) -> list[float]:
+    found = [parse_wall_clock(block.text) for block in blocks]
+    return [clock.seconds if clock else math.nan for clock in found]
+
+
+def _times(
+    blocks: Sequence[Subtitle], clocks: list[float], origin: str, warnings: list[str]
+) -> tuple[list[float], bool]:
+    """Seconds of the video, or of the clock in files without such times; and which of them it is."""
+    times = [block.start_s for block in blocks]
+    if any(math.isfinite(time) for time in times):
+        return times, True
+    if not any(math.isfinite(clock) for clock in clocks):
+        raise TelemetryError(f"{origin}: its blocks have neither times of the video nor a clock")
+    warnings.append("no times of the video: times are those of its clock since the first sample")
+    return clocks, False
+
+
+def _place_pairs(parsed: list[BlockFields], origin: str, warnings: list[str]) -> None:
+    """Gives the unnamed coordinates their names, dialect by dialect."""
+    kinds: dict[str, list[BlockFields]] = defaultdict(list)
+    for fields in parsed:
+        if np.isfinite(fields.pair).all() and "latitude_deg" not in fields.row:
+            kinds[fields.dialect].append(fields)
+    for dialect, rows in kinds.items():
+        thirds: set[ThirdValue] = {fields.third for fields in rows}
+        step_deg = 10.0 ** -min(max(fields.decimals for fields in rows), 15)
+        decision = decide_order(
+            f"{origin} ({dialect})" if len(kinds) > 1 else origin,
+            _column_of(rows, "pair"),
+            _column_of(rows, "home"),
+            np.array([fields.distance_m for fields in rows]),
+            thirds.pop() if len(thirds) == 1 else "none",
+            step_deg,
+        )
+        if not decision.certain:
+            warnings.append(
+                f"order of coordinates: {decision.evidence}; nothing else in the file confirms it"
+            )
+        names = ("latitude_deg", "longitude_deg")
+        for fields in rows:
+            fields.row.update(
+                zip(names if decision.order == "lat_lon" else names[::-1], fields.pair, strict=True)
+            )
+
+
+def _column_of(rows: list[BlockFields], name: str) -> FloatArray:
+    return np.array([getattr(fields, name) for fields in rows], dtype=np.float64).reshape(-1, 2)
+
+
+def _tell_heights(parsed: list[BlockFields], warnings: list[str]) -> None:
+    """Heights beside the coordinates, where they are heights and say something."""
+    metres = [fields for fields in parsed if fields.third in ("metres", "decimal")]
+    if any(fields.third_value != 0.0 for fields in metres):
+        for fields in metres:
+            fields.row.setdefault("height_m", fields.third_value)
+    elif metres:
+        warnings.append("the heights beside the coordinates are 0 throughout and not used")
+    if any(fields.altitude_unnamed for fields in parsed):
+        warnings.append(
+            'heights are called "altitude" without saying above what; some models count them from take-off'
+        )
