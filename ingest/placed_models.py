@@ -12,6 +12,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap.bridge import Model
+from ingest.colmap.picture_shear import IMPOSSIBLE, shear_words
 from ingest.colmap.submodel import keep_photos, select_photos
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
@@ -198,7 +199,12 @@ def _component(
             reason_code="NO_POINTS",
             reason="no point is placed well enough: the photos' rays are parallel",
         )
-    held_back = placed.provisional or impossible_lens(model, chosen) or (HINTS if any(hints) else "")
+    held_back = (
+        placed.provisional
+        or impossible_lens(model, chosen)
+        or impossible_shear(feature_map)
+        or (HINTS if any(hints) else "")
+    )
     if held_back:
         feature_map = replace(feature_map, status="quarantined")
     return replace(component, feature_map=feature_map, reason_code="", reason=held_back)
@@ -219,6 +225,14 @@ def impossible_lens(model: Model, chosen: Sequence[Photo]) -> str:
     return (
         f"the focal length of {photo.name} became {camera.focal_px:.0f} px where EXIF says "
         f"{photo.focal_px:.0f}: a rolling shutter, a zoom or wrong EXIF bends the map"
+    )
+
+
+def impossible_shear(feature_map: FeatureMap) -> str:
+    """That the pictures are sheared as no lens shears them; "" where they are not."""
+    size = float(feature_map.provenance.get("picture_shear", 0.0))
+    return (
+        f"{shear_words(size)}: the map is bent more than its positions can tell" if size > IMPOSSIBLE else ""
     )
 
 

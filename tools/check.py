@@ -1,7 +1,8 @@
 """Everything that must hold before a change goes in: format, lint, types, import rules, tests, the demo.
 
 uv run --extra dev python tools/check.py            all of it
-uv run --extra dev python tools/check.py --fast     without slow tests and without the demo
+uv run --extra dev python tools/check.py --fast     without slow tests, of which the demo is one
+uv run --extra dev python tools/check.py --all      also the studies that tests leave out
 """
 
 import argparse
@@ -15,31 +16,40 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 # Two tests run at a time on two cores: threads of their libraries beside them would only wait for each other.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
+# Some machines tell Python not to keep bytecode. Then every process compiles all that it imports,
+# for seconds, and tests start many processes.
+_ENVIRONMENT = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | _ONE_THREAD
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Run all checks of the repository.")
-    parser.add_argument("--fast", action="store_true", help="leave out slow tests and the demo")
-    fast = parser.parse_args().fast
+    how_much = parser.add_mutually_exclusive_group()
+    how_much.add_argument("--fast", action="store_true", help="leave out slow tests and the demo")
+    how_much.add_argument("--all", action="store_true", help="also run the studies (pytest --evaluations)")
+    args = parser.parse_args()
     python = sys.executable
     # Two at a time, a file on one worker each, since modules share what they have made; in the order of
     # their folders, which leaves the short ones to the end, when one worker may have to wait for the other.
-    # Studies (marked as evaluations) are rows of the scoreboard.
-    tests = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
-    tests += ["--durations", "250"]
-    tests += ["-m", "not slow"] if fast else []
-    with tempfile.TemporaryDirectory() as folder:
-        steps = [
-            ("format", [python, "-m", "ruff", "format", "--check", "."]),
-            ("lint", [python, "-m", "ruff", "check", "."]),
-            ("types", [python, "-m", "mypy"]),
-            ("import rules", [str(Path(python).with_name("lint-imports"))]),
-            ("tests", tests),
-        ]
-        if not fast:
-            demo = [python, "-m", "featuredb.cli", "demo", "--size", "short", "--out", f"{folder}/demo"]
-            steps.append(("demo", demo))
+    pytest = [python, "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
+    pytest += ["--durations", "250"]
+    steps = [
+        ("format", [python, "-m", "ruff", "format", "--check", "."]),
+        ("lint", [python, "-m", "ruff", "check", "."]),
+        ("import rules", [str(Path(python).with_name("lint-imports"))]),
+        ("tests", [*pytest, "-m", "not slow"] if args.fast else pytest),
+    ]
+    if args.all:
+        steps.append(("studies", [*pytest, "--evaluations"]))
+    # Types take one core, and tests wait now and then: beside them they take little time of their own.
+    with tempfile.TemporaryFile() as said:
+        types = subprocess.Popen(
+            [python, "-m", "mypy"], cwd=ROOT, env=_ENVIRONMENT, stdout=said, stderr=subprocess.STDOUT
+        )
         failed = [name for name, command in steps if not _passes(name, command)]
+        code = types.wait()
+        said.seek(0)
+        print(f"== types\n{said.read().decode()}== types: {_verdict(code)}", flush=True)
+    failed += ["types"] if code != 0 else []
     print(f"failed: {', '.join(failed)}" if failed else "all checks passed")
     return 1 if failed else 0
 
@@ -47,9 +57,13 @@ def main() -> int:
 def _passes(name: str, command: list[str]) -> bool:
     print(f"== {name}", flush=True)
     start = time.monotonic()
-    code = subprocess.run(command, cwd=ROOT, env=os.environ | _ONE_THREAD, check=False).returncode
-    print(f"== {name}: {'ok' if code == 0 else f'exit {code}'}, {time.monotonic() - start:.0f} s", flush=True)
+    code = subprocess.run(command, cwd=ROOT, env=_ENVIRONMENT, check=False).returncode
+    print(f"== {name}: {_verdict(code)}, {time.monotonic() - start:.0f} s", flush=True)
     return code == 0
+
+
+def _verdict(code: int) -> str:
+    return "ok" if code == 0 else f"exit {code}"
 
 
 if __name__ == "__main__":

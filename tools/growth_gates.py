@@ -1,6 +1,6 @@
 """What each gate of growth refuses, and what it alone refuses, beside the truth.
 
-    python -m tools.growth_gates gates.jsonl ...
+    python -m tools.growth_gates gates.jsonl ... [--json FILE]
 
 The programs that measure growth record every judgement into gates.jsonl of their folder: of each placement
 that was tried, of each refined one, of each map's drift, and of each map in quarantine. All gates of a
@@ -33,6 +33,7 @@ from ingest.growth.gates import Gate
 from ingest.growth.place import component
 from ingest.growth.values import Refused
 from ingest.photos.photo import Photo
+from tools.figures import add_json_option, write_figures
 
 WRONG_M = 2.0  # a photo registered further off than this is wrong
 
@@ -204,14 +205,25 @@ def gate_rows(judgements: Iterable[Judgement]) -> list[tuple[str, str, int, int,
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("files", type=Path, nargs="+", metavar="gates.jsonl")
-    judgements = read_judgements(parser.parse_args(argv).files)
+    add_json_option(parser)
+    args = parser.parse_args(argv)
+    judgements = read_judgements(args.files)
     sys.stdout.write("step    gate                      asked refused  alone  right  wrong\n")
     for step, gate, *figures in gate_rows(judgements):
         sys.stdout.write(f"{step:7} {gate:24}" + "".join(f"{figure:7d}" for figure in figures) + "\n")
+    rows = gate_rows(judgements)
+    figures = {
+        "judged": sum(j.step == "place" for j in judgements),
+        "gates": len(rows),
+        "alone_right": sum(right for *_, right, _ in rows),
+        "alone_wrong": sum(wrong for *_, wrong in rows),
+    }
     for step in dict.fromkeys(j.step for j in judgements):
         passed = [j for j in judgements if j.step == step and not j.refused_by]
         right, wrong = sum(j.right for j in passed), sum(j.wrong for j in passed)
+        figures |= {f"{step}_right": right, f"{step}_wrong": wrong}
         sys.stdout.write(f"{step}: {len(passed)} pass, with {right} right and {wrong} wrong photos\n")
+    write_figures(args.json, figures)
     return 0
 
 

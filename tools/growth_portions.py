@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -53,6 +54,7 @@ from ingest.workspace import Workspace
 from reloc.localiser import Localiser
 from tools.figures import add_json_option, write_figures
 from tools.growth_common import log_to_stderr
+from tools.growth_gates import recorded
 
 _PORTIONS = 3
 _LIMIT_M = 0.3
@@ -71,6 +73,8 @@ class State:
         centers: of registered photos in the first map's frame, metres, by name.
         frame: of the first map.
         growing: without a drift budget where the first map's metre is made up.
+        joint: camera centres of the joint reconstruction, in its own frame, by name.
+        gates: where what the gates say is recorded, beside the joint reconstruction's places.
     """
 
     photos: list[Photo]
@@ -82,6 +86,8 @@ class State:
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
     growing: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
+    joint: dict[str, FloatArray] = field(default_factory=dict)
+    gates: Path | None = None
 
     def features_of(self, row: int) -> PhotoFeatures:
         """Features of a photo, from the cache of the ingest."""
@@ -104,6 +110,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             work=args.work,
             database=Database.create(Path(scratch) / "portions"),
             least_first=args.first_photos,
+            joint={p.name: c for p, c in zip(joint.photos, joint.model.centers(), strict=True)},
+            gates=args.gates,
         )
         started = time.process_time()
         cut = portions(len(photos), args.cut, args.seed)
@@ -205,16 +213,33 @@ def _grow(state: State) -> Grown:
     if localised:
         known = [r for r, photo in enumerate(state.photos) if photo.name in state.centers]
     witnesses, _ = localise_photos(state.photos, known, state.features_of, areas)
-    return grow_photos(
-        models,
-        state.photos,
-        state.features_of,
-        localised,
-        areas,
-        _identity,
-        options=state.growing,
-        known=witnesses,
+    with nullcontext() if state.gates is None else _recording(state, state.gates):
+        return grow_photos(
+            models,
+            state.photos,
+            state.features_of,
+            localised,
+            areas,
+            _identity,
+            options=state.growing,
+            known=witnesses,
+        )
+
+
+def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
+    """The joint reconstruction's places, carried to the first map's frame by the photos that are in both."""
+    both = sorted(state.joint.keys() & state.centers.keys())
+    ours, theirs = (
+        np.array([of[name] for name in both]).reshape(-1, 3) for of in (state.centers, state.joint)
     )
+    carried = similarity_closed_form(theirs, ours) if len(both) >= 3 else None
+    if carried is None or state.frame is None:
+        return nullcontext()
+
+    def place(name: str) -> FloatArray | None:
+        return carried.act(state.joint[name]) if name in state.joint else None
+
+    return recorded(gates, state.frame, place)
 
 
 def _commit(state: State, feature_map: FeatureMap) -> None:
@@ -319,6 +344,7 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("--adjust", action="store_true", help="adjust all maps together at the end")
     parser.add_argument("-v", "--verbose", action="store_true", help="one line a photo")
+    parser.add_argument("--gates", type=Path, default=None, help="record what gates say (tools.growth_gates)")
     add_json_option(parser)
     return parser.parse_args(argv)
 

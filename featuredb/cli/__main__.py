@@ -2,6 +2,6 @@
 
 import sys
 
-from featuredb.cli.main import main
+from featuredb.cli.main import program
 
-sys.exit(main())
+sys.exit(program())

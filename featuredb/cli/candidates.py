@@ -8,7 +8,6 @@ from typing import Any
 
 from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
 from featuredb.errors import CandidateNotFoundError, InvalidValueError
-from featuredb.store.candidates.photos import list_candidates, withdraw
 from featuredb.store.candidates.states import CANDIDATE_STATES, Candidate
 
 _SHOWN_ID = 12  # hex digits of an id in a table: enough to tell some millions of photos apart
@@ -41,6 +40,8 @@ def register(subparsers: Any) -> None:
 
 def run_candidates(args: argparse.Namespace) -> int:
     """List the inbox, or withdraw."""
+    from featuredb.store.candidates.photos import list_candidates, withdraw
+
     database = open_database(args)
     candidates = list_candidates(database)
     if args.withdraw or args.withdraw_owner:

@@ -7,7 +7,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from featuredb.cli import candidates, lineage
 from featuredb.cli.common import (
@@ -21,12 +21,11 @@ from featuredb.cli.common import (
     version_or_time,
     write_json,
 )
-from featuredb.store import Database, UnplacedSummary
-from featuredb.store.maintenance import VacuumOptions, compact, vacuum
-from featuredb.store.scans import list_scans, retire_scan
-from featuredb.store.sql import SqlResult, SqlSession
-from featuredb.store.tables import FORMAT_VERSION
-from featuredb.store.verify import verify
+from featuredb.store.vacuum_options import VacuumOptions
+
+if TYPE_CHECKING:
+    from featuredb.store import UnplacedSummary
+    from featuredb.store.sql import SqlResult
 
 _DEFAULTS = VacuumOptions()
 
@@ -69,6 +68,8 @@ def register(subparsers: Any) -> None:
 
 
 def run_init(args: argparse.Namespace) -> int:
+    from featuredb.store import Database
+
     database = Database.create(args.db, storage_options=storage_options(args))
     sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
     return 0
@@ -100,7 +101,7 @@ def run_maps(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write_unplaced(unplaced: Sequence[UnplacedSummary]) -> None:
+def _write_unplaced(unplaced: Sequence["UnplacedSummary"]) -> None:
     """The maps without a place, with what would give them one."""
     if not unplaced:
         return
@@ -138,6 +139,8 @@ def run_history(args: argparse.Namespace) -> int:
 
 
 def run_sql(args: argparse.Namespace) -> int:
+    from featuredb.store.sql import SqlSession
+
     database = open_database(args)
     with SqlSession(database.snapshot(args.as_of), database) as session:
         write_result(session.query(args.query), args.format)
@@ -145,6 +148,8 @@ def run_sql(args: argparse.Namespace) -> int:
 
 
 def run_verify(args: argparse.Namespace) -> int:
+    from featuredb.store.verify import verify
+
     report = verify(open_database(args))
     if args.json:
         write_json(
@@ -176,6 +181,8 @@ def run_verify(args: argparse.Namespace) -> int:
 
 
 def run_retire(args: argparse.Namespace) -> int:
+    from featuredb.store.scans import list_scans, retire_scan
+
     database = open_database(args)
     retired: tuple[str, ...] = ()
     if args.map_id not in {scan.scan_id for scan in list_scans(database, include_retired=True)}:
@@ -192,12 +199,16 @@ def run_rollback(args: argparse.Namespace) -> int:
 
 
 def run_compact(args: argparse.Namespace) -> int:
+    from featuredb.store.maintenance import compact
+
     for table, saved in compact(open_database(args)).items():
         sys.stdout.write(f"{table}: {saved} files less\n")
     return 0
 
 
 def run_upgrade(args: argparse.Namespace) -> int:
+    from featuredb.store.tables import FORMAT_VERSION
+
     found = open_database(args).upgrade()
     if found == FORMAT_VERSION:
         sys.stdout.write(f"format {found} already, nothing to do\n")
@@ -207,6 +218,8 @@ def run_upgrade(args: argparse.Namespace) -> int:
 
 
 def run_vacuum(args: argparse.Namespace) -> int:
+    from featuredb.store.maintenance import vacuum
+
     options = VacuumOptions(
         history_h=args.keep_history_hours,
         orphan_grace_h=args.orphan_grace_hours,
@@ -222,7 +235,7 @@ def run_vacuum(args: argparse.Namespace) -> int:
     return 0
 
 
-def write_result(result: SqlResult, output: str) -> None:
+def write_result(result: "SqlResult", output: str) -> None:
     """Write a query's rows to stdout as table, csv or json; the latter two row by row."""
     if output == "table":
         sys.stdout.write(format_table(result.columns, result.rows))

@@ -16,8 +16,7 @@ from featuredb.cli.common import (
     write_json,
 )
 from featuredb.errors import ExportError
-from featuredb.maps.feature_map import MAP_STATUSES, MapStatus
-from featuredb.maps.unplaced_map import UNPLACED_STATUSES, UnplacedStatus
+from featuredb.maps.statuses import MAP_STATUSES, UNPLACED_STATUSES, MapStatus, UnplacedStatus
 
 if TYPE_CHECKING:
     from featuredb.export.job import Exported, ExportJob

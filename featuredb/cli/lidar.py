@@ -8,16 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
 from featuredb.cli.common import (
     add_command,
     format_table,
@@ -25,13 +15,11 @@ from featuredb.cli.common import (
     storage_options,
     write_json,
 )
-from featuredb.geo.crs import HEIGHT_UNITS
-from featuredb.geo.datum import HEIGHT_DATUMS
-from featuredb.store import Database
-from featuredb.store.scans import ScanSummary, find_scan, list_scans
+from featuredb.geo.heights import HEIGHT_DATUMS, HEIGHT_UNITS
 
 if TYPE_CHECKING:
     from featuredb.lidar.add import Progress as Step
+    from featuredb.store.scans import ScanSummary
 
 _TITLES = {"read": "Reading points", "clean": "Cleaning and ordering", "write": "Writing"}
 
@@ -63,6 +51,7 @@ def run_add(args: argparse.Namespace) -> int:
     """Add a scan and say what is in it."""
     from featuredb.lidar.add import add_scan
     from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
+    from featuredb.store import Database
 
     options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)
     if args.keep_outliers:
@@ -90,6 +79,8 @@ def run_add(args: argparse.Namespace) -> int:
 
 def run_list(args: argparse.Namespace) -> int:
     """Print a table of the scans."""
+    from featuredb.store.scans import list_scans
+
     scans = list_scans(open_database(args), include_retired=args.all)
     if args.json:
         write_json({"scans": [{**scan.row, "created_at": scan.created_at} for scan in scans]})
@@ -114,6 +105,7 @@ def run_list(args: argparse.Namespace) -> int:
 def run_picture(args: argparse.Namespace) -> int:
     """Draw one scan."""
     from featuredb.lidar.picture import write_plan_view
+    from featuredb.store.scans import find_scan
 
     database = open_database(args)
     write_plan_view(database, find_scan(database, args.scan_id), args.out)
@@ -121,7 +113,7 @@ def run_picture(args: argparse.Namespace) -> int:
     return 0
 
 
-def summary(scan: ScanSummary, outcome: str) -> str:
+def summary(scan: "ScanSummary", outcome: str) -> str:
     """What a surveyor wants to check: counts, CRS, units, datum, bounds, density, classes, losses."""
     row, box = scan.row, scan.box
     area_m2 = scan.points * scan.spacing_m**2
@@ -169,7 +161,7 @@ def _class_count(number: int, points: int) -> str:
     return f"{number} {_CLASS_NAMES.get(number, 'other')} {points:,}"
 
 
-def _intensity(scan: ScanSummary) -> str:
+def _intensity(scan: "ScanSummary") -> str:
     if not scan.has_intensity:
         return "none"
     return f"raw {scan.row['intensity_low']:g} to {scan.row['intensity_high']:g} stretched to 0 to 255"
@@ -215,6 +207,16 @@ def _register_add(commands: Any) -> None:
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Callable[["Step"], None]]:
     """A callback that draws bars on stderr, if somebody watches."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
     console = Console(stderr=True)
     if quiet or not console.is_terminal:
         yield lambda step: None

@@ -4,11 +4,13 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import add_as_of_argument, add_database_argument, open_database, write_json
 from featuredb.maps.lineage import MapLineage, describe_lineage, family_of
-from featuredb.store import MapSummary, Snapshot
+
+if TYPE_CHECKING:
+    from featuredb.store import MapSummary, Snapshot
 
 _DOT_STYLE = {"active": "solid", "quarantined": "dashed", "retired": "dotted"}
 
@@ -49,7 +51,7 @@ def run_lineage(args: argparse.Namespace) -> int:
 
 
 def draw_tree(
-    maps: Mapping[str, MapSummary], lineages: Mapping[str, MapLineage], marked: str | None = None
+    maps: Mapping[str, "MapSummary"], lineages: Mapping[str, MapLineage], marked: str | None = None
 ) -> Iterator[str]:
     """Lines of ASCII: each map once, under the parent on its shortest chain to an anchor.
 
@@ -75,7 +77,7 @@ def draw_tree(
             stack.append((child, under + ("`- " if last else "|- "), under + ("   " if last else "|  ")))
 
 
-def draw_dot(maps: Mapping[str, MapSummary], lineages: Mapping[str, MapLineage]) -> Iterator[str]:
+def draw_dot(maps: Mapping[str, "MapSummary"], lineages: Mapping[str, MapLineage]) -> Iterator[str]:
     """Lines of a Graphviz digraph, parents above the maps that they placed."""
     yield "digraph lineage {"
     yield "  node [shape=box, fontname=sans];"
@@ -89,7 +91,7 @@ def draw_dot(maps: Mapping[str, MapSummary], lineages: Mapping[str, MapLineage])
     yield "}"
 
 
-def _wanted(snapshot: Snapshot, map_id: str | None, *, include_retired: bool) -> dict[str, MapSummary]:
+def _wanted(snapshot: "Snapshot", map_id: str | None, *, include_retired: bool) -> "dict[str, MapSummary]":
     every = {m.map_id: m for m in snapshot.maps(include_retired=True)}
     if map_id is not None:
         family = family_of(snapshot.get(map_id).map_id, every)
@@ -98,7 +100,7 @@ def _wanted(snapshot: Snapshot, map_id: str | None, *, include_retired: bool) ->
 
 
 def _drawn_under(
-    map_id: str, maps: Mapping[str, MapSummary], lineages: Mapping[str, MapLineage]
+    map_id: str, maps: Mapping[str, "MapSummary"], lineages: Mapping[str, MapLineage]
 ) -> str | None:
     """The parent under which a map is drawn: that on its chain. None: it is a root here.
 
@@ -108,7 +110,7 @@ def _drawn_under(
     return chain[1] if len(chain) > 1 and chain[1] in maps else None
 
 
-def _line(summary: MapSummary, lineage: MapLineage, drawn_under: str | None) -> str:
+def _line(summary: "MapSummary", lineage: MapLineage, drawn_under: str | None) -> str:
     parts = [f"{summary.map_id}  {summary.name}", f"{summary.method}, generation {summary.generation}"]
     parts.append(describe_lineage(lineage))
     others = [parent for parent in dict.fromkeys(summary.parents) if parent != drawn_under]
@@ -119,7 +121,7 @@ def _line(summary: MapSummary, lineage: MapLineage, drawn_under: str | None) -> 
     return "; ".join(parts)
 
 
-def _as_json(summary: MapSummary, lineage: MapLineage) -> dict[str, Any]:
+def _as_json(summary: "MapSummary", lineage: MapLineage) -> dict[str, Any]:
     return {
         "map_id": summary.map_id,
         "name": summary.name,

@@ -19,6 +19,7 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, v
 from typing import Any
 
 from featuredb.errors import FeatureDbError
+from featuredb.extras import leave_out_pandas
 
 logger = logging.getLogger(__name__)
 
@@ -27,6 +28,12 @@ EXIT_ERROR, EXIT_DEFECT, EXIT_INTERRUPTED = 2, 70, 130  # 1: the command itself 
 LOG_LEVELS = ("debug", "info", "warning", "error")
 
 Register = Callable[[Any], None]
+
+
+def program() -> int:
+    """`featuredb` as a process of its own: run the command line and return its exit code."""
+    leave_out_pandas()
+    return main()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -3,27 +3,10 @@
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-
-from featuredb.simworld.scan_world import (
-    ORTHO_FILE,
-    OTHER_ORTHO_FILE,
-    OTHER_SCAN_FILE,
-    SCAN_FILE,
-    ScanWorldOptions,
-    write_lidar,
-)
-from featuredb.simworld.world import World, WorldOptions, write_world
+if TYPE_CHECKING:
+    from featuredb.simworld.world import World, WorldOptions
 
 
 def register(subparsers: Any) -> None:
@@ -55,6 +38,11 @@ def register(subparsers: Any) -> None:
 
 def run_simworld(args: argparse.Namespace) -> int:
     """Write the world and say what is in it."""
+    from rich.console import Console
+
+    from featuredb.simworld.scan_world import ScanWorldOptions, write_lidar
+    from featuredb.simworld.world import WorldOptions
+
     options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
     options = replace(options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error))
     console = Console(stderr=True)
@@ -65,7 +53,19 @@ def run_simworld(args: argparse.Namespace) -> int:
     return 0
 
 
-def _write_with_progress(folder: Path, options: WorldOptions) -> World:
+def _write_with_progress(folder: Path, options: "WorldOptions") -> "World":
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    from featuredb.simworld.world import write_world
+
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -78,7 +78,9 @@ def _write_with_progress(folder: Path, options: WorldOptions) -> World:
         return write_world(folder, options, lambda done, total: bar.update(task, completed=done, total=total))
 
 
-def _summary(world: World, *, lidar: bool) -> str:
+def _summary(world: "World", *, lidar: bool) -> str:
+    from featuredb.simworld.scan_world import ORTHO_FILE, OTHER_ORTHO_FILE, OTHER_SCAN_FILE, SCAN_FILE
+
     counts = {
         "survey photos": len(world.images("drone")),
         "queries": len(world.images("queries")),

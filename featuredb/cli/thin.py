@@ -2,15 +2,15 @@
 
 import argparse
 import sys
-from typing import Any
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import add_database_argument, open_database
 from featuredb.errors import StoreError
-from featuredb.maps.thin import ThinOptions, described_points_of_images, thin_map
-from featuredb.maps.unplaced_map import AnyMap
-from featuredb.store import MapSummary, Snapshot, UnplacedSummary
+from featuredb.maps.thin_options import ThinOptions
+
+if TYPE_CHECKING:
+    from featuredb.maps.unplaced_map import AnyMap
+    from featuredb.store import MapSummary, Snapshot, UnplacedSummary
 
 _DEFAULTS = ThinOptions()
 
@@ -55,6 +55,9 @@ def run_thin(args: argparse.Namespace) -> int:
         InvalidValueError: options out of range.
         ConflictError: someone else changed the map meanwhile.
     """
+    from featuredb.maps.thin import thin_map
+    from featuredb.store import UnplacedSummary
+
     options = ThinOptions(cover=args.cover, max_views=args.max_views, keep_points=not args.drop_points)
     database = open_database(args)
     snapshot = database.snapshot()
@@ -81,7 +84,7 @@ def run_thin(args: argparse.Namespace) -> int:
     return 0
 
 
-def _thinnable(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
+def _thinnable(snapshot: "Snapshot", map_id: str) -> "MapSummary | UnplacedSummary":
     found = snapshot.find(map_id)
     if found.status not in ("active", "unplaced"):
         raise StoreError(
@@ -90,7 +93,11 @@ def _thinnable(snapshot: Snapshot, map_id: str) -> MapSummary | UnplacedSummary:
     return found
 
 
-def _figures(feature_map: AnyMap) -> str:
+def _figures(feature_map: "AnyMap") -> str:
+    import numpy as np
+
+    from featuredb.maps.thin import described_points_of_images
+
     seen = feature_map.observations
     described = len(np.unique(seen.point_index[seen.has_descriptor]))
     cover = described_points_of_images(feature_map)

@@ -24,12 +24,9 @@ from pyproj.transformer import TransformerGroup
 from featuredb.errors import GeodesyError
 from featuredb.geo.datum import HeightDatum, check_datum
 from featuredb.geo.geotiff_keys import GeoKeys, crs_of_geo_keys
+from featuredb.geo.heights import FOOT_M, HEIGHT_UNITS, US_SURVEY_FOOT_M
 from featuredb.geo.utm import utm_epsg, zone_of
 from featuredb.geometry.arrays import FloatArray
-
-FOOT_M = 0.3048
-US_SURVEY_FOOT_M = 1200.0 / 3937.0
-HEIGHT_UNITS: dict[str, float] = {"m": 1.0, "ft": FOOT_M, "us-ft": US_SURVEY_FOOT_M}
 
 # EPSG's vertical datums, and what other writers call them.
 _DATUM_CODES: dict[int, HeightDatum] = {5103: "navd88", 5171: "egm96", 1027: "egm2008"}

@@ -8,17 +8,14 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
-from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
 
 from featuredb.errors import GeodesyError, InvalidValueError
 from featuredb.geo.checks import as_geodetic
+from featuredb.geo.heights import HEIGHT_DATUMS as HEIGHT_DATUMS
+from featuredb.geo.heights import HeightDatum as HeightDatum
 from featuredb.geo.projections import shift_heights
-
-HeightDatum = Literal["ellipsoidal", "egm96", "egm2008", "navd88", "unknown"]
-HEIGHT_DATUMS: tuple[HeightDatum, ...] = get_args(HeightDatum)
 
 # Grid files of each geoid by PROJ's present and former names, best first; `projsync --file` installs one.
 GEOID_GRIDS: dict[HeightDatum, tuple[str, ...]] = {
@@ -132,6 +129,8 @@ def ellipsoidal_height(
 def find_geoid_grid(datum: HeightDatum, directories: Sequence[Path] | None = None) -> Path | None:
     """The installed grid file of a datum's geoid, or None; by default looks where PROJ looks."""
     if directories is None:
+        from pyproj.datadir import get_data_dir, get_user_data_dir  # type: ignore[attr-defined]
+
         listed = [*get_data_dir().split(os.pathsep), str(get_user_data_dir())]
         directories = [Path(directory) for directory in listed if directory]
     for name in GEOID_GRIDS.get(datum, ()):

@@ -2,20 +2,22 @@
 
 Every conversion is a PROJ pipeline written out in full, so none of them looks up a database, a grid or the
 network, and axis order is always longitude before latitude. pyproj makes a Transformer usable from several
-threads by itself but not a Proj, so all objects are kept per thread here and created once in each.
+threads by itself but not a Proj, so all objects are kept per thread here and created once in each. It is
+imported with the first of them: most commands that only look at a database convert nothing.
 """
 
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pyproj import Proj, Transformer
-from pyproj.enums import TransformDirection
-from pyproj.exceptions import ProjError
 
 from featuredb.errors import GeodesyError
 from featuredb.geometry.arrays import FloatArray
+
+if TYPE_CHECKING:
+    from pyproj import Proj, Transformer
 
 WGS84_SEMI_MAJOR_M = 6378137.0
 WGS84_FLATTENING = 1.0 / 298.257223563
@@ -93,6 +95,8 @@ def shift_heights(lat_lon_h: FloatArray, grid: Path, after: str = "") -> FloatAr
     Raises:
         GeodesyError: PROJ cannot read the grid.
     """
+    from pyproj.exceptions import ProjError
+
     pipeline = f'{_DEGREES_IN}+proj=vgridshift +grids="{grid}" +multiplier=1 {after}'
     try:
         shifted = _raw_transform(pipeline, lat_lon_h[:, [1, 0, 2]])
@@ -106,6 +110,8 @@ def utm_factors(latitude_deg: float, longitude_deg: float, zone: int, south: boo
     definition = _utm_definition(zone, south)
     projection = _per_thread.projections.get(definition)
     if projection is None:
+        from pyproj import Proj
+
         projection = _per_thread.projections[definition] = Proj(definition)
     factors = projection.get_factors(longitude_deg, latitude_deg, errcheck=False)
     convergence, scale = float(factors.meridian_convergence), float(factors.meridional_scale)
@@ -134,6 +140,9 @@ def _transform(pipeline: str, points: FloatArray, *, inverse: bool = False) -> F
 
 def _raw_transform(pipeline: str, points: FloatArray, *, inverse: bool = False) -> FloatArray:
     """Points (n, 3) through a pipeline, as PROJ answers: infinity for what it cannot convert."""
+    from pyproj import Transformer
+    from pyproj.enums import TransformDirection
+
     transformer = _per_thread.transformers.get(pipeline)
     if transformer is None:
         transformer = _per_thread.transformers[pipeline] = Transformer.from_pipeline(pipeline)

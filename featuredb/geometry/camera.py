@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-import pycolmap
-from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
+
+if TYPE_CHECKING:
+    from numpy.polynomial import Polynomial
 
 SUPPORTED_MODELS = (
     "SIMPLE_PINHOLE",
@@ -70,7 +71,7 @@ class Camera:
         if model not in SUPPORTED_MODELS:
             raise InvalidValueError(f"Camera.model: unknown model {model!r}")
         width, height = _pixel_count("Camera.width", width), _pixel_count("Camera.height", height)
-        camera = pycolmap.Camera.create_from_model_name(1, model, float(focal_px), width, height)
+        camera = _pycolmap().Camera.create_from_model_name(1, model, float(focal_px), width, height)
         return cls(model=model, width=width, height=height, params=tuple(camera.params))
 
     @classmethod
@@ -82,7 +83,7 @@ class Camera:
 
     def to_pycolmap(self, camera_id: int = 1) -> Any:
         """As a pycolmap.Camera with the given id."""
-        return pycolmap.Camera(
+        return _pycolmap().Camera(
             camera_id=camera_id,
             model=self.model,
             width=self.width,
@@ -146,6 +147,13 @@ class Camera:
         return np.asarray(self.to_pycolmap().cam_from_img(xy), dtype=np.float64)
 
 
+def _pycolmap() -> Any:
+    """Imported where a camera is, and not for what only speaks of cameras: listing maps, a command's help."""
+    import pycolmap
+
+    return pycolmap
+
+
 def _pixel_count(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 < value <= _MAX_SIZE_PX:
         raise InvalidValueError(f"{name}: expected a whole number in 1..{_MAX_SIZE_PX} px, found {value!r}")
@@ -179,8 +187,10 @@ def _tan_of_fold(model: str, params: tuple[float, ...]) -> float:
     return float(np.tan(fold)) if fold < np.pi / 2 else np.inf
 
 
-def _radial_polynomials(model: str, params: tuple[float, ...]) -> tuple[Polynomial, Polynomial]:
+def _radial_polynomials(model: str, params: tuple[float, ...]) -> "tuple[Polynomial, Polynomial]":
     """Numerator and denominator, in r, of the distorted radius."""
+    from numpy.polynomial import Polynomial
+
     first = {"SIMPLE_RADIAL": 3, "RADIAL": 3, "OPENCV": 4, "FULL_OPENCV": 4}
     first |= {"SIMPLE_RADIAL_FISHEYE": 3, "RADIAL_FISHEYE": 3, "OPENCV_FISHEYE": 4}
     k = params[first[model] :] if model in first else ()
@@ -201,5 +211,5 @@ _TEMPLATES: dict[str, Any] = {}
 def _template(model: str) -> Any:
     """A pycolmap camera of the model, for its constants (parameter names and places)."""
     if model not in _TEMPLATES:
-        _TEMPLATES[model] = pycolmap.Camera.create_from_model_name(1, model, 1.0, 2, 2)
+        _TEMPLATES[model] = _pycolmap().Camera.create_from_model_name(1, model, 1.0, 2, 2)
     return _TEMPLATES[model]

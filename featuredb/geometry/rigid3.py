@@ -1,6 +1,7 @@
 """Rigid transforms of space, with the covariance of their left perturbation."""
 
 from dataclasses import dataclass
+from math import hypot, sin
 from typing import Self
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.rotation import (
+    determinant,
     matrix_from_quaternion,
     quaternion_from_matrix,
     rotation_angle,
@@ -17,6 +19,7 @@ from featuredb.geometry.rotation import (
     so3_log,
 )
 
+_IDENTITY = np.eye(3)
 _SMALL_ANGLE = 1e-6  # below this the series' next term is under float64's resolution
 
 
@@ -38,7 +41,7 @@ class Rigid3:
 
     def __post_init__(self) -> None:
         rotation = frozen_array("Rigid3.rotation", self.rotation, (3, 3))
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-6 or np.linalg.det(rotation) < 0:
+        if np.abs(rotation @ rotation.T - _IDENTITY).max() > 1e-6 or determinant(rotation) < 0:
             raise InvalidValueError(
                 "Rigid3.rotation: expected an orthonormal matrix with determinant +1, "
                 f"found {rotation.tolist()}; use nearest_rotation() to clean up a noisy one"
@@ -139,10 +142,10 @@ class Rigid3:
 
 def _left_jacobian(omega: FloatArray) -> FloatArray:
     """Left Jacobian of SO(3): V with exp(omega, nu) = (exp(omega), V nu)."""
-    theta = float(np.linalg.norm(omega))
+    theta = hypot(*omega.tolist())
     k = skew(omega)
     if theta < _SMALL_ANGLE:
-        return np.eye(3) + 0.5 * k + k @ k / 6.0
-    a = 0.5 * (np.sin(0.5 * theta) / (0.5 * theta)) ** 2  # (1 - cos) / theta^2 without its cancellation
-    b = (theta - np.sin(theta)) / theta**3
-    return np.asarray(np.eye(3) + a * k + b * (k @ k), dtype=np.float64)
+        return _IDENTITY + 0.5 * k + k @ k / 6.0
+    a = 0.5 * (sin(0.5 * theta) / (0.5 * theta)) ** 2  # (1 - cos) / theta^2 without its cancellation
+    b = (theta - sin(theta)) / theta**3
+    return _IDENTITY + a * k + b * (k @ k)

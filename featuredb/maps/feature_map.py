@@ -9,7 +9,7 @@ local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes 
 from collections.abc import Sized
 from dataclasses import dataclass, field, replace
 from datetime import datetime
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,11 +22,10 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
-
-MapMethod = Literal["gps", "lidar", "gcp", "map"]
-MapStatus = Literal["quarantined", "active", "retired"]
-MAP_METHODS: tuple[MapMethod, ...] = get_args(MapMethod)
-MAP_STATUSES: tuple[MapStatus, ...] = get_args(MapStatus)
+from featuredb.maps.statuses import MAP_METHODS as MAP_METHODS
+from featuredb.maps.statuses import MAP_STATUSES as MAP_STATUSES
+from featuredb.maps.statuses import MapMethod as MapMethod
+from featuredb.maps.statuses import MapStatus as MapStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

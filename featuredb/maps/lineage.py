@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from featuredb.maps.feature_map import MapMethod, MapStatus
+from featuredb.maps.statuses import MapMethod, MapStatus
 
 GROWTH = "growth"  # key of Placement.evidence that growth writes and this module reads
 

@@ -5,7 +5,7 @@ makes a FeatureMap of it, under the same map id.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, TypeAlias, TypeVar, get_args
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,9 +21,8 @@ from featuredb.maps.feature_map import (
     check_parts,
     check_points,
 )
-
-UnplacedStatus = Literal["unplaced", "retired"]
-UNPLACED_STATUSES: tuple[UnplacedStatus, ...] = get_args(UnplacedStatus)
+from featuredb.maps.statuses import UNPLACED_STATUSES as UNPLACED_STATUSES
+from featuredb.maps.statuses import UnplacedStatus as UnplacedStatus
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,8 +1,15 @@
-"""The database: Delta tables, snapshots, commits, checks, SQL. The home of deltalake and DuckDB."""
+"""The database: Delta tables, snapshots, commits, checks, SQL. The home of deltalake and DuckDB.
 
-from featuredb.store.commits import HistoryEntry
-from featuredb.store.database import CommitResult, Database, StatusResult
-from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary, UtmBox
+What this package names is imported when it is asked for: a command's help needs none of it.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from featuredb.store.commits import HistoryEntry
+    from featuredb.store.database import CommitResult, Database, StatusResult
+    from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary, UtmBox
 
 __all__ = [
     "CommitResult",
@@ -14,3 +21,16 @@ __all__ = [
     "UnplacedSummary",
     "UtmBox",
 ]
+
+_MODULES = {
+    "commits": ("HistoryEntry",),
+    "database": ("CommitResult", "Database", "StatusResult"),
+    "snapshot": ("MapSummary", "Snapshot", "UnplacedSummary", "UtmBox"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(import_module(f"{__name__}.{module}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -71,7 +71,7 @@ def run_video(args: argparse.Namespace) -> int:
         TelemetryError, IngestError, StoreError, InvalidValueError
     """
     from featuredb.cli.common import storage_options
-    from featuredb.geo.datum import HEIGHT_DATUMS
+    from featuredb.geo.heights import HEIGHT_DATUMS
     from featuredb.store import Database
     from ingest.cli.ingest_run import ingest_folder
     from ingest.cli.progress_bars import progress_bars

@@ -1,4 +1,4 @@
-"""The worker's side of the process pool; standard library only until a task is there."""
+"""The worker's side of the process pool; nothing heavy until a task is there."""
 
 import multiprocessing
 import multiprocessing.connection
@@ -11,6 +11,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
+
+from featuredb.extras import leave_out_pandas
 
 # What OpenMP, OpenBLAS and MKL read when they are loaded.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -43,6 +45,7 @@ def cap_threads(threads: int) -> None:
 
 def serve(connection: Connection, threads: int) -> None:
     """Answer tasks until the parent hangs up: (function, item) in, (True, result) or (False, error) out."""
+    leave_out_pandas()
     threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
     cap_threads(threads)

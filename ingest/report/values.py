@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.plain_json import plain
+from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.register.control.model import ControlledPlacement
 from ingest.report.films import FilmOutcome, films_json
 
@@ -21,9 +22,6 @@ SCHEMA_ID = "featuredb/ingest/report/1"
 # EXIF rounds to whole millimetres of 35 mm equivalent (2.5 % at 20 mm) and makers count the frame differently
 # (4 %); beyond their sum something else is at work.
 FOCAL_CHANGE_TO_WARN = 0.08
-# One of a hundred reconstructions of real photos shears its pictures by more: log-normal over nine maps of
-# `brighton`, `lewis`, `seneca`, `fountain-P11`, `entry-P10` and `karma` (0.3 to 5e-5; `tools.lens_widths`).
-SHEARED = 1.3e-4
 
 _TRACK_BINS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 50)
 _PERCENTILES = (50, 90, 99)
@@ -186,12 +184,10 @@ class MapOutcome:
             if c.focal_before_px and abs(c.focal_after_px / c.focal_before_px - 1) > FOCAL_CHANGE_TO_WARN
         ]
         sheared = [
-            f"The pictures of map {self.map_id} are sheared by {self.picture_shear:.2%} (root mean square), "
-            "as by a rolling shutter while the camera moves, or by software that stabilises a film. That "
-            "counts in the uncertainty of its poses, but its shape may bend; move more slowly, or use a "
-            "mechanical shutter."
+            f"Map {self.map_id}: {shear_words(self.picture_shear)}. That counts in the uncertainty of its "
+            "poses, but its shape may bend; move more slowly, or use a mechanical shutter."
         ]
-        return tuple(focal + sheared * (self.picture_shear > SHEARED))
+        return tuple(focal + sheared * (UNUSUAL < self.picture_shear <= IMPOSSIBLE))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -23,7 +23,7 @@ from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.viewer.server import listen, uvicorn_server
 from tests.browser.test_viewer import browser as browser
-from tests.support.hill_photos import CAMERA, FRAME, hill_height, write_hill_photos
+from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos
 from tests.support.hill_scan import write_hill_scan
 
 pytestmark = pytest.mark.slow
@@ -75,7 +75,7 @@ def until(page: Page, condition: str) -> None:
 
 
 def test_a_map_is_placed_by_clicks(browser: Browser, session: PickSession, url: str, tmp_path: Path) -> None:
-    truth = {p.name: p for p in write_hill_photos(tmp_path / "again")}
+    truth = {p.name: p for p in hill_photos()}
     page = browser.new_page(viewport={"width": 1500, "height": 800})
     errors: list[str] = []
     page.on("pageerror", lambda error: errors.append(str(error)))

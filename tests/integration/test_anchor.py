@@ -27,7 +27,7 @@ from ingest.reconstruction import MapMakingOptions
 from ingest.register.anchor.frames import FramesOptions
 from ingest.register.anchor.values import AnchorOptions
 from schemas import load_schema
-from tests.support.hill_photos import CAMERA, FRAME, hill_height, write_hill_photos
+from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos
 from tests.support.hill_scan import EPSG, write_hill_scan
 from tests.support.maps import random_map
 
@@ -65,9 +65,9 @@ def only_map(database: Path, as_of: int | None = None) -> FeatureMap:
     return snapshot.load_map(summary.map_id)
 
 
-def errors(feature_map: FeatureMap, photos: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
+def errors(feature_map: FeatureMap) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Distances of cameras (m), angles (deg), and heights of points (m) from the truth on the scan."""
-    truth = {p.name: p.cam_from_local for p in write_hill_photos(photos.parent / "again")}
+    truth = {p.name: p.cam_from_local for p in hill_photos()}
     frame_from_map = FRAME.enu_from(feature_map.frame)
     metres, degrees = [], []
     for image in feature_map.images:
@@ -87,7 +87,7 @@ def test_auto_places_the_map_on_the_scan(
     photos, right, _ = hills
     database = copied(right)
     old = only_map(database)
-    metres_before, _, heights_before = errors(old, photos)
+    metres_before, _, heights_before = errors(old)
     assert np.median(metres_before) > 5.0
     assert abs(np.median(heights_before)) > 5.0
     # A map that the old one placed must not go on answering from there.
@@ -99,7 +99,7 @@ def test_auto_places_the_map_on_the_scan(
     assert main([*words, "--auto", "--quiet"]) == 0
     said = capsys.readouterr().out
     new = only_map(database)
-    metres, degrees, heights = errors(new, photos)
+    metres, degrees, heights = errors(new)
     assert np.median(metres) < 0.15
     assert np.median(degrees) < 0.15
     assert np.abs(np.median(heights)) < 0.05
@@ -167,7 +167,7 @@ def test_frames_are_proposed_and_one_is_confirmed(
     assert main([*words, "--confirm", "photo_99.jpg"]) == 2
     assert "no image is called" in capsys.readouterr().err
     assert main([*words, "--confirm", name]) == 0
-    metres, _, heights = errors(only_map(database), photos)
+    metres, _, heights = errors(only_map(database))
     assert np.median(metres) < 0.3
     assert abs(np.median(heights)) < 0.1
     # What was proposed belongs to the old state of the map.
@@ -275,7 +275,7 @@ def test_picks_with_an_outlier_start_a_map_that_lies_elsewhere(
     database.commit_map(lost(old, np.array([45.0, 30.0, -20.0])), replaces=old.map_id)
     words = ["anchor", str(path), old.map_id, "--photos", str(photos), "--out", str(out), "--quiet"]
     image = old.images[4]
-    truth = {p.name: p.cam_from_local for p in write_hill_photos(tmp_path / "again")}[image.name]
+    truth = {p.name: p.cam_from_local for p in hill_photos()}[image.name]
     rng = np.random.default_rng(0)
     plan = truth.center[:2] + rng.uniform(-14, 14, (9, 2))
     points = np.column_stack([plan, hill_height(plan[:, 0], plan[:, 1])])
@@ -288,7 +288,7 @@ def test_picks_with_an_outlier_start_a_map_that_lies_elsewhere(
     helped = [*words, "--picks", str(picks), "--image", image.name, "--frames", "1", "--auto"]
     assert main(helped) == 0
     assert "contradict the others: line 6" in capsys.readouterr().out
-    metres, _, heights = errors(only_map(path), photos)
+    metres, _, heights = errors(only_map(path))
     assert np.median(metres) < 0.3
     assert abs(np.median(heights)) < 0.1
 

@@ -2,6 +2,7 @@
 
 import csv
 import os
+import shutil
 import signal
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -44,11 +45,17 @@ def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhot
 
 
 @pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of `in_process`."""
+    return tmp_path_factory.mktemp("work")
+
+
+@pytest.fixture(scope="module")
 def in_process(
-    hills: tuple[Path, list[HillPhoto]], tmp_path_factory: pytest.TempPathFactory
+    hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[FeatureMap, IngestReport]:
     database = Database.create(tmp_path_factory.mktemp("in-process") / "db")
-    report = ingest_photos(database, hills[0], _OPTIONS)
+    report = ingest_photos(database, hills[0], replace(_OPTIONS, work=work))
     return _only_map(database), report
 
 
@@ -76,7 +83,11 @@ def test_blocks_are_joined_into_one_map_that_agrees_with_the_truth(
 
 
 def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
-    hills: tuple[Path, list[HillPhoto]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    hills: tuple[Path, list[HillPhoto]],
+    in_process: tuple[FeatureMap, IngestReport],
+    work: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Blocks laid on top of each other at random: no match fits, yet no block is lost for it."""
 
@@ -86,8 +97,10 @@ def test_a_wrong_joint_is_undone_and_the_blocks_stay_apart(
         return [JoinedModel(members=tuple(range(len(models))), first_from=tuple(turned))]
 
     monkeypatch.setattr(reconstruct, "join", at_random)
+    for done in ("features", "matches"):
+        shutil.copytree(work / done, tmp_path / "work" / done)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, hills[0], _OPTIONS)
+    report = ingest_photos(database, hills[0], replace(_OPTIONS, work=tmp_path / "work"))
     poses = {photo.name: photo.cam_from_local for photo in hills[1]}
     snapshot = database.snapshot()
     maps = [snapshot.load_map(m.map_id) for m in snapshot.maps()]
@@ -157,14 +170,14 @@ def _write_table(folder: Path, photos: list[HillPhoto], path: Path, *, owner: st
 
 @pytest.mark.parametrize(("trust", "status"), [(False, "quarantined"), (True, "active")])
 def test_positions_of_a_table_place_active_maps_only_when_they_are_trusted(
-    trust: bool, status: str, tmp_path: Path
+    trust: bool, status: str, work: Path, tmp_path: Path
 ) -> None:
     photos = write_hill_photos(tmp_path / "photos")
     table = tmp_path / "site.csv"
     _write_table(tmp_path / "photos", photos, table, owner="Ann")
     database = Database.create(tmp_path / "db")
     making = replace(_OPTIONS.making, clusters=ClusterOptions())
-    options = IngestOptions(workers=1, making=making, scan=ScanOptions(trust_geotags=trust))
+    options = IngestOptions(workers=1, making=making, scan=ScanOptions(trust_geotags=trust), work=work)
     report = ingest_photos(database, table, options)
     assert report.count("registered") == 9
     found = _only_map(database)

@@ -32,7 +32,7 @@ NOT_RUN = {
     "featuredb anchor film.db": _BY_HAND,
     "featuredb track film.db": _BY_HAND,
     "featuredb localise film.db": _BY_HAND,
-    "featuredb demo": "the last step of tools/check.py runs it",
+    "featuredb demo": "tests/integration/test_demo.py runs it",
     "tools/check.py": "it runs these tests",
     "pip install": "installs; the extra is looked up",
     "tools/scan_poses.py": _REAL_DATA,

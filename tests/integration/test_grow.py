@@ -40,6 +40,7 @@ from tests.support.hill_walk import (
     step_of,
     survey,
 )
+from tests.support.made_once import made_once
 
 _EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
 _AWAY_M = WEST_M + 90.0  # and there nothing of it
@@ -48,9 +49,7 @@ _AWAY_M = WEST_M + 90.0  # and there nothing of it
 @pytest.fixture(scope="module")
 def anchored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an anchored database, to be copied."""
-    folder = tmp_path_factory.mktemp("anchored")
-    anchored_database(folder)
-    return folder / "db"
+    return made_once("anchored-hills", anchored_database, tmp_path_factory) / "db"
 
 
 @pytest.fixture
@@ -330,9 +329,7 @@ def test_an_empty_inbox_is_no_error(database: Database) -> None:
 
 
 @pytest.mark.parametrize(("up_m", "other_datum"), [(0.0, False), (1.0, False), (1.0, True)])
-def test_a_scan_in_store_has_its_say(
-    database: Database, tmp_path: Path, up_m: float, other_datum: bool
-) -> None:
+def test_a_scan_in_store_has_its_say(given: Path, tmp_path: Path, up_m: float, other_datum: bool) -> None:
     """The grown map claims centimetres; a scan that has the hills a metre higher keeps it out.
 
     With heights of another datum it cannot say so, and the report tells.
@@ -341,13 +338,13 @@ def test_a_scan_in_store_has_its_say(
     pytest.importorskip("laspy")
     from featuredb.lidar.add import AddOptions, add_scan
 
+    database = _copy(given, tmp_path)
     anchor = next(iter(database.snapshot().maps()))
     datum = database.snapshot().load_map(anchor.map_id).height_datum
     if other_datum:
         datum = next(d for d in ("ellipsoidal", "egm2008") if d != datum)
     scan = write_hill_scan(tmp_path / "hills.laz", offset_m=(0.0, 0.0, up_m), half_side_m=50.0, spacing_m=0.4)
     add_scan(database, [scan], AddOptions(height_datum=datum))
-    give(database, step_of(_EAST_M))
     report = grow_candidates(database, growing())
     said = [note for note in report.notes if "scans in store" in note]
     assert bool(said) == other_datum

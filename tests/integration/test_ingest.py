@@ -25,10 +25,16 @@ def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhot
     return folder, write_hill_photos(folder)
 
 
-def test_map_agrees_with_the_truth(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where features and matches are kept for the next test with the same photos."""
+    return tmp_path_factory.mktemp("work")
+
+
+def test_map_agrees_with_the_truth(hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path) -> None:
     folder, truth = hills
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, folder, _TRUTH)
+    report = ingest_photos(database, folder, replace(_TRUTH, work=work))
     assert [m.status for m in report.maps] == ["committed"]
     assert report.count("registered") == len(truth) == 9
     feature_map = database.snapshot().load_map(report.maps[0].map_id)
@@ -49,11 +55,13 @@ def test_map_agrees_with_the_truth(hills: tuple[Path, list[HillPhoto]], tmp_path
     assert 0.6 < (np.abs(above - np.median(above)) < sigma).mean() < 0.92
 
 
-def test_only_long_tracks_carry_descriptors(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+def test_only_long_tracks_carry_descriptors(
+    hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
+) -> None:
     options = IngestOptions(
         workers=1,
         gps_sigma_m=(0.02, 0.02),
-        work=tmp_path / "work",
+        work=work,
         making=MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(min_track_length=4)),
     )
     database = Database.create(tmp_path / "db")
@@ -109,13 +117,13 @@ def test_two_places_become_two_maps(tmp_path: Path) -> None:
     assert east[1] - east[0] == pytest.approx(400.0, abs=10.0)
 
 
-def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
+def test_a_wrong_position_is_named_and_left_out(work: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_hill_photos(folder, gps_noise_m=0.01)
     stray = write_hill_photos(tmp_path / "stray", east_m=30.0)[4]
     (tmp_path / "stray" / stray.name).replace(folder / stray.name)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, folder, _TRUTH)
+    report = ingest_photos(database, folder, replace(_TRUTH, work=work))
     assert [m.status for m in report.maps] == ["committed"]
     unused = [p for p in report.photos if p.gps_used is False]
     assert [p.name for p in unused] == [stray.name]
@@ -128,14 +136,14 @@ def test_a_wrong_position_is_named_and_left_out(tmp_path: Path) -> None:
     assert report.maps[0].radius_m == pytest.approx(2.45 * 0.02, rel=0.3)
 
 
-def test_positions_that_agree_on_another_place_keep_their_photos_out(tmp_path: Path) -> None:
+def test_positions_that_agree_on_another_place_keep_their_photos_out(work: Path, tmp_path: Path) -> None:
     folder = tmp_path / "photos"
     write_hill_photos(folder, gps_noise_m=0.01)
     strays = write_hill_photos(tmp_path / "stray", east_m=30.0)[3:5]
     for stray in strays:
         (tmp_path / "stray" / stray.name).replace(folder / stray.name)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, folder, _TRUTH)
+    report = ingest_photos(database, folder, replace(_TRUTH, work=work))
     assert [(m.status, m.photos, m.reason_code) for m in report.maps] == [
         ("committed", 7, ""),
         ("refused", 2, "ELSEWHERE"),
@@ -158,18 +166,22 @@ def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
     assert "overlap" in report.warnings[0]
 
 
-def test_a_kept_focal_length_is_that_of_exif(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+def test_a_kept_focal_length_is_that_of_exif(
+    hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
+) -> None:
     making = MapMakingOptions(extractor=_EXTRACTOR, sfm=SfmOptions(refine_focal=False))
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making))
+    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making, work=work))
     (camera,) = report.maps[0].cameras
     assert camera.focal_before_px == camera.focal_after_px
     assert report.count("registered") == 9
 
 
-def test_a_map_without_a_good_point_is_refused(hills: tuple[Path, list[HillPhoto]], tmp_path: Path) -> None:
+def test_a_map_without_a_good_point_is_refused(
+    hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
+) -> None:
     making = MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(max_sigma_over_distance=1e-9))
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making))
+    report = ingest_photos(database, hills[0], replace(_TRUTH, making=making, work=work))
     assert [(m.status, m.reason_code) for m in report.maps] == [("refused", "NO_POINTS")]
     assert not database.snapshot().maps()

@@ -62,21 +62,7 @@ def foreign(tmp_path_factory: pytest.TempPathFactory, field_map: FeatureMap) -> 
 
 def colmap_alone(folder: Path, photos: Path, feature_map: FeatureMap, normalisation: str) -> None:
     """COLMAP's SIFT, matches and triangulation at known poses, into `folder`."""
-    database = folder / "database.db"
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.use_gpu = False
-    extraction.num_threads = 1
-    extraction.sift.normalization = getattr(pycolmap.Normalization, normalisation)
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    reader.camera_params = "600,600,320,240"
-    pycolmap.extract_features(
-        str(database),
-        str(photos),
-        camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=reader,
-        extraction_options=extraction,
-    )
+    database = colmap_features(folder, photos, normalisation)
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.num_threads = 1
@@ -93,6 +79,26 @@ def colmap_alone(folder: Path, photos: Path, feature_map: FeatureMap, normalisat
     (folder / "sparse" / "0").mkdir(parents=True)
     made = pycolmap.triangulate_points(posed, str(database), str(photos), str(folder / "sparse" / "0"))
     made.write(str(folder / "sparse" / "0"))
+
+
+def colmap_features(folder: Path, photos: Path, normalisation: str) -> Path:
+    """COLMAP's SIFT, into the database in `folder`."""
+    database = folder / "database.db"
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.use_gpu = False
+    extraction.num_threads = 1
+    extraction.sift.normalization = getattr(pycolmap.Normalization, normalisation)
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = "PINHOLE"
+    reader.camera_params = "600,600,320,240"
+    pycolmap.extract_features(
+        str(database),
+        str(photos),
+        camera_mode=pycolmap.CameraMode.SINGLE,
+        reader_options=reader,
+        extraction_options=extraction,
+    )
+    return database
 
 
 def localised(feature_map: FeatureMap) -> Rigid3:
@@ -251,7 +257,9 @@ class TestRefusals:
     def test_descriptors_that_are_no_rootsift(
         self, tmp_path: Path, foreign: Path, field_map: FeatureMap
     ) -> None:
-        colmap_alone(tmp_path, foreign / "photos", field_map, "L2")
+        # Where keypoints are, and so the model, is the same for every normalisation of their descriptors.
+        colmap_features(tmp_path, foreign / "photos", "L2")
+        shutil.copytree(foreign / "sparse", tmp_path / "sparse")
         options = ModelOptions(photos=foreign / "photos", stated=STATED)
         with pytest.raises(IngestError, match="expected RootSIFT"):
             map_of_model(tmp_path, options)

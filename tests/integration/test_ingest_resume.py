@@ -110,7 +110,8 @@ def _wait_for_workers(group: int) -> None:
 )
 def test_killed_at_a_stage(pattern: str, photos: Path, undisturbed: FeatureMap, tmp_path: Path) -> None:
     database = tmp_path / "db"
-    process = _start(database, photos)
+    # What comes after the models is the command's own work: it needs no workers, which take long to start.
+    process = _start(database, photos, workers=2 if pattern.startswith("_work/") else 1)
     killed = _kill_when(process, lambda: any(database.glob(pattern)))
     if killed:
         _wait_for_workers(process.pid)
@@ -156,7 +157,7 @@ def test_two_ingests_at_once_both_land(photos: Path, undisturbed: FeatureMap, tm
     other = tmp_path / "other"
     write_hill_photos(other, columns=2, rows=2, texture_seed=5, east_m=300.0)
     database = tmp_path / "db"
-    processes = [_start(database, folder) for folder in (photos, other, photos)]
+    processes = [_start(database, folder, workers=1) for folder in (photos, other, photos)]
     assert [p.wait(_TIMEOUT_S) for p in processes] == [0, 0, 0]
     opened = Database.open(database)
     maps = {m.map_id: m for m in opened.snapshot().maps()}

@@ -1,6 +1,7 @@
 """`featuredb ingest video`: a film over the test hills becomes a map where its telemetry has them."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.planar_map import field_texture, view
 
 _RATE_HZ = 10.0
+# For what telemetry does: a handful of photos, each of which is looked at for what is burnt in.
+_FEW = KeyframeOptions(step=0.25, least=4)
 
 
 def _pose(frame: int) -> Rigid3:
@@ -102,7 +105,7 @@ def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Pa
 
 def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> None:
     telemetry = read_telemetry(film.with_suffix(".srt"))
-    late = make_stills(film, telemetry, tmp_path, StillsOptions(telemetry_late_s=0.2))
+    late = make_stills(film, telemetry, tmp_path, StillsOptions(telemetry_late_s=0.2, keyframes=_FEW))
     file = sorted(late.folder.glob("*.jpg"))[0]
     there = geopose_from_camera(_pose(int(file.stem) + 2), FRAME)
     assert read_exif(file.read_bytes()).longitude_deg == pytest.approx(there.longitude_deg, abs=2e-8)
@@ -110,7 +113,8 @@ def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> 
 
 def test_the_lag_is_looked_for_and_what_was_found_is_said(film: Path, tmp_path: Path) -> None:
     """Not much of a curve in five seconds: no lag is believed, and none is applied."""
-    stills = make_stills(film, read_telemetry(film.with_suffix(".srt")), tmp_path)
+    options = StillsOptions(keyframes=_FEW)
+    stills = make_stills(film, read_telemetry(film.with_suffix(".srt")), tmp_path, options)
     assert stills.late_s == 0.0
     assert any("lag" in note for note in stills.notes)
 
@@ -207,7 +211,8 @@ def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: P
     log = _log(tmp_path / "log.csv")
     telemetry = read_telemetry(log if kind == "csv" else _gpx(log, tmp_path / "log.gpx"))
     begins = film_start("2026-05-01T14:00:03+02:00", telemetry)
-    stills = make_stills(film, telemetry, tmp_path, StillsOptions(film_start_s=begins))
+    options = StillsOptions(film_start_s=begins, keyframes=_FEW)
+    stills = make_stills(film, telemetry, tmp_path, options)
     assert stills.late_s == 3.0
     assert stills.positions == stills.photos > 2
     assert any("as was told" in note for note in stills.notes)
@@ -217,9 +222,9 @@ def test_a_log_places_the_film_where_it_is_told_to_begin(film: Path, tmp_path: P
         assert told.latitude_deg == pytest.approx(place.latitude_deg, abs=5.0 / 111_000)
         assert told.longitude_deg == pytest.approx(place.longitude_deg, abs=5.0 / 73_000)
     # Other clocks are other photos, and beside control points a log that does not fit is only told.
-    again = make_stills(film, telemetry, tmp_path, StillsOptions(film_start_s=begins, telemetry_late_s=1.0))
+    again = make_stills(film, telemetry, tmp_path, replace(options, telemetry_late_s=1.0))
     assert (again.late_s, again.folder == stills.folder) == (4.0, False)
-    without = make_stills(film, telemetry, tmp_path, StillsOptions(positions=False))
+    without = make_stills(film, telemetry, tmp_path, StillsOptions(positions=False, keyframes=_FEW))
     assert (without.late_s, without.positions) == (None, 0)
     assert any("less than 40 s of movement" in note for note in without.notes)
 
@@ -239,7 +244,9 @@ def test_a_table_in_the_films_time_needs_no_clock(film: Path, tmp_path: Path) ->
     )
     telemetry = read_telemetry(table)
     assert telemetry.in_video_time
-    stills = make_stills(film, telemetry, tmp_path / "work", StillsOptions(telemetry_late_s=0.0))
+    stills = make_stills(
+        film, telemetry, tmp_path / "work", StillsOptions(telemetry_late_s=0.0, keyframes=_FEW)
+    )
     assert stills.positions == stills.photos
 
 

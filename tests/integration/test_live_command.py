@@ -32,16 +32,22 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture(scope="module")
-def film(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A film over one place, as slow as this machine, busy as it is, needs to find it in good time."""
+def streamed(server: Server, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[TrackPose]]:
+    """A film over one place, as slow as this machine needs to find it in good time, and its poses."""
     for rate_hz in _RATES_HZ:
         path = tmp_path_factory.mktemp("film") / f"still-{rate_hz:g}.mp4"
         with VideoWriter(path, width=CAMERA.width, height=CAMERA.height, fps=rate_hz) as writer:
             for _ in range(_FRAMES):
                 writer.write(frame(0))
-        if sum(pose.state == "tracking" for pose in _streamed(server, path)) > _FRAMES // 2:
+        poses = _streamed(server, path)
+        if sum(pose.state == "tracking" for pose in poses) > _FRAMES // 2:
             break
-    return path
+    return path, poses
+
+
+@pytest.fixture(scope="module")
+def film(streamed: tuple[Path, list[TrackPose]]) -> Path:
+    return streamed[0]
 
 
 def _streamed(server: Server, film: Path) -> list[TrackPose]:
@@ -115,8 +121,8 @@ def test_a_film_that_cannot_be_read_opens_no_session(server: Server, tmp_path: P
     assert after.opened == before.opened
 
 
-def test_a_pose_survives_the_wire(server: Server, film: Path) -> None:
-    known = next(pose for pose in _streamed(server, film) if pose.state == "tracking")
+def test_a_pose_survives_the_wire(streamed: tuple[Path, list[TrackPose]]) -> None:
+    known = next(pose for pose in streamed[1] if pose.state == "tracking")
     assert known.body_axes == BODY_AXES
     assert known.accuracy is not None
     point = point_of_message(TrackPose.model_validate_json(known.model_dump_json()))

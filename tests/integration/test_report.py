@@ -266,6 +266,6 @@ def _file(folder: Path, data: bytes) -> Path:
 
 
 def test_pictures_that_are_sheared_are_warned_of() -> None:
-    sheared = MapOutcome(map_id="m1", name="n", status="committed", picture_shear=6e-4)
-    assert any("rolling shutter" in text and "0.06%" in text for text in sheared.warnings)
+    sheared = MapOutcome(map_id="m1", name="n", status="committed", picture_shear=2e-4)
+    assert any("rolling shutter" in text and "0.02%" in text for text in sheared.warnings)
     assert not MapOutcome(map_id="m2", name="n", status="committed", picture_shear=5e-5).warnings

@@ -18,6 +18,7 @@ from featuredb.geo.crs import scan_crs
 from featuredb.geo.wkt import utm_wkt
 from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.formats.las_writer import write_las
+from featuredb.simworld import scan_world
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.laser.airborne import scan_town
 from featuredb.simworld.laser.scan_file import write_scan
@@ -232,10 +233,10 @@ def test_the_command_writes_scan_and_ortho(
     command.register(parser.add_subparsers())
     args = parser.parse_args(["simworld", str(tmp_path / "w"), "--lidar", "--workers", "1"])
     monkeypatch.setattr(
-        command.WorldOptions, "short", classmethod(lambda cls, seed: replace(OPTIONS.world, seed=seed))
+        WorldOptions, "short", classmethod(lambda cls, seed: replace(OPTIONS.world, seed=seed))
     )
     monkeypatch.setattr(
-        command,
+        scan_world,
         "write_lidar",
         lambda folder, options, note: write_lidar(folder, replace(OPTIONS, world=options.world), note),
     )

@@ -157,7 +157,7 @@ def test_the_command_writes_a_world(
         street=0,
     )
     monkeypatch.setattr(
-        command.WorldOptions,
+        WorldOptions,
         "short",
         classmethod(lambda cls, seed: replace(tiny, seed=seed, negatives_per_kind=0)),
     )

@@ -30,6 +30,7 @@ from reloc.tracking.tracker import TrackedFrame, Tracker
 from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import WEST_M, anchored_database
+from tests.support.made_once import made_once
 from tests.support.planar_map import field_texture, view
 
 _OPTIONS = TrackOptions(keyframe_every=4, answer_after=4, lost_answer_after=6, catch_up=6, min_matches=20)
@@ -45,9 +46,7 @@ def pose_at(frame: int) -> Rigid3:
 
 @pytest.fixture(scope="module")
 def anchored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("anchored")
-    anchored_database(folder)
-    return folder / "db"
+    return made_once("anchored-hills", anchored_database, tmp_path_factory) / "db"
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Films on a scan: right by it alone, from a coarse first pose; lost where it shows nothing of them."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from reloc.tracking.trajectory.values import point_of
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_scan import EPSG, write_hill_scan
 from tests.support.hill_walk import anchored_database
+from tests.support.made_once import made_once
 from tests.support.planar_map import field_texture, view
 
 pytest.importorskip("laspy")
@@ -59,7 +61,7 @@ def coarse(pose: Rigid3, off_m: float = 2.0, off_deg: float = 2.0) -> FramePrior
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The map of a survey in the west, and a scan that reaches further east."""
     folder = tmp_path_factory.mktemp("scanned")
-    anchored_database(folder)
+    shutil.copytree(made_once("anchored-hills", anchored_database, tmp_path_factory) / "db", folder / "db")
     scan = write_hill_scan(folder / "hills.laz")
     assert main(["lidar", "add", str(folder / "db"), str(scan), "--height-datum", "ellipsoidal"]) == 0
     return folder / "db"

@@ -7,16 +7,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, logm
+from scipy.spatial.transform import Rotation
 
+from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import (
     matrix_from_quaternion,
     nearest_rotation,
     quaternion_from_matrix,
+    rotation_angle,
     rotation_to_up,
     skew,
     so3_exp,
+    so3_log,
 )
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 
@@ -285,3 +289,31 @@ def test_skew_is_the_cross_product_of_many_as_of_one() -> None:
     np.testing.assert_allclose(np.einsum("nij,nj->ni", skew(v), w), np.cross(v, w), atol=1e-12)
     np.testing.assert_array_equal(skew(v)[2], skew(v[2]))
     assert skew(np.zeros((0, 3))).shape == (0, 3, 3)
+
+
+@given(rotation_vectors(np.pi), st.floats(0.01, 100.0))
+def test_rotations_are_those_of_scipy(omega: FloatArray, length: float) -> None:
+    theirs = Rotation.from_rotvec(omega)
+    matrix = theirs.as_matrix()
+    np.testing.assert_allclose(so3_exp(omega), matrix, rtol=0, atol=2e-15)
+    np.testing.assert_allclose(quaternion_from_matrix(matrix), theirs.as_quat(canonical=True), atol=2e-15)
+    np.testing.assert_allclose(so3_log(matrix), Rotation.from_matrix(matrix).as_rotvec(), atol=5e-15)
+    np.testing.assert_allclose(matrix_from_quaternion(length * theirs.as_quat()), matrix, rtol=0, atol=2e-15)
+    assert rotation_angle(matrix) == pytest.approx(theirs.magnitude(), abs=5e-15)
+
+
+@pytest.mark.parametrize(
+    "axis", [*np.eye(3), *-np.eye(3), [0.6, 0.0, -0.8], [-0.6, 0.8, 0.0], [0.0, -0.6, 0.8]]
+)
+def test_half_turns_are_those_of_scipy(axis: FloatArray) -> None:
+    theirs = Rotation.from_quat([*axis, 0.0])
+    found = quaternion_from_matrix(theirs.as_matrix())
+    np.testing.assert_allclose(found, theirs.as_quat(canonical=True), atol=1e-15)
+    assert rotation_angle(theirs.as_matrix()) == pytest.approx(np.pi, abs=1e-15)
+
+
+def test_a_matrix_that_is_almost_a_rotation_counts_as_the_nearest() -> None:
+    matrix = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix() + 1e-7 * np.arange(9.0).reshape(3, 3)
+    np.testing.assert_allclose(so3_log(matrix), so3_log(nearest_rotation(matrix)), atol=1e-15)
+    with pytest.raises(InvalidValueError, match="expected a rotation matrix"):
+        quaternion_from_matrix(np.diag([1.0, 1.0, -1.0]))

@@ -3,12 +3,15 @@
 Points are keypoints of the views intersected with the plane, so map and truth need no reconstruction.
 """
 
+from functools import cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from featuredb.features.extractor import ExtractorOptions, extract
+from featuredb.features.features import Features
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -20,6 +23,7 @@ EASTING, NORTHING, HEIGHT = 456_800.0, 5_429_300.0, 120.0
 CAMERA = Camera(model="PINHOLE", width=640, height=480, params=(600.0, 600.0, 320.0, 240.0))
 _TEXEL_M = 0.08
 _SIDE_M = 120.0
+_OPTIONS = ExtractorOptions(max_features=1500)
 
 
 def field_texture(seed: int) -> NDArray[np.uint8]:
@@ -61,19 +65,8 @@ def planar_map(
     texture_seed: int = 1, *, map_id: str = "field", east_m: float = 0.0, fingerprint: str | None = None
 ) -> FeatureMap:
     """The map of a field whose middle lies `east_m` east of (EASTING, NORTHING), made from nine views."""
-    texture = field_texture(texture_seed)
     frame = LocalFrame.from_utm(EASTING + east_m, NORTHING, HEIGHT, EPSG)
-    poses = [
-        view(e, n, 45.0, tilt, heading)
-        for (e, n), tilt, heading in zip(
-            [(e, n) for e in (-14, 0, 14) for n in (-14, 0, 14)],
-            [0, 12, 5, 15, 0, 10, 5, 12, 0],
-            [0, 20, 350, 40, 0, 90, 10, 330, 60],
-            strict=True,
-        )
-    ]
-    options = ExtractorOptions(max_features=1500)
-    found = [extract(render(texture, pose, seed=i), options) for i, pose in enumerate(poses)]
+    poses, found = _seen(texture_seed)
     ground = [_on_ground(f.xy, pose) for f, pose in zip(found, poses, strict=True)]
     points, rows = _tracks(ground, [f.scale for f in found])
     point_index = np.concatenate(rows)
@@ -115,8 +108,24 @@ def planar_map(
             covariance=np.diag([1e-10] * 4 + [1e-4] * 3),
             residual_rms_m=0.01,
         ),
-        extractor_fingerprint=fingerprint or options.fingerprint,
+        extractor_fingerprint=fingerprint or _OPTIONS.fingerprint,
     )
+
+
+@cache  # seconds, and many tests begin with the field of one seed
+def _seen(texture_seed: int) -> tuple[tuple[Rigid3, ...], tuple[Features, ...]]:
+    """The nine views, and the keypoints of each."""
+    texture = field_texture(texture_seed)
+    poses = tuple(
+        view(e, n, 45.0, tilt, heading)
+        for (e, n), tilt, heading in zip(
+            [(e, n) for e in (-14, 0, 14) for n in (-14, 0, 14)],
+            [0, 12, 5, 15, 0, 10, 5, 12, 0],
+            [0, 20, 350, 40, 0, 90, 10, 330, 60],
+            strict=True,
+        )
+    )
+    return poses, tuple(extract(render(texture, pose, seed=i), _OPTIONS) for i, pose in enumerate(poses))
 
 
 _PER_KEYPOINT = ("xy", "scale", "angle", "descriptors")

@@ -12,6 +12,7 @@ import signal
 import sys
 from typing import Any
 
+from featuredb.extras import leave_out_pandas
 from featuredb.store import Database
 from featuredb.store import delta as delta_module
 from tests.support.maps import random_map
@@ -46,4 +47,5 @@ def _die_before_write(number: int) -> None:
 
 
 if __name__ == "__main__":
+    leave_out_pandas()
     main(*sys.argv[1:])

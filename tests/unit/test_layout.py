@@ -20,6 +20,7 @@ LONG_MODULES = {
 }
 FULL_FOLDERS = {
     "featuredb/export/dataset",
+    "featuredb/geo",
     "ingest/register/anchor",
     "ingest/register/frame",
 }

@@ -11,9 +11,10 @@ from ingest.clusters.reconstruct import Reconstruction
 from ingest.colmap.bridge import Model
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
-from ingest.placed_models import Component, impossible_lens, place_models
+from ingest.placed_models import Component, impossible_lens, impossible_shear, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed
 from ingest.sfm.extract import FeatureFiles
+from tests.support.growth_box import existing
 from tests.support.posed_models import model_of
 
 
@@ -84,3 +85,12 @@ def test_a_focal_length_that_cannot_be_holds_a_map_back(focal_px: float | None, 
     reason = impossible_lens(model, photos)
     assert word in reason
     assert bool(reason) == bool(word)
+
+
+@pytest.mark.parametrize(("size", "held"), [(9e-4, True), (1e-4, False), (None, False)])
+def test_pictures_sheared_as_no_lens_shears_them_hold_a_map_back(size: float | None, held: bool) -> None:
+    feature_map = existing()
+    told = {} if size is None else {"picture_shear": size}
+    reason = impossible_shear(replace(feature_map, provenance=told))
+    assert ("rolling shutter" in reason) == held
+    assert bool(reason) == held

@@ -6,6 +6,7 @@ from tools.scoreboard.row import Form, Limit, Row
 from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HELD_OUT, OUT, SCAN, same
 
 _LENS_SETS = ("brighton/images", "seneca/images", "copr/images", "sacre_coeur/mapping")
+_CUTS = ("interleaved", "consecutive")
 _LENS_WIDTHS = ("focal_rel", "aspect_rel", "center_rel", "radial", "tangential")
 
 
@@ -26,6 +27,34 @@ def _portions(photos: str, cut: str, minutes: float) -> Row:
         limits=(Limit(figure="missing", most=0), Limit(figure="median_m", most=0.3)),
         needs=(photos,),
         minutes=minutes,
+    )
+
+
+_GATED = tuple((photos, cut) for photos in ("brighton/images", "sacre_coeur/mapping") for cut in _CUTS)
+
+
+def _gates() -> Row:
+    return Row(
+        name="growth-gates",
+        group="real",
+        form="full",
+        claim="what gates of growth let pass is right, of `brighton` and `sacre_coeur` in three portions",
+        commands=(
+            *(
+                (
+                    *("tools.growth_portions", "--photos", f"{{data}}/{photos}", "--cut", cut),
+                    *("--work", "{work}/cache", "--gates", f"{{work}}/{k}.jsonl"),
+                )
+                for k, (photos, cut) in enumerate(_GATED)
+            ),
+            ("tools.growth_gates", *(f"{{work}}/{k}.jsonl" for k in range(len(_GATED))), *OUT),
+        ),
+        figures=same("judged", "alone_right", "alone_wrong", "refine_right", "refine_wrong"),
+        text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates "
+        "that alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
+        limits=(Limit(figure="refine_wrong", most=0),),
+        needs=tuple(photos for photos, _ in _GATED),
+        minutes=8,
     )
 
 
@@ -519,4 +548,5 @@ REAL: tuple[Row, ...] = (
     _portions("lewis/images", "consecutive", 20),
     _portions("copr/images", "consecutive", 15),
     _portions("sacre_coeur/mapping", "interleaved", 4),
+    _gates(),
 )

@@ -10,10 +10,12 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from featuredb.errors import InvalidValueError
-from featuredb.store.encode import Row
+
+if TYPE_CHECKING:
+    from featuredb.store.encode import Row
 
 CandidateState = Literal["waiting", "used", "refused", "withdrawn"]
 CANDIDATE_STATES: tuple[CandidateState, ...] = get_args(CandidateState)
@@ -135,12 +137,12 @@ def candidate_id_of(image: bytes) -> str:
     return hashlib.sha256(image).hexdigest()[:32]
 
 
-def event_order(event: Row) -> tuple[datetime, str, int]:
+def event_order(event: "Row") -> tuple[datetime, str, int]:
     """Sorts events by time; those of one write in the order in which they were given."""
     return event["happened_at"], event["write_id"], event["event_index"]
 
 
-def standing_of(events: Sequence[Row], live_maps: Collection[str]) -> CandidateStanding:
+def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> CandidateStanding:
     """The state that a candidate's events add up to.
 
     The latest refusal, withdrawal or opening decides, unless it was used after it: then it is used while one
@@ -173,7 +175,7 @@ def standing_of(events: Sequence[Row], live_maps: Collection[str]) -> CandidateS
     )
 
 
-def contributors_of(events: Iterable[Row]) -> tuple[Contributor, ...]:
+def contributors_of(events: Iterable["Row"]) -> tuple[Contributor, ...]:
     """Those who gave the photo, each owner once, by their first contribution since it was last withdrawn."""
     found: dict[str, Contributor] = {}
     gone: dict[str, Contributor] = {}
@@ -193,7 +195,7 @@ def contributors_of(events: Iterable[Row]) -> tuple[Contributor, ...]:
     return tuple((found or gone).values())
 
 
-def candidate_of(events: Sequence[Row], live_maps: Collection[str]) -> Candidate:
+def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidate:
     """A candidate out of all its events, in order, among them at least one contribution."""
     given = [event for event in events if event["event"] == CONTRIBUTED]
     contributors = contributors_of(events)

@@ -31,7 +31,7 @@ def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
     turn = pose.rotation.T @ prior.cam_from_local.rotation
     heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
     cosine, sine = np.cos(heading), np.sin(heading)
-    tilt = _small_log(turn @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
+    tilt = so3_log(turn @ np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
     if prior.sigma_heading_deg >= 180.0:
         heading = 0.0
     angles = np.degrees([tilt[0], tilt[1], heading])
@@ -42,22 +42,6 @@ def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
             angles / (tilted, tilted, prior.sigma_heading_deg),
         ]
     )
-
-
-def _small_log(rotation: FloatArray) -> FloatArray:
-    """so3_log, ten times as fast where the angle is not near 180 degrees."""
-    cosine = float(np.trace(rotation) - 1.0) / 2.0
-    if cosine < -0.9:
-        return so3_log(rotation)
-    axis = np.array(
-        [
-            rotation[2, 1] - rotation[1, 2],
-            rotation[0, 2] - rotation[2, 0],
-            rotation[1, 0] - rotation[0, 1],
-        ]
-    )
-    sine = float(np.linalg.norm(axis)) / 2.0
-    return axis / 2.0 * (float(np.arctan2(sine, cosine)) / sine if sine > 1e-9 else 1.0)
 
 
 def prior_sigmas(prior: FramePrior, pose: Rigid3) -> float:
