@@ -91,23 +91,6 @@ def shared_points(count: int, limit: int) -> Gate:
     )
 
 
-def spread(sigma_m: float, distance_m: float, limit: float) -> Gate:
-    """How far the placement may be off at the rim of the new map, over the distance that photos look.
-
-    Few photos, or many close together, leave scale and tilt open; the rim moves most.
-    """
-    share = sigma_m / distance_m if distance_m > 0 else np.inf
-    return Gate(
-        name="spread",
-        reason="POORLY_HELD",
-        figure=share,
-        limit=limit,
-        passes=share <= limit,
-        message=f"at its rim the new map is held to {sigma_m:.2f} m, {share:.2%} of the viewing distance; "
-        f"{limit:.1%} is allowed",
-    )
-
-
 def residuals(offset_m: float, distance_m: float, limit: float) -> Gate:
     """Typical distance of localised camera centres from the placed ones, over the viewing distance.
 
@@ -122,20 +105,6 @@ def residuals(offset_m: float, distance_m: float, limit: float) -> Gate:
         passes=share <= limit,
         message=f"localised cameras lie {offset_m:.2f} m from the placed ones, {share:.2%} of the viewing "
         f"distance; {limit:.1%} is allowed",
-    )
-
-
-def runner_up(rival_photos: int, agreeing: int, limit: float) -> Gate:
-    """Photos that agree with the best placement elsewhere, over those that agree with this one."""
-    share = rival_photos / agreeing if agreeing else np.inf
-    return Gate(
-        name="runner_up",
-        reason="AMBIGUOUS",
-        figure=share,
-        limit=limit,
-        passes=share <= limit,
-        message=f"{rival_photos} photos agree with another placement, {agreeing} with this one; a share of "
-        f"{limit:.0%} is allowed",
     )
 
 

@@ -26,22 +26,10 @@ def test_shared_points() -> None:
     assert gates.shared_points(30, 30).passes
 
 
-def test_spread_is_relative_to_the_viewing_distance() -> None:
-    assert gates.spread(0.9, 50.0, 0.02).passes
-    assert not gates.spread(0.9, 40.0, 0.02).passes
-    assert not gates.spread(0.1, 0.0, 0.02).passes  # no distance, no statement
-
-
 def test_residuals() -> None:
     assert gates.residuals(0.4, 50.0, 0.01).passes
     assert not gates.residuals(0.6, 50.0, 0.01).passes
     assert not gates.residuals(float("nan"), 50.0, 0.01).passes
-
-
-def test_runner_up() -> None:
-    assert gates.runner_up(2, 4, 0.5).passes
-    assert not gates.runner_up(3, 4, 0.5).passes
-    assert not gates.runner_up(0, 0, 0.5).passes
 
 
 def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
@@ -110,4 +98,4 @@ def test_first_refusal_and_json() -> None:
     assert refusal.name == "shared_points"
     assert gates.first_refusal(asked[:1]) is None
     assert asked[1].as_json() == {"figure": 5.0, "limit": 30, "passes": False}
-    assert gates.runner_up(0, 0, 0.5).as_json()["figure"] is None
+    assert gates.residuals(0.1, 0.0, 0.01).as_json()["figure"] is None

@@ -271,7 +271,7 @@ def _anchors_of(feature_map: FeatureMap) -> list[str]:
 # the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
 # whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
 # confirm them: twelve photos promoted 277 m off.
-AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "AMBIGUOUS", "RESIDUALS", "NOT_VISIBLE")
+AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
 _LEAST_PHOTOS = 3
 
 

@@ -17,7 +17,6 @@ from featuredb.index.area import Area
 from ingest.colmap.bridge import Model
 from ingest.growth import gates
 from ingest.growth.gates import Gate
-from ingest.growth.map_places import at_most_places, place_sigmas_m
 from ingest.growth.place.contradictions import center_variance_m2
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.parents import ParentOptions, edges_of, parents_covariance
@@ -45,13 +44,9 @@ class PlacementOptions:
         max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
             above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
         min_shared_points: distinct points of the parents; twice what a single pose needs.
-        max_rim_sigma: at the rim of the model, over the viewing distance; further off, over the distance.
         max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
             Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
             look-alike place shows in pixels long before.
-        max_rival: share of photos that agree with another placement.
-        rival_views: placements count as different if they move the model's photos by more than this share
-            of the viewing distance.
         max_against_gps: share of the photos with a position.
         visibility: what a photo must show.
         max_blind: share of photos that show less of the existing points. Single ones are left out
@@ -63,10 +58,7 @@ class PlacementOptions:
     min_agreeing: int = 2
     max_disagreeing: float = 0.34
     min_shared_points: int = 30
-    max_rim_sigma: float = 0.02
     max_residual: float = 0.01
-    max_rival: float = 0.5
-    rival_views: float = 0.05
     max_against_gps: float = 0.5
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     max_blind: float = 0.34
@@ -137,9 +129,7 @@ def place_by_maps(
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
     shows = shown_parts(model, sim, held, areas, frame, options.visibility)
     blind = _blind(shows, agree, own.keys() - agree, options.visibility)
-    asked = _ask(
-        model, fit, agree, own, held, shows.existing, edges, photos, frame, on_earth, ranked, options
-    )
+    asked = _ask(model, fit, agree, own, held, shows.existing, edges, photos, frame, on_earth, options)
     refusal = gates.first_refusal(asked)
     placement = MapsPlacement(
         reason=refusal.reason if refusal else None,
@@ -220,7 +210,6 @@ def _ask(
     photos: Sequence[Photo],
     frame: LocalFrame,
     on_earth: FloatArray,
-    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
     options: PlacementOptions,
 ) -> tuple[Gate, ...]:
     sim = fit.local_from_sfm
@@ -228,51 +217,17 @@ def _ask(
     reach = (
         float(np.median(np.linalg.norm(held.points - centers[held.photo_of], axis=1))) if len(held) else 0.0
     )
-    rivals = _rival_photos(model, sim, ranked, agree, reach, options)
     offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     return (
         gates.agreeing_photos(len(agree), options.min_agreeing),
         gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
         gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
-        gates.spread(_rim_sigma_m(model, fit, reach), reach, options.max_rim_sigma),
         gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
-        gates.runner_up(rivals, len(agree), options.max_rival),
         gates.geotags(
             offsets_gps, spreads_gps, options.max_against_gps, by=", ".join(e.map_id for e in edges)
         ),
         gates.visibility(shows[np.isfinite(shows)], options.visibility.min_visible, options.max_blind),
     )
-
-
-def _rim_sigma_m(model: Model, fit: FittedSimilarity, reach_m: float) -> float:
-    """How well the model's points and cameras are held; what lies further off than the reach, as seen there.
-
-    A tower on the horizon may be off by its share of its distance, as a house is by that of its own.
-    """
-    sim = fit.local_from_sfm
-    centers, points = sim.act(model.centers()), sim.act(model.xyz[:: max(1, len(model.xyz) // 2000)])
-    away = np.linalg.norm(points - centers.mean(axis=0), axis=1)
-    at_reach = place_sigmas_m(fit.covariance, points) * np.minimum(1.0, reach_m / np.maximum(away, 1e-9))
-    return at_most_places(np.concatenate([place_sigmas_m(fit.covariance, centers), at_reach]))
-
-
-def _rival_photos(
-    model: Model,
-    sim: Sim3,
-    ranked: Sequence[tuple[Sim3, NDArray[np.int64]]],
-    agree: set[int],
-    reach_m: float,
-    options: PlacementOptions,
-) -> int:
-    """Most photos, not agreeing with the placement, that agree with a proposal elsewhere."""
-    here = sim.act(model.centers())
-    most = 0
-    for other, photos in ranked:
-        beside = [int(k) for k in photos if int(k) not in agree]
-        apart = float(np.median(np.linalg.norm(other.act(model.centers()) - here, axis=1)))
-        if len(beside) > most and apart > options.rival_views * reach_m:
-            most = len(beside)
-    return most
 
 
 def _against_positions(
