@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.optimize import brentq, minimize
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from featuredb.adjust.block import whole_lens
 from featuredb.adjust.lens_agreement import lens_squares
@@ -77,6 +77,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         disagreement += factors
         sys.stderr.write(f"{folder}: {len(found)} lenses\n")
         told += found
+    write_shears([_database(folder, args.work) for folder in args.photos])
     if not told:
         sys.stderr.write("no lens of any map\n")
         return 1
@@ -99,6 +100,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if all(inside.values()) else 1
 
 
+def write_shears(databases: Sequence[Path]) -> None:
+    """How much the pictures of each largest map are sheared, and what few maps exceed (log-normal)."""
+    largest = [max(all_maps(path), key=lambda one: len(one.images)) for path in databases]
+    shears = np.log([picture_shear(block_of_map(one)).size for one in largest])
+    for path, shear in zip(databases, np.exp(shears), strict=True):
+        sys.stdout.write(f"{path.name}: pictures sheared by {shear:.1e}\n")
+    if len(shears) > 1:
+        few, hardly = np.exp(shears.mean() + shears.std(ddof=1) * norm.isf([0.05, 0.001]))
+        sys.stdout.write(f"one map in twenty is above {few:.1e}, one in a thousand above {hardly:.1e}\n")
+
+
 def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[list[Told], list[float]]:
     """What the photos of each lens of a database's maps say of it, and how far they disagree about it."""
     photos = {photo.name: photo for photo in scan_folder(folder).photos}
@@ -115,7 +127,6 @@ def lenses_of(database: Path, folder: Path, options: AdjustOptions) -> tuple[lis
             if np.isfinite(one):
                 sys.stdout.write(f"{folder}: photos disagree {one / free:.2f} times ({free:.0f} degrees)\n")
                 disagreement.append(one / free)
-        sys.stdout.write(f"{folder}: pictures sheared by {picture_shear(block).size:.1e}\n")
         told += _told(problem, terms, focal_px, options)
     return told, disagreement
 
