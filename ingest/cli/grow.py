@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -110,6 +109,7 @@ def _register_canary(subparsers: Any) -> None:
 def run_grow(args: argparse.Namespace) -> int:
     """Grow once or until stopped; 0."""
     from featuredb.cli.common import open_database
+    from featuredb.stop_signals import on_stop_signals
     from ingest.growing import grow_candidates, watch_and_grow
 
     database, options = open_database(args), _options(args)
@@ -117,14 +117,10 @@ def run_grow(args: argparse.Namespace) -> int:
         _show(grow_candidates(database, options), args)
         return 0
     stop = threading.Event()
-    before = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
+    with on_stop_signals(stop.set):
         sys.stdout.write(f"watching {database.url}; stop with Ctrl-C\n")
         sys.stdout.flush()
         watch_and_grow(database, options, stop, lambda report: _show(report, args), poll_s=args.poll)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
     return 0
 
 

@@ -1,14 +1,14 @@
 """Run the gateway until told to stop."""
 
 import logging
-import signal
 import socket
 from collections.abc import Callable
-from types import FrameType
+from functools import partial
 
 import uvicorn
 
 from featuredb.errors import FeatureDbError
+from featuredb.stop_signals import on_stop_signals
 from reloc.gateway.app import create_app
 from reloc.gateway.options import GatewayOptions
 
@@ -70,17 +70,9 @@ def serve(options: GatewayOptions, on_ready: Callable[[str], None] = lambda url:
         GatewayStartError: cannot listen.
     """
     logging.getLogger("uvicorn.error").setLevel(logging.WARNING)
-    # uvicorn stops in good order on these, and then raises them again for whoever had them before.
-    before = {number: signal.signal(number, _stopped) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with listen(options) as bound:
-            host, port = bound.getsockname()[:2]
-            on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
-            uvicorn_server(options).run(sockets=[bound])
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _stopped(number: int, frame: FrameType | None) -> None:
-    """The end of the command is no failure of it."""
+    server = uvicorn_server(options)
+    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
+    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(options) as bound:
+        host, port = bound.getsockname()[:2]
+        on_ready(f"http://{f'[{host}]' if ':' in host else host}:{port}{options.prefix}")
+        server.run(sockets=[bound])

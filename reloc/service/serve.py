@@ -1,9 +1,9 @@
 """Serve one database until told to stop."""
 
-import signal
 import threading
 from collections.abc import Callable
 
+from featuredb.stop_signals import on_stop_signals
 from featuredb.store import Database
 from reloc.localise.options import LocaliseOptions
 from reloc.service.contributions.database_inbox import DatabaseInbox
@@ -43,15 +43,8 @@ def serve(
         As `start_server`.
     """
     stop = threading.Event()
-    before = {
-        number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        with start_server(database, options, localise_options) as server:
-            on_ready(server)
-            # A signal that a library's thread receives does not end a wait: its handler runs at the next.
-            while not stop.wait(_TURN_S):
-                pass
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with on_stop_signals(stop.set), start_server(database, options, localise_options) as server:
+        on_ready(server)
+        # A signal that a library's thread receives does not end a wait: its handler runs at the next.
+        while not stop.wait(_TURN_S):
+            pass

@@ -1,12 +1,12 @@
 """Run the viewer until told to stop."""
 
-import signal
 import sys
 import webbrowser
-from types import FrameType
+from functools import partial
 
 from fastapi import FastAPI
 
+from featuredb.stop_signals import on_stop_signals
 from reloc.viewer.server import HOST, listen, uvicorn_server
 
 
@@ -19,21 +19,13 @@ def serve(app: FastAPI, port: int, *, browser: bool, path: str = "") -> None:
     Raises:
         ViewerStartError: cannot listen.
     """
-    # uvicorn stops in good order on these, and then raises them again for whoever had them before.
-    before = {number: signal.signal(number, _stopped) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with listen(port) as bound:
-            url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
-            sys.stdout.write(f"{url}; stop with Ctrl-C\n")
-            sys.stdout.flush()
-            # Connections wait in the socket until the server runs.
-            if browser and not webbrowser.open(url):
-                sys.stderr.write("no browser was found; open the address by hand\n")
-            uvicorn_server(app).run(sockets=[bound])
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _stopped(number: int, frame: FrameType | None) -> None:
-    """The end of the command is no failure of it."""
+    server = uvicorn_server(app)
+    # uvicorn handles these while it runs, and then raises them again; one that comes before counts as well.
+    with on_stop_signals(partial(setattr, server, "should_exit", True)), listen(port) as bound:
+        url = f"http://{HOST}:{bound.getsockname()[1]}/{path}"
+        sys.stdout.write(f"{url}; stop with Ctrl-C\n")
+        sys.stdout.flush()
+        # Connections wait in the socket until the server runs.
+        if browser and not webbrowser.open(url):
+            sys.stderr.write("no browser was found; open the address by hand\n")
+        server.run(sockets=[bound])

@@ -17,7 +17,7 @@ from featuredb.cli.main import build_parser, main
 from featuredb.errors import InvalidValueError
 from reloc.client import CameraRequest, PriorRequest
 from reloc.gateway.options import GatewayOptions
-from reloc.gateway.serve import GatewayStartError, listen
+from reloc.gateway.serve import GatewayStartError, listen, serve
 from reloc.service.options import ServeOptions
 from reloc.service.server import Server
 from reloc.wire.query import LocaliseReply
@@ -299,6 +299,12 @@ def test_the_command_serves_until_it_is_told_to_stop():
     assert process.returncode == 0, err
     assert '"route": "/vps/geopose", "status": 200' in err
     assert "Traceback" not in out + err
+
+
+def test_a_stop_signal_right_after_the_address_was_told_counts():
+    """The server takes signals from its own start on; one that comes before may not be lost."""
+    options = GatewayOptions(connect="tcp/127.0.0.1:1", port=0)
+    serve(options, on_ready=lambda url: signal.raise_signal(signal.SIGTERM))
 
 
 def test_the_command_is_among_those_of_the_program():

@@ -20,6 +20,7 @@ import numpy as np
 import pyproj
 import pytest
 import requests
+from fastapi import FastAPI
 from PIL import ExifTags, Image
 from scipy.spatial import cKDTree
 
@@ -31,6 +32,7 @@ from reloc.service.handler import answer_query
 from reloc.viewer.photos import PICTURE_PX, Pictures
 from reloc.viewer.placing import PlacingPages
 from reloc.viewer.scene import build_scene
+from reloc.viewer.serve import serve
 from reloc.viewer.server import ViewerStartError, listen
 from reloc.wire.query import LocaliseWireRequest
 from tests.support.maps import random_map
@@ -338,6 +340,20 @@ def test_the_command_serves_until_it_is_stopped(world: ViewerWorld) -> None:
             assert process.stderr.read() == ""
         finally:
             process.kill()
+
+
+def test_a_stop_signal_right_after_the_address_was_told_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The server takes signals from its own start on; one that comes before may not be lost."""
+    opened: list[str] = []
+
+    def stop_at_once(url: str) -> bool:
+        opened.append(url)
+        signal.raise_signal(signal.SIGTERM)
+        return True
+
+    monkeypatch.setattr("webbrowser.open", stop_at_once)
+    serve(FastAPI(), 0, browser=True)
+    assert len(opened) == 1
 
 
 def test_without_a_folder_of_photos_the_page_says_so() -> None:
