@@ -72,7 +72,9 @@ class LensWalk:
             return
         recent = np.array([one for one in self._seen if time_s - one[0] <= self.options.still_s])
         half = len(recent) // 2
+        if not half:  # frames are that far apart
+            return
         change = abs(recent[:half, 1].mean() - recent[half:, 1].mean())
-        if half and change < 0.5 * self.options.surprise * recent[:, 2].mean():
+        if change < 0.5 * self.options.surprise * recent[:, 2].mean():
             self.zooming = False
             self._seen.clear()

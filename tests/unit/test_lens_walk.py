@@ -77,6 +77,14 @@ def test_a_zoom_is_followed_and_a_lens_that_stands_still_is_known_better() -> No
     assert max(rel[20:50]) < rel[0]
 
 
+def test_frames_that_are_far_apart_say_nothing_of_whether_a_zoom_has_ended() -> None:
+    lens = LensWalk(camera=CAMERA, rel=0.005, lent=True, options=OPTIONS)
+    lens.zooms()
+    for frame in range(4):
+        lens.take(CAMERA.focal_px, 0.005, frame * 1.5 * OPTIONS.still_s)
+    assert lens.zooming
+
+
 def test_options_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InvalidValueError, match="floor_rel"):
         LensWalkOptions(floor_rel=0.5)
