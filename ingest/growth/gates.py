@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binom, chi2
 
 from featuredb.geo.words import way_words
@@ -26,7 +25,7 @@ class Gate:
     """One question and its answer.
 
     Attributes:
-        name: for programs, e.g. "agreeing_photos".
+        name: for programs, e.g. "agreement".
         reason: the code that a refusal by this gate carries.
         figure: what was measured.
         limit: where the line is.
@@ -52,42 +51,18 @@ def sigmas_limit(sigmas: float, degrees: int) -> float:
     return float(chi2.isf(chi2.sf(sigmas**2, 1), degrees))
 
 
-def agreeing_photos(agreeing: int, limit: int) -> Gate:
-    """Photos whose own localisation agrees with the placement; one alone proves nothing."""
-    return Gate(
-        name="agreeing_photos",
-        reason="TOO_FEW_AGREE",
-        figure=agreeing,
-        limit=limit,
-        passes=agreeing >= limit,
-        message=f"{agreeing} photos localised by themselves agree with the placement, {limit} are needed",
-    )
-
-
-def disagreeing_share(agreeing: int, disagreeing: int, limit: float) -> Gate:
-    """Share of the localised photos that contradict the placement."""
+def agreement(agreeing: int, disagreeing: int, least: int, share: float) -> Gate:
+    """Photos whose own localisation agrees with the placement: one alone proves nothing, and most must."""
     total = agreeing + disagreeing
-    share = disagreeing / total if total else 0.0
+    found = agreeing / total if total else 0.0
     return Gate(
-        name="disagreeing_share",
-        reason="PHOTOS_DISAGREE",
-        figure=share,
-        limit=limit,
-        passes=share <= limit,
-        message=f"{disagreeing} of {total} localised photos contradict the placement, "
-        f"{limit:.0%} are allowed",
-    )
-
-
-def shared_points(count: int, limit: int) -> Gate:
-    """Points of existing maps that the new photos see where they should."""
-    return Gate(
-        name="shared_points",
-        reason="TOO_FEW_SHARED_POINTS",
-        figure=count,
-        limit=limit,
-        passes=count >= limit,
-        message=f"{count} points of existing maps hold the new photos, {limit} are needed",
+        name="agreement",
+        reason="TOO_FEW_AGREE" if agreeing < least else "PHOTOS_DISAGREE",
+        figure=found,
+        limit=share,
+        passes=agreeing >= least and found >= share,
+        message=f"{agreeing} of {total} photos localised by themselves agree with the placement, {least} and "
+        f"{share:.0%} are needed",
     )
 
 
@@ -162,24 +137,6 @@ def visibility(agreements: FloatArray, least: float, limit: float) -> Gate:
         passes=share <= limit,
         message=f"{blind} of {len(agreements)} photos show less than {least:.0%} of what they should see of "
         f"existing maps, a share of {limit:.0%} is allowed",
-    )
-
-
-def held_share(kept: NDArray[np.bool_], limit: float) -> Gate:
-    """Share of the anchors that the adjusted reconstruction still fits.
-
-    Args:
-        kept: (m,) for each anchor whether it fits.
-    """
-    share = float(kept.mean()) if len(kept) else 0.0
-    return Gate(
-        name="held_share",
-        reason="REFINEMENT",
-        figure=share,
-        limit=limit,
-        passes=share >= limit,
-        message=f"{share:.0%} of the existing points that hold the new photos fit after adjustment, "
-        f"{limit:.0%} are needed",
     )
 
 

@@ -135,7 +135,7 @@ def test_two_owners_at_once_are_promoted_in_one_run(given: Path, tmp_path: Path,
     entry = report.maps[0]
     assert (entry.status, entry.steps) == ("active", 1)
     assert all(gate["passes"] for gate in entry.gates.values())
-    assert {"agreeing_photos", "residuals", "visibility", "drift", "sources", "canaries"} <= set(entry.gates)
+    assert {"agreement", "residuals", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
     assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
     assert {s["owner"] for s in evidence["sources"]} == {"anna", "ben"}

@@ -70,7 +70,6 @@ def test_what_the_gates_say_is_recorded_beside_the_truth(
     assert (placed.step, refined.step) == ("place", "refine")
     assert (placed.right, placed.wrong, placed.refused_by) == (len(new.photos) - 1, 1, [])
     assert "visibility" in placed.gates
-    assert "held_share" in refined.gates
 
 
 def test_a_reconstruction_is_placed_and_becomes_a_map(
@@ -196,7 +195,7 @@ def test_photos_that_see_a_look_alike_elsewhere_refuse_it(
     some = {r: localised[r] for r in (2, 3, 4)} | there
     grown = grow_component(new.model, new.photos, new.features_of, some, [area], identity())
     assert isinstance(grown, Refused)
-    assert {g.name for g in grown.gates if not g.passes} >= {"disagreeing_share"}
+    assert {g.name for g in grown.gates if not g.passes} >= {"agreement"}
 
 
 @pytest.mark.parametrize(("liars", "refused"), [(1, False), (5, True)])

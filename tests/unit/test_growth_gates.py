@@ -7,23 +7,18 @@ from ingest.growth import gates
 
 
 def test_one_photo_is_never_enough() -> None:
-    assert not gates.agreeing_photos(1, 2).passes
-    assert gates.agreeing_photos(1, 2).reason == "TOO_FEW_AGREE"
-    assert gates.agreeing_photos(2, 2).passes
+    assert not gates.agreement(1, 0, 2, 0.66).passes
+    assert gates.agreement(1, 0, 2, 0.66).reason == "TOO_FEW_AGREE"
+    assert gates.agreement(2, 0, 2, 0.66).passes
+    assert not gates.agreement(0, 0, 2, 0.66).passes
 
 
 def test_a_third_of_the_photos_may_disagree() -> None:
-    assert gates.disagreeing_share(2, 1, 0.34).passes
-    refused = gates.disagreeing_share(2, 2, 0.34)
+    assert gates.agreement(2, 1, 2, 0.66).passes
+    refused = gates.agreement(2, 2, 2, 0.66)
     assert not refused.passes
-    assert refused.figure == 0.5
+    assert (refused.figure, refused.reason) == (0.5, "PHOTOS_DISAGREE")
     assert "2 of 4" in refused.message
-    assert gates.disagreeing_share(0, 0, 0.34).passes  # nobody disagrees; agreeing_photos asks the rest
-
-
-def test_shared_points() -> None:
-    assert not gates.shared_points(29, 30).passes
-    assert gates.shared_points(30, 30).passes
 
 
 def test_residuals() -> None:
@@ -78,12 +73,6 @@ def test_photos_that_do_not_show_what_they_should() -> None:
     assert gates.visibility(np.zeros(0), 0.2, 0.34).passes
 
 
-def test_held_share() -> None:
-    assert gates.held_share(np.array([True, True, False]), 0.5).passes
-    assert not gates.held_share(np.array([True, False, False]), 0.5).passes
-    assert not gates.held_share(np.zeros(0, dtype=np.bool_), 0.5).passes
-
-
 def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
     """Tables of chi-square: 99.73 % lies below 9, 11.83 and 20.06 for 1, 2 and 6 degrees of freedom."""
     assert gates.sigmas_limit(3.0, 1) == pytest.approx(9.0)
@@ -92,10 +81,10 @@ def test_limit_of_three_sigmas_by_degrees_of_freedom() -> None:
 
 
 def test_first_refusal_and_json() -> None:
-    asked = (gates.agreeing_photos(3, 2), gates.shared_points(5, 30), gates.residuals(9.0, 10.0, 0.01))
+    asked = (gates.agreement(3, 0, 2, 0.66), gates.residuals(9.0, 10.0, 0.01))
     refusal = gates.first_refusal(asked)
     assert refusal is not None
-    assert refusal.name == "shared_points"
+    assert refusal.name == "residuals"
     assert gates.first_refusal(asked[:1]) is None
-    assert asked[1].as_json() == {"figure": 5.0, "limit": 30, "passes": False}
+    assert asked[1].as_json() == {"figure": 0.9, "limit": 0.01, "passes": False}
     assert gates.residuals(0.1, 0.0, 0.01).as_json()["figure"] is None

@@ -57,7 +57,7 @@ def with_drift(
         relative = solution.covariance_relative[feature_map.map_id]
     drift = drift_m(relative, places_of(feature_map))
     confirmed = confirm(feature_map, confirmation)
-    gates = {g.name: g.as_json() for g in (*confirmed.gates, drift_gate(drift, budget_m))}
+    gates = {g.name: g.as_json() for g in (confirmed.gate, drift_gate(drift, budget_m))}
     growth |= {
         "drift_m": round(drift, 6),
         "budget_m": budget_m,

@@ -41,9 +41,8 @@ class PlacementOptions:
     Attributes:
         fit: how the similarity is found.
         min_agreeing: photos; one alone proves nothing.
-        max_disagreeing: share of the localised photos. Every accepted pose is right with a probability
+        min_agreeing_share: of the localised photos. Every accepted pose is right with a probability
             above 0.95; a third wrong means that the reconstruction is, or that the place repeats itself.
-        min_shared_points: distinct points of the parents; twice what a single pose needs.
         max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
             Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
             look-alike place shows in pixels long before.
@@ -56,8 +55,7 @@ class PlacementOptions:
 
     fit: SimilarityFitOptions = field(default_factory=SimilarityFitOptions)
     min_agreeing: int = 2
-    max_disagreeing: float = 0.34
-    min_shared_points: int = 30
+    min_agreeing_share: float = 0.66
     max_residual: float = 0.01
     max_against_gps: float = 0.5
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
@@ -106,25 +104,14 @@ def place_by_maps(
     if ranked and len(ranked[0][1]) >= 1:
         found = _settled(model, ranked[0][0], ranked[0][1], own, correspondences, options)
     if found is None:
-        gate = gates.agreeing_photos(0 if not ranked else len(ranked[0][1]), options.min_agreeing)
-        placement = MapsPlacement(
-            reason=gate.reason,
-            message=f"no placement: {gate.message}",
-            frame=frame,
-            disagreeing=tuple(localised_rows(model, own)),
-            gates=(gate,),
-        )
-        return SupportedPlacement(
-            placement=placement,
-            correspondences=correspondences,
-            fit=None,
-            used=np.zeros(len(correspondences), dtype=np.bool_),
-        )
+        return _nowhere(model, own, 0 if not ranked else len(ranked[0][1]), correspondences, frame, options)
     fit, agree = found
     used = np.isin(correspondences.photo_of, list(agree)) | correspondences.carried
     used &= fit.errors_px < tolerances_px(model, correspondences, options.fit.tolerance_rel)
     maps = {m.map_id: m for area in areas for m in area.maps}
     edges = edges_of(model, fit, correspondences, used, options.parents, options.fit)
+    if not edges:
+        return _nowhere(model, own, 0, correspondences, frame, options)
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
     shows = shown_parts(model, sim, held, areas, frame, options.visibility)
@@ -154,9 +141,31 @@ def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: Visi
     return little | {k for k in agree if shows.existing[k] < options.min_visible}
 
 
-def localised_rows(model: Model, own: Mapping[int, LocalisedPhoto]) -> list[int]:
-    """Rows of the photos of the model's photos."""
-    return [int(model.rows[k]) for k in sorted(own)]
+def _nowhere(
+    model: Model,
+    own: Mapping[int, LocalisedPhoto],
+    agreeing: int,
+    correspondences: Correspondences,
+    frame: LocalFrame,
+    options: PlacementOptions,
+) -> SupportedPlacement:
+    """Nothing that photos agree upon, or no existing map that would hold them."""
+    gate = gates.agreement(
+        agreeing, len(own) - agreeing, max(options.min_agreeing, agreeing + 1), options.min_agreeing_share
+    )
+    placement = MapsPlacement(
+        reason=gate.reason,
+        message=f"no placement: {gate.message}",
+        frame=frame,
+        disagreeing=tuple(int(model.rows[k]) for k in sorted(own)),
+        gates=(gate,),
+    )
+    return SupportedPlacement(
+        placement=placement,
+        correspondences=correspondences,
+        fit=None,
+        used=np.zeros(len(correspondences), dtype=np.bool_),
+    )
 
 
 def _settled(
@@ -219,9 +228,7 @@ def _ask(
     )
     offsets_gps, spreads_gps = _against_positions(model, centers, photos, frame, fit.covariance + on_earth)
     return (
-        gates.agreeing_photos(len(agree), options.min_agreeing),
-        gates.disagreeing_share(len(agree), len(own) - len(agree), options.max_disagreeing),
-        gates.shared_points(sum(e.shared_points for e in edges), options.min_shared_points),
+        gates.agreement(len(agree), len(own) - len(agree), options.min_agreeing, options.min_agreeing_share),
         gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
         gates.geotags(
             offsets_gps, spreads_gps, options.max_against_gps, by=", ".join(e.map_id for e in edges)

@@ -52,9 +52,6 @@ class SettleOptions:
 
     Attributes:
         refine: the adjustment.
-        min_held_share: of the correspondences that agree with the placement, the share that still fits once
-            poses, lenses and new points have been adjusted to them; on real sets above 0.9. Less means that
-            the reconstruction cannot be bent to what the existing maps say.
         min_link: `firmness` that photos need which are not localised themselves. In simulated communities
             photos tied to look-alike halls 68 and 78 m from theirs had 0.15 and 0.04; right photos nearly
             all 0.46 and more, single ones 0.14. Those wait, and are localised by themselves once their
@@ -67,7 +64,6 @@ class SettleOptions:
     """
 
     refine: RefineOptions = field(default_factory=RefineOptions)
-    min_held_share: float = 0.5
     min_link: float = 0.25
     max_photo_bound_m: float = 0.5
     max_rounds: int = 4
@@ -145,10 +141,6 @@ def settle(
             keypoints,
             options.refine,
         )
-        gate = gates.held_share(adjusted.fixed_kept, options.min_held_share)
-        asked = replace(placement, gates=(*placement.gates, gate))
-        if not gate.passes:
-            return _refused(gate.reason, gate.message, rows, asked)
         spread = photo_covariances(
             adjusted.model,
             keypoints,
@@ -176,22 +168,21 @@ def settle(
             break
     if loose:
         message = f"hardly a photo is held well enough: {next(iter(loose.values()))}"
-        return _refused(LOOSE, message, rows, asked)
+        return _refused(LOOSE, message, rows, placement)
     if against:
         message = f"photos contradict the others again and again: {next(iter(against.values()))}"
-        return _refused(CONTRADICTS, message, rows, asked)
-    asked = _with_fit(asked, adjusted, held_pixels, fit, placing)
+        return _refused(CONTRADICTS, message, rows, placement)
+    asked = _with_fit(placement, adjusted, held_pixels, fit, placing)
     whole = with_existing(adjusted, fixed, held_pixels, asked.parents)
     for k in sorted(set(range(len(rows))) - set(outside) - set(whole.photo_of.tolist())):
         left_out[rows[k]] = LOOSE, "the photo shows nothing that another photo of the map shows as well"
         outside.append(k)
     asked = _agreeing_still(asked, outside, left_out, rows)
-    gate = gates.disagreeing_share(len(asked.agreeing), len(asked.disagreeing), placing.max_disagreeing)
+    gate = gates.agreement(
+        len(asked.agreeing), len(asked.disagreeing), placing.min_agreeing, placing.min_agreeing_share
+    )
     if not gate.passes:
         return _refused(gate.reason, f"once refined, {gate.message}", rows, asked)
-    gate = gates.agreeing_photos(len(asked.agreeing), placing.min_agreeing)
-    if not gate.passes:  # those that agreed are among the photos that were left out
-        return _refused(gate.reason, gate.message, rows, asked)
     turning = turning_covariance(adjusted.model, fit.covariance, spread)
     bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     kept = [k for k in range(len(rows)) if k not in outside]

@@ -58,8 +58,6 @@ class ConfirmationOptions:
         trusted_owners: whose photos need nobody else: surveys of those who keep the database.
         min_shared_points: two photos confirm each other from so many common points of the map on. An
             accepted pose has at least so many inliers (reloc.localise.options), and chance gives a few.
-        min_confirmed_share: of the map's photos. Photos at the rim of a map often share less with others;
-            a map of which most photos hang on one source alone is that source's claim.
         min_parallax: distance of two cameras over their distance from what both see. The same picture given
             by two people, cut or compressed anew, shows no parallax; poses of one place are good to some
             thousandths.
@@ -68,7 +66,6 @@ class ConfirmationOptions:
     independent_by: Independence = "owner"
     trusted_owners: tuple[str, ...] = ()
     min_shared_points: int = 15
-    min_confirmed_share: float = 0.5
     min_parallax: float = 0.01
 
 
@@ -93,28 +90,22 @@ class Confirmation:
     """How far a map is confirmed.
 
     Attributes:
-        gates: "sources", "confirmed_share", "confirming_pairs"; the map is confirmed when
-            all pass.
+        gate: the map is confirmed when it passes.
         sources: those among the photos that confirm each other, or are trusted.
         confirmed: image ids of the map.
         witnesses: names of witnesses that confirm a photo of the map.
     """
 
-    gates: tuple[Gate, ...]
+    gate: Gate
     sources: tuple[Source, ...]
     confirmed: tuple[int, ...]
     witnesses: tuple[str, ...] = ()
 
     @property
-    def confirmed_by_others(self) -> bool:
-        return all(gate.passes for gate in self.gates)
-
-    @property
     def message(self) -> str:
-        """The first gate that refuses, or how it was confirmed; for people."""
-        for gate in self.gates:
-            if not gate.passes:
-                return gate.message
+        """Why it is not confirmed, or how it was; for people."""
+        if not self.gate.passes:
+            return self.gate.message
         return f"{len(self.confirmed)} photos confirmed by {len(self.sources)} sources"
 
 
@@ -138,12 +129,18 @@ def independent(a: Source, b: Source, by: Independence = "owner") -> bool:
 
 
 def confirm(
-    feature_map: FeatureMap, options: ConfirmationOptions, witnesses: Sequence[Witness] = ()
+    feature_map: FeatureMap,
+    options: ConfirmationOptions,
+    witnesses: Sequence[Witness] = (),
+    against: Sequence[str] = (),
 ) -> Confirmation:
     """How far independent sources confirm a map.
 
     A photo of the map is confirmed when it shares enough of the map's points with a photo of an independent
     source, the map's own or a witness, or when its owner is trusted.
+
+    Args:
+        against: sentences on photos from outside that the map has elsewhere than they are.
     """
     sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
     own = len(sources)
@@ -158,11 +155,11 @@ def confirm(
     trusted = np.array([bool(s.owner) and s.owner in options.trusted_owners for s in everyone], dtype=bool)
     confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | trusted, dtype=np.bool_)
     groups = _groups(everyone, confirmed, agree, options.independent_by)
-    gates = _gates(confirmed[:own], groups, _pairs(agree), bool((confirmed & trusted)[:own].any()), options)
+    gate = _gate(int(confirmed[:own].sum()), _pairs(agree), bool((confirmed & trusted)[:own].any()), against)
     ids = [image.image_id for image in feature_map.images]
     vouching: list[bool] = [bool(row.any()) for row in agree[own:, :own]]
     return Confirmation(
-        gates=gates,
+        gate=gate,
         sources=tuple(groups),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
         witnesses=tuple(w.name for w, yes in zip(witnesses, vouching, strict=True) if yes),
@@ -178,42 +175,29 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(partner >= 0)) / 2.0
 
 
-def _gates(
-    confirmed: NDArray[np.bool_],
-    sources: Sequence[Source],
-    pairs: float,
-    trusted: bool,
-    options: ConfirmationOptions,
-) -> tuple[Gate, ...]:
-    count, share = int(confirmed.sum()), float(confirmed.mean()) if len(confirmed) else 0.0
-    needed = 1 if trusted else 2
-    return (
-        Gate(
-            name="sources",
-            reason="ONE_SOURCE",
-            figure=len(sources),
-            limit=needed,
-            passes=len(sources) >= needed,
-            message=f"{len(sources)} independent sources see the same of it, {needed} are needed",
-        ),
-        Gate(
-            name="confirmed_share",
-            reason="MOSTLY_ONE_SOURCE",
-            figure=share,
-            limit=options.min_confirmed_share,
-            passes=share >= options.min_confirmed_share,
-            message=f"{share:.0%} of its photos are confirmed by another source, "
-            f"{options.min_confirmed_share:.0%} are needed",
-        ),
-        Gate(
-            name="confirming_pairs",
-            reason="FEW_PAIRS",
-            figure=pairs,
-            limit=_ONE_PAIR,
-            passes=trusted or pairs > _ONE_PAIR,
-            message=f"{count} photos are confirmed by one photo alone; another pair of independent photos is "
-            "needed",
-        ),
+def _gate(confirmed: int, pairs: float, trusted: bool, against: Sequence[str]) -> Gate:
+    """Whether more pairs confirm the map than one and those that photos contradict it with."""
+    needed = len(against) + (0.0 if trusted else _ONE_PAIR)
+    if against and pairs > _ONE_PAIR:
+        reason = "CONTRADICTED"
+        message = (
+            f"{len(against)} photos from outside contradict it, {pairs:g} pairs confirm it: {against[0]}"
+        )
+    elif pairs:
+        reason = "FEW_PAIRS"
+        message = (
+            f"{confirmed} photos are confirmed by one photo alone; another pair of independent photos is "
+            "needed"
+        )
+    else:
+        reason, message = "ONE_SOURCE", "no two independent sources see the same of it"
+    return Gate(
+        name="confirmation",
+        reason=reason,
+        figure=pairs,
+        limit=needed,
+        passes=pairs > needed or (trusted and not against),
+        message=message,
     )
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
@@ -16,7 +14,7 @@ from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, confirm
 from ingest.growth.trust.examined import question, recall, remember
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
-from ingest.growth.trust.witnesses import Heard, NewPhotos, WitnessOptions, hear_witnesses
+from ingest.growth.trust.witnesses import NewPhotos, WitnessOptions, hear_witnesses
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
@@ -28,16 +26,11 @@ class PromotionOptions:
     """What a promotion needs.
 
     Attributes:
-        max_contradictions: share of the outside photos found in a map that may have their known place
-            elsewhere; one look-alike among many is no proof against it.
         answer_with: "confirmed": only points that independent sources have seen keep their descriptors and
             answer queries; "all": a photo that is altered in one part brings that part in.
-        min_points: that answer; four times the inliers that an answer needs.
     """
 
-    max_contradictions: float = 0.25
     answer_with: Literal["confirmed", "all"] = "confirmed"
-    min_points: int = 60
     confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
     witnesses: WitnessOptions = field(default_factory=WitnessOptions)
     canaries: CanaryOptions = field(default_factory=CanaryOptions)
@@ -49,7 +42,6 @@ class ExaminedMap:
 
     feature_map: FeatureMap
     confirmation: Confirmation
-    gates: tuple[Gate, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -68,7 +60,7 @@ class Promotion:
     Attributes:
         promoted: whether it is active now.
         reason_code, reason: why it stays in quarantine; the reason of the promotion otherwise.
-        gates: of confirmation, witnesses and canaries.
+        gates: of confirmation and canaries.
     """
 
     map_id: str
@@ -123,10 +115,10 @@ def promote_confirmed(
             outcomes.append(_stays(summary.map_id, *known))
             continue
         found = examine(snapshot.load_map(summary.map_id), snapshot, options, new)
-        failed = next((gate for gate in found.gates if not gate.passes), None)
-        if failed is not None:
-            outcomes.append(_stays(summary.map_id, failed.reason, failed.message, found.gates))
-            remember(work, summary.map_id, asked, failed.reason, failed.message, found.gates)
+        gate = found.confirmation.gate
+        if not gate.passes:
+            outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
+            remember(work, summary.map_id, asked, gate.reason, gate.message, (gate,))
         else:
             ready.append(_committed(database, summary, found))
     if ready:
@@ -168,8 +160,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
 def examine(
     feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
 ) -> ExaminedMap:
-    """How far others confirm a map: by its own photos alone if they do, else with photos from outside."""
-    confirmation = confirm(feature_map, options.confirmation)
+    """How far others confirm a map: photos of its own, and from outside."""
     heard = hear_witnesses(
         feature_map,
         _others(feature_map.map_id, snapshot),
@@ -178,47 +169,12 @@ def examine(
         options.witnesses,
         write_id=snapshot.get(feature_map.map_id).write_id,
     )
-    if not confirmation.confirmed_by_others:
-        confirmation = confirm(feature_map, options.confirmation, heard.witnesses)
+    confirmation = confirm(feature_map, options.confirmation, heard.witnesses, heard.contradictions)
     part = feature_map
     if options.answer_with == "confirmed":
         points = confirmed_points(feature_map, options.confirmation, heard.witnesses)
         part = answering_with(feature_map, points)
-    gates = (
-        *confirmation.gates,
-        points_gate(part, options.min_points),
-        contradiction_gate(heard, options.max_contradictions),
-    )
-    return ExaminedMap(feature_map=part, confirmation=confirmation, gates=gates)
-
-
-def points_gate(feature_map: FeatureMap, least: int) -> Gate:
-    """Whether enough points can answer."""
-    seen = feature_map.observations
-    count = len(np.unique(seen.point_index[seen.has_descriptor]))
-    return Gate(
-        name="answering_points",
-        reason="FEW_POINTS",
-        figure=count,
-        limit=least,
-        passes=count >= least,
-        message=f"{count} of its points are seen by independent sources, {least} are needed",
-    )
-
-
-def contradiction_gate(heard: Heard, limit: float) -> Gate:
-    """Whether photos whose place is known are found elsewhere by the map."""
-    total = len(heard.witnesses) + len(heard.contradictions)
-    share = len(heard.contradictions) / total if total else 0.0
-    example = f": {heard.contradictions[0]}" if heard.contradictions else ""
-    return Gate(
-        name="witnesses_agree",
-        reason="CONTRADICTED",
-        figure=share,
-        limit=limit,
-        passes=share <= limit,
-        message=f"{len(heard.contradictions)} of {total} photos from outside contradict it{example}",
-    )
+    return ExaminedMap(feature_map=part, confirmation=confirmation)
 
 
 def canary_gate(run: CanaryRun) -> Gate:
@@ -321,7 +277,7 @@ def _decide(
 ) -> list[Promotion]:
     gate = canary_gate(run)
     ids = [r.map_id for r in ready]
-    gates = {r.map_id: (*r.found.gates, gate) for r in ready}
+    gates = {r.map_id: (r.found.confirmation.gate, gate) for r in ready}
     if not gate.passes:
         return [_stays(m, gate.reason, gate.message, gates[m]) for m in ids]
     confirmed = "; ".join(dict.fromkeys(r.found.confirmation.message for r in ready))
