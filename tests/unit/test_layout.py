@@ -22,7 +22,6 @@ FULL_FOLDERS = {
     "featuredb/export/dataset",
     "featuredb/geo",
     "ingest/register/anchor",
-    "ingest/register/frame",
 }
 
 
