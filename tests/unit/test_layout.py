@@ -19,9 +19,7 @@ LONG_MODULES = {
     "reloc/tracking/tracker.py",
 }
 FULL_FOLDERS = {
-    "featuredb/export/dataset",
     "featuredb/geo",
-    "ingest/register/anchor",
 }
 
 
