@@ -22,8 +22,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store.changes import RETIRED
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id, read_rows
 from featuredb.store.database import Database
-from featuredb.store.delta import Table, retry_stale
+from featuredb.store.delta import Table
 from featuredb.store.encode import Row
+from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
 from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, LIDAR_TABLES, SPECS
 

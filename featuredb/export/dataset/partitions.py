@@ -9,8 +9,8 @@ import pyarrow as pa
 from featuredb.export.dataset import columns
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, point_columns
 from featuredb.export.dataset.layout import IMAGES, OBSERVATIONS, POINTS, Partition
+from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.geopose import geopose_from_camera
-from featuredb.geo.wkt import utm_projjson
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.geometry.sim3 import point_jacobian
