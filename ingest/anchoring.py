@@ -24,7 +24,11 @@ from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.anchor_map import place_map
-from ingest.register.anchor.first_place import (
+from ingest.register.anchor.frames import TriedFrames, try_frames
+from ingest.register.anchor.photo_files import PhotoFiles, find_photos
+from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
+from ingest.register.anchor.report import AnchorReport, write_anchor_report
+from ingest.register.anchor.start.first_place import (
     MARGIN_M,
     FirstPlace,
     StartFiles,
@@ -32,11 +36,7 @@ from ingest.register.anchor.first_place import (
     plan_box,
     started_images,
 )
-from ingest.register.anchor.frames import TriedFrames, try_frames
-from ingest.register.anchor.photo_files import PhotoFiles, find_photos
-from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
-from ingest.register.anchor.report import AnchorReport, write_anchor_report
-from ingest.register.anchor.start import image_named
+from ingest.register.anchor.start.priors import image_named
 from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 

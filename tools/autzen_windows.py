@@ -49,7 +49,7 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
-from ingest.register.frame.confirmation import ConfirmOptions
+from ingest.register.frame.dense.confirmation import ConfirmOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.verdict import VerdictOptions
 from ingest.register.frame_registration import FramePrior

@@ -27,15 +27,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.oriented_gradients import (
+from ingest.register.frame.dense.oriented_gradients import (
     FloatImage,
     GradientOptions,
     inner_part,
     oriented_gradients,
 )
-from ingest.register.frame.pinhole_view import PinholeView, pinhole_view
-from ingest.register.frame.scan_resolution import finest_side_px
-from ingest.register.frame.source_pictures import source_picture
+from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view
+from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture
 from ingest.register.frame_registration import RenderSource
 
 _BINS = 24  # some ten thousand samples fill 24 x 24 bins with about twenty each

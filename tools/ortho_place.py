@@ -12,7 +12,8 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from featuredb.geo.crs import scan_crs, utm_transform
+from featuredb.geo.crs.scan import scan_crs
+from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.render.cloud import PointCloud
 

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from featuredb.errors import GeodesyError, ScanError
 from featuredb.file_digest import file_sha256
-from featuredb.geo.crs import ScanCrs, UtmTransform, scan_crs, utm_transform
+from featuredb.geo.crs.scan import ScanCrs, scan_crs
+from featuredb.geo.crs.utm_transform import UtmTransform, utm_transform
 from featuredb.lidar.clean import Colouring, clean_block
 from featuredb.lidar.formats.dsm import is_raster, open_dsm, read_dsm
 from featuredb.lidar.formats.las import ScanFile, open_scan_file, read_points
@@ -128,7 +129,7 @@ def crs_of_file(file: ScanFile, options: AddOptions) -> ScanCrs:
     """The CRS of one file, under the options.
 
     Raises:
-        GeodesyError: as featuredb.geo.crs.scan_crs; the message names the file.
+        GeodesyError: as featuredb.geo.crs.scan.scan_crs; the message names the file.
     """
     # The header says which of the two counts; where that one is missing, it is the other.
     wkt = file.wkt if file.wkt_counts or not file.geo_keys else None

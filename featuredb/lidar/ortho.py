@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.raster_crs import raster_from_utm
+from featuredb.geo.crs.utm_transform import raster_from_utm
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.ortho_image import OrthoImage as OrthoImage
 from featuredb.lidar.formats.ortho_image import open_ortho as open_ortho

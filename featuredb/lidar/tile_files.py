@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geo.tiles import tile_bounds
-from featuredb.geo.wkt import utm_wkt
 from featuredb.lidar.formats.las_stream import LasStream
 from featuredb.store.database import Database
 from featuredb.store.scans import ScanSummary, count_points, scan_points

@@ -65,15 +65,7 @@ class LensUncertainty:
             raise InvalidValueError(
                 f"provenance {_KEY}: expected {_NUMBERS} numbers of at least 0, found {numbers!r}"
             )
-        f, aspect, cx, cy, k1, k2, p1, p2, dilution = numbers
-        return cls(
-            focal_rel=f,
-            aspect=aspect,
-            center_rel=(cx, cy),
-            radial=(k1, k2),
-            tangential=(p1, p2),
-            dilution=dilution,
-        )
+        return _of_numbers(*numbers)
 
 
 def uncertainty_of_lenses(
@@ -97,7 +89,11 @@ def uncertainty_of_lenses(
         by = np.diag([1.0 / fx, 0.0, 1.0 / longer, 1.0 / longer, 1.0, 1.0, 1.0, 1.0])
         by[1, :2] = -fy / fx**2, 1.0 / fx
         variance += weight**2 * np.diag(by @ covariances[c] @ by.T)
-    f, aspect, cx, cy, k1, k2, p1, p2 = np.sqrt(np.maximum(variance, 0.0)).tolist()
+    return _of_numbers(*np.sqrt(np.maximum(variance, 0.0)).tolist(), dilution)
+
+
+def _of_numbers(*numbers: float) -> LensUncertainty:
+    f, aspect, cx, cy, k1, k2, p1, p2, dilution = numbers
     return LensUncertainty(
         focal_rel=f,
         aspect=aspect,

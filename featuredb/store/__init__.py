@@ -7,8 +7,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from featuredb.store.commits import HistoryEntry
-    from featuredb.store.database import CommitResult, Database, StatusResult
+    from featuredb.store.commits import CommitResult, HistoryEntry, StatusResult
+    from featuredb.store.database import Database
     from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary, UtmBox
 
 __all__ = [
@@ -23,8 +23,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "commits": ("HistoryEntry",),
-    "database": ("CommitResult", "Database", "StatusResult"),
+    "commits": ("CommitResult", "HistoryEntry", "StatusResult"),
+    "database": ("Database",),
     "snapshot": ("MapSummary", "Snapshot", "UnplacedSummary", "UtmBox"),
 }
 

@@ -21,8 +21,9 @@ from featuredb.geo.utm import zone_of
 from featuredb.geometry.arrays import FloatArray, frozen_array
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
-from featuredb.store.delta import Table, retry_stale
+from featuredb.store.delta import Table
 from featuredb.store.encode import Row
+from featuredb.store.retry import retry_stale
 from featuredb.store.tables import CANARIES, SPECS
 
 Origin = Literal["person", "answer"]

@@ -1,4 +1,4 @@
-"""What every commit has in common: its name, its place as the very next version, how it is read back."""
+"""What every commit has in common: its name, its place as the very next version, result and history."""
 
 import uuid
 from collections.abc import Mapping, Sequence
@@ -39,6 +39,38 @@ class HistoryEntry:
     operation: str
     maps: tuple[str, ...]
     reason: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommitResult:
+    """What became of one map.
+
+    Attributes:
+        created: False if the map was visible already and nothing had to be done.
+        version: snapshot in which the map is visible.
+        write_id: of its child rows.
+        flagged: ids of other maps that this commit put into quarantine, because what placed them gave way.
+    """
+
+    map_id: str
+    created: bool
+    version: int
+    write_id: str
+    flagged: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatusResult:
+    """What a change of status did.
+
+    Attributes:
+        version: snapshot that shows it.
+        changed: ids of the maps whose status changed, none where nothing was to be done; those asked for
+            first, behind them maps that were quarantined because they hang on one of these alone.
+    """
+
+    version: int
+    changed: tuple[str, ...]
 
 
 def history_entry(commit: Commit) -> HistoryEntry:

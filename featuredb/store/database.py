@@ -3,7 +3,6 @@
 import logging
 import threading
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,7 +12,9 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.store.changes import RETIRED, Change, add_maps, change_status, live_row, retire_map
 from featuredb.store.commits import (
     LONGEST_COMMIT,
+    CommitResult,
     HistoryEntry,
+    StatusResult,
     apply_change,
     commit_as_of,
     history_entry,
@@ -21,46 +22,15 @@ from featuredb.store.commits import (
     read_rows,
     upgrade_metadata,
 )
-from featuredb.store.delta import Commit, Table, retry_stale
+from featuredb.store.delta import Commit, Table
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
+from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CHILD_TABLES, FORMAT_VERSION, MAPS, SPECS
 
 logger = logging.getLogger(__name__)
 
 _STATUS_OPERATION = {"active": "promote", "quarantined": "quarantine"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CommitResult:
-    """What became of one map.
-
-    Attributes:
-        created: False if the map was visible already and nothing had to be done.
-        version: snapshot in which the map is visible.
-        write_id: of its child rows.
-        flagged: ids of other maps that this commit put into quarantine, because what placed them gave way.
-    """
-
-    map_id: str
-    created: bool
-    version: int
-    write_id: str
-    flagged: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StatusResult:
-    """What a change of status did.
-
-    Attributes:
-        version: snapshot that shows it.
-        changed: ids of the maps whose status changed, none where nothing was to be done; those asked for
-            first, behind them maps that were quarantined because they hang on one of these alone.
-    """
-
-    version: int
-    changed: tuple[str, ...]
 
 
 class Database:

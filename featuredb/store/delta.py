@@ -10,8 +10,6 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
 
 import atexit
 import json
-import logging
-import random
 import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -38,23 +36,14 @@ from deltalake import (
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from featuredb.errors import ConflictError, DatabaseNotFoundError, SnapshotNotFoundError, StoreError
+from featuredb.store.retry import ATTEMPTS, StaleVersionError, retry_stale
 from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
 
-logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
-ATTEMPTS = (
-    40  # 20 writers that all collide need at most 20 turns; twice that bounds the wait to about a minute
-)
-FIRST_PAUSE_S = 0.02  # a commit on a local disk takes about 10 ms
-LONGEST_PAUSE_S = 2.0
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
 _HEX = re.compile(r"[0-9a-f]{1,64}")
-
-
-class StaleVersionError(StoreError):
-    """Someone committed since the table was read: read again and decide anew."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,24 +66,6 @@ class Commit:
     timestamp: datetime
     operation: str
     metadata: dict[str, str]
-
-
-def retry_stale(what: str, attempt: Callable[[], T]) -> T:
-    """Call `attempt` until no concurrent writer gets in between, with random pauses that grow.
-
-    Raises:
-        ConflictError: ATTEMPTS collisions in a row.
-    """
-    for count in range(ATTEMPTS):
-        try:
-            return attempt()
-        except StaleVersionError:
-            pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 1.5**count)
-            time.sleep(random.uniform(0.0, pause))
-            logger.debug("%s: another writer was first, attempt %d", what, count + 2)
-    raise ConflictError(
-        f"{what}: {ATTEMPTS} attempts collided with other writers; nothing was committed, try again later"
-    )
 
 
 class Table:

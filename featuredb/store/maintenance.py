@@ -12,7 +12,8 @@ from featuredb.store.candidates.upkeep import growth_tables, named_writes, super
 from featuredb.store.changes import RETIRED, Change
 from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows, write_time
 from featuredb.store.database import Database
-from featuredb.store.delta import Commit, Table, retry_stale
+from featuredb.store.delta import Commit, Table
+from featuredb.store.retry import retry_stale
 from featuredb.store.scans import has_scans, retired_since, scan_rows
 from featuredb.store.tables import CANDIDATE_IMAGES, CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
 from featuredb.store.vacuum_options import VacuumOptions as VacuumOptions

@@ -22,8 +22,9 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store.changes import RETIRED
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id, read_rows
 from featuredb.store.database import Database
-from featuredb.store.delta import Table, retry_stale
+from featuredb.store.delta import Table
 from featuredb.store.encode import Row
+from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
 from featuredb.store.tables import BOUNDS, LIDAR, LIDAR_POINTS, LIDAR_TABLES, SPECS
 
@@ -370,22 +371,15 @@ def _level_rows(
 
 def _summary(row: Row) -> ScanSummary:
     return ScanSummary(
-        scan_id=row["scan_id"],
-        write_id=row["write_id"],
-        name=row["name"],
-        status=row["status"],
-        status_reason=row["status_reason"],
-        created_at=row["created_at"],
-        epsg=row["epsg"],
-        height_datum=row["height_datum"],
         box=UtmBox(**{name: row[name] for name in BOUNDS}),
-        points=row["points"],
-        points_in_files=row["points_in_files"],
         level_points=tuple(row["level_points"]),
-        spacing_m=row["spacing_m"],
         classes={c["classification"]: c["points"] for c in row["classes"]},
-        colour=row["colour"],
-        has_intensity=row["has_intensity"],
-        licence=row["licence"],
         row=row,
+        **{name: row[name] for name in _AS_STORED},
     )
+
+
+_AS_STORED = (
+    "scan_id", "write_id", "name", "status", "status_reason", "created_at", "epsg", "height_datum", "points",
+    "points_in_files", "spacing_m", "colour", "has_intensity", "licence",
+)  # fmt: skip

@@ -282,34 +282,17 @@ _AS_STORED = (
     "map_id", "write_id", "content_digest", "name", "status", "status_reason", "created_at", "images",
     "points", "observations", "descriptors", "extractor_fingerprint", "source", "licence",
 )  # fmt: skip
+_PLACED_AS_STORED = ("epsg", "height_datum", "method", "generation", "residual_rms_m")
 
 
 def _summary(row: Row) -> MapSummary:
     box = None if row[BOUNDS[0]] is None else UtmBox(**{name: row[name] for name in BOUNDS})
     drift_m, budget_m = drift_and_budget(json.loads(row["placement_evidence"]))
     return MapSummary(
-        map_id=row["map_id"],
-        write_id=row["write_id"],
-        content_digest=row["content_digest"],
-        name=row["name"],
-        status=row["status"],
-        status_reason=row["status_reason"],
-        created_at=row["created_at"],
-        epsg=row["epsg"],
-        height_datum=row["height_datum"],
         box=box,
         tiles=tuple(row["tiles"]),
-        images=row["images"],
-        points=row["points"],
-        observations=row["observations"],
-        descriptors=row["descriptors"],
-        method=row["method"],
-        generation=row["generation"],
         parents=tuple(row["parents"]),
-        residual_rms_m=row["residual_rms_m"],
-        extractor_fingerprint=row["extractor_fingerprint"],
-        source=row["source"],
-        licence=row["licence"],
         drift_m=drift_m,
         budget_m=budget_m,
+        **{name: row[name] for name in (*_AS_STORED, *_PLACED_AS_STORED)},
     )

@@ -6,7 +6,6 @@ needs, and has no way to files, network, extensions or settings.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any
 
 import duckdb
@@ -87,9 +86,7 @@ class SqlSession:
     def __enter__(self) -> "SqlSession":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failed: object) -> None:
         self._connection.close()
 
     def query(self, text: str) -> SqlResult:

@@ -10,7 +10,7 @@ not do by itself, and is done here:
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from fractions import Fraction
 
 import av
@@ -50,24 +50,13 @@ class ReadingTally:
             frame_count: packets that the whole film has; None where that is not known or was not asked for.
             end_s: when the film's last frame should end, on its clock; None likewise.
         """
-        missing = short_by_s = 0.0
+        counts = asdict(self)
+        packets, missing, short_by_s = counts.pop("packets"), 0, 0.0
         if self.at_end and frame_count is not None:
-            missing = max(0, frame_count - self.packets)
+            missing = max(0, frame_count - packets)
         if self.at_end and end_s is not None and self.last_s is not None:
             short_by_s = max(0.0, end_s - self.last_s)
-        return VideoReport(
-            delivered=self.delivered,
-            decoded=self.decoded,
-            undecodable=self.undecodable,
-            damaged=self.damaged,
-            out_of_order=self.out_of_order,
-            times_guessed=self.times_guessed,
-            longest_gap_s=self.longest_gap_s,
-            last_s=self.last_s,
-            at_end=self.at_end,
-            missing=int(missing),
-            short_by_s=short_by_s,
-        )
+        return VideoReport(**counts, missing=missing, short_by_s=short_by_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

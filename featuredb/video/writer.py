@@ -9,7 +9,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 import av
@@ -126,10 +125,8 @@ class VideoWriter:
             raise self._failed(error) from error
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None:
+    def __exit__(self, failed: object, *more: object) -> None:
+        if failed is not None:
             self._discard()
             return
         try:

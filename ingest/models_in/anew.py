@@ -2,32 +2,23 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import overload
 
 from featuredb.errors import ImageError, IngestError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.describe import describe_at
 from featuredb.features.orientation import orientations_at
 from ingest.models_in.stored import StoredFeatures
-from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.extract import LazyFeatures, PhotoFeatures
 
 
-class DescribedAnew(Sequence[PhotoFeatures]):
+class DescribedAnew(LazyFeatures):
     """Features of the model's images with this extractor's own descriptors, and its own orientations where
     the model's files have none; one photo in memory at a time."""
 
     def __init__(self, stored: StoredFeatures, photos: Sequence[Path]) -> None:
         self._stored, self._photos = stored, tuple(photos)
 
-    @overload
-    def __getitem__(self, index: int) -> PhotoFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "Sequence[PhotoFeatures]": ...
-
-    def __getitem__(self, index: int | slice) -> "PhotoFeatures | Sequence[PhotoFeatures]":
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
+    def read(self, index: int) -> PhotoFeatures:
         keypoints = self._stored.keypoints(index, with_descriptors=False)
         if not (keypoints.scale > 0).all():
             raise IngestError(

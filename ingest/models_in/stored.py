@@ -1,9 +1,7 @@
 """What every format of models gives: the model as arrays, and the keypoints and descriptors of its images."""
 
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from abc import abstractmethod
 from dataclasses import dataclass
-from typing import overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +9,7 @@ from numpy.typing import NDArray
 from featuredb.errors import IngestError
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
 from ingest.colmap.bridge import Model
-from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.extract import LazyFeatures, PhotoFeatures
 
 # RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
 # `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).
@@ -55,7 +53,7 @@ class Keypoints:
     descriptors: NDArray[np.uint8] | None
 
 
-class StoredFeatures(Sequence[PhotoFeatures], ABC):
+class StoredFeatures(LazyFeatures):
     """Features of the model's images, each read when it is asked for, and not kept."""
 
     def __init__(self, stored: StoredModel, fingerprint: str) -> None:
@@ -69,15 +67,7 @@ class StoredFeatures(Sequence[PhotoFeatures], ABC):
             IngestError: the files have other keypoints than the model, or other descriptors than RootSIFT.
         """
 
-    @overload
-    def __getitem__(self, index: int) -> PhotoFeatures: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> "Sequence[PhotoFeatures]": ...
-
-    def __getitem__(self, index: int | slice) -> "PhotoFeatures | Sequence[PhotoFeatures]":
-        if isinstance(index, slice):
-            return [self[k] for k in range(len(self))[index]]
+    def read(self, index: int) -> PhotoFeatures:
         found = self.keypoints(index)
         if found.descriptors is None or found.angle is None:
             raise IngestError(

@@ -1,6 +1,6 @@
 """OpenDroneMap's `geo.txt`: positions of photos in any coordinate system.
 
-The first line names the system (`featuredb.geo.projected`). Then a line a photo: name, x (or longitude), y
+The first line names the system (`featuredb.geo.crs.survey`). Then a line a photo: name, x (or longitude), y
 (or latitude), and as far as they are known z, yaw, pitch, roll, horizontal and vertical accuracy, all in the
 units of the system. Angles are in degrees as OpenDroneMap counts them: yaw clockwise from true north, pitch
 0 looks straight down and 90 ahead, roll to the right; all zero where nobody knows them. Heights are taken as
@@ -12,7 +12,7 @@ from typing import Any
 
 from featuredb.errors import GeodesyError
 from featuredb.features.exif.angles import DEFAULT_SIGMA_TILT_DEG, DEFAULT_SIGMA_YAW_DEG
-from featuredb.geo.projected import SurveyCrs, geodetic_from_survey, survey_crs
+from featuredb.geo.crs.survey import SurveyCrs, geodetic_from_survey, survey_crs
 from featuredb.geometry.camera_angles import CameraAngles
 
 COLUMNS = ("path", "lat", "lon", "height", "accuracy", "accuracy_height", "yaw", "pitch", "roll")

@@ -22,7 +22,8 @@ from featuredb.features.exif.gps import DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGM
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
-from ingest.register.position_noise import ANGLES_WRONG, NOISE_SHARE, Held, NoisyFit, fit_noisy, stated_sigma
+from ingest.register.position_noise import ANGLES_WRONG, Held, NoisyFit, fit_noisy, stated_sigma
+from ingest.register.variance_components import NOISE_SHARE
 
 GpsReason = Literal["TOO_FEW", "DEGENERATE_LINE", "RESIDUALS", "SCALE"]
 

@@ -4,37 +4,28 @@
 
 For the horizontal axes and the vertical each: noise is independent, drift is a line and a random walk along
 the time of the flight, the bias is shared by the flight and cannot be told from the similarity's
-translation. What positions say of themselves is a prior of these components of variance; they are estimated
-by restricted maximum likelihood (Patterson, Thompson 1971) under it. Their own uncertainty is integrated
-over (importance sampling around the modes), so that few positions give wide answers. Positions far out are
-found with weights of Student's t (Lange, Little, Taylor 1989) and then left out.
+translation. What positions say of themselves is a prior of these components of variance (`MixedModel`).
+Positions far out are found with weights of Student's t (Lange, Little, Taylor 1989) and then left out.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import minimize
 from scipy.special import gammaln
 from scipy.stats import chi2
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3, point_jacobian
+from ingest.register.variance_components import MixedModel, ModelAxis, prior_mean
 
 _TAIL = 4.0  # degrees of freedom of Student's t, until what is far out is known
 _ROUNDS = 12  # of weights and components; most settle in five
 _MOST_STEP = 0.5  # of the logarithm of the scale and of a turn; further it is not linear
 _SETTLED = 1e-3  # of a step over its standard deviation
-NOISE_SHARE, _DRIFT_SHARE = 0.5, 0.4  # of the stated sigma: the middle of what they may be
-_NOISE_SPREAD, _DRIFT_SPREAD = 1.0, 1.5  # of their logarithms
 _TREND = 0.75  # of the variance of a drift at its end: what has one slope all along
-_SAMPLES = 128
 _UNKNOWN_SCALE, _UNKNOWN_TURN, _UNKNOWN_M = 1.0, 1.8, 1e5  # logarithm, radians: nothing is known
-_DELTA = 0.1  # of a logarithm
-_PROPOSAL = 5.0  # degrees of freedom of the t from which components are drawn
 _LEAST_M = 1e-6
-_RANGE = 7.0  # of logarithms: a thousand times more or less
 _LEAST_PHOTOS = 3
 _LEAST_SHARE = 0.02  # of a stated sigma: the least noise that counts where chance is judged
 _LAG_SHARE = 0.5  # of a stated sigma that may be a lag
@@ -191,35 +182,6 @@ class _State:
         return -self.sim.scale * data.speed @ self.sim.rotation.T
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Axis:
-    """Positions along one axis in a basis where noise and walk are independent.
-
-    Attributes:
-        group: 0 horizontal, 1 vertical.
-        residual: (m,). jacobian: (m, p). walk: (m,) variance of a unit walk over that of unit noise.
-    """
-
-    group: int
-    residual: FloatArray
-    jacobian: FloatArray
-    walk: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linear:
-    """A linear problem whose noise is independent once its components are given.
-
-    Attributes:
-        axes: east, north, up.
-        known: (m, p) whitened Jacobian, off: (m,) residuals, of what is known beside positions.
-    """
-
-    axes: list[_Axis]
-    known: FloatArray
-    off: FloatArray
-
-
 def fit_noisy(
     start: Sim3,
     centers: FloatArray,
@@ -254,7 +216,7 @@ def fit_noisy(
         lag_sigma_s=min(_LAG_SHARE * stated[0] / usual, _MOST_LAG_S) if usual > 0 else _MOST_LAG_S,
         held=held,
     )
-    state, theta = _State(middle.inverse() @ start, 0.0), _prior_mean(stated)
+    state, theta = _State(middle.inverse() @ start, 0.0), prior_mean(stated)
     taken = np.zeros((len(centers), 1))
     taken[np.argsort(order, kind="stable")[:: -(-len(centers) // _MOST_POSITIONS)]] = 1.0
     weights = taken * _start_weights(data, state)
@@ -272,12 +234,12 @@ def fit_noisy(
         used, weights = again, taken * again
         state, theta, _ = _round(data, state, weights, theta)
     problem = _at(data, state, weights)
-    modes = _modes(problem, theta, stated)
-    step, covariance = _integrated(problem, modes, stated)
+    modes = problem.modes(theta, stated)
+    step, covariance = problem.integrated(modes, stated)
     checked = covariance[2:5, 2:5]
     if held is not None and not held.told:
         free = _at(replace(data, held=None), state, weights)
-        checked = _integrated(free, modes, stated)[1][2:5, 2:5]
+        checked = free.integrated(modes, stated)[1][2:5, 2:5]
     state, theta = state.moved(step), modes[0]
     white, drift = np.exp(theta[:2]), np.exp(theta[2:])
     return NoisyFit(
@@ -296,8 +258,8 @@ def _round(
 ) -> tuple[_State, FloatArray, bool]:
     """Components, then similarity; whether it has settled."""
     problem = _at(data, state, weights)
-    theta = _most_likely(problem, theta, data.stated)
-    step, covariance = _solution(problem, theta)
+    theta = problem.most_likely(theta, data.stated)
+    step, covariance = problem.solution(theta)
     settled = np.abs(step / np.sqrt(np.diag(covariance))).max() < _SETTLED
     return state.moved(step), theta, bool(settled)
 
@@ -330,11 +292,7 @@ def _walk(times_s: FloatArray) -> FloatArray:
     return np.asarray((1.0 - _TREND) * np.minimum(share[:, None], share) + _TREND * np.outer(share, share))
 
 
-def _prior_mean(stated: FloatArray) -> FloatArray:
-    return np.asarray(np.log(np.concatenate([NOISE_SHARE * stated, _DRIFT_SHARE * stated])))
-
-
-def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[_Axis]:
+def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: FloatArray) -> list[ModelAxis]:
     """East, north, up.
 
     Args:
@@ -348,7 +306,7 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
             walk = data.walk[np.ix_(known, known)]
             variance, basis = np.linalg.eigh(root[:, None] * walk * root)
             result.append(
-                _Axis(
+                ModelAxis(
                     group,
                     basis.T @ (root * residual[known, axis]),
                     basis.T @ (root[:, None] * jacobian[known, axis]),
@@ -358,111 +316,9 @@ def _axes(data: _Data, residual: FloatArray, jacobian: FloatArray, weights: Floa
     return result
 
 
-def _at(data: _Data, state: _State, weights: FloatArray) -> _Linear:
+def _at(data: _Data, state: _State, weights: FloatArray) -> MixedModel:
     axes = _axes(data, state.residual(data), state.jacobian(data), weights)
-    return _Linear(axes, *state.known(data))
-
-
-def _normal(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
-    """Normal matrix (p, p), right side (p,), sum of squared residuals and of the variances' logarithms."""
-    matrix, right = problem.known.T @ problem.known, problem.known.T @ problem.off
-    squared, logs = float(problem.off @ problem.off), 0.0
-    for axis in problem.axes:
-        variance = np.exp(2.0 * theta[axis.group]) + np.exp(2.0 * theta[2 + axis.group]) * axis.walk
-        scaled = axis.jacobian / variance[:, None]
-        matrix = matrix + axis.jacobian.T @ scaled
-        right = right + scaled.T @ axis.residual
-        squared += float((axis.residual**2 / variance).sum())
-        logs += float(np.log(variance).sum())
-    return matrix, right, squared, logs
-
-
-def _cost(theta: FloatArray, problem: _Linear, stated: FloatArray | None) -> float:
-    """Minus twice the logarithm of the restricted likelihood, with the prior where `stated` is given."""
-    return _cost_and_slope(theta, problem, stated)[0]
-
-
-def _cost_and_slope(
-    theta: FloatArray, problem: _Linear, stated: FloatArray | None
-) -> tuple[float, FloatArray]:
-    """`_cost` and its derivative (4,)."""
-    matrix, right, squared, logs = _normal(problem, theta)
-    factor, lower = cho_factor(matrix)
-    covariance = cho_solve((factor, lower), np.eye(len(matrix)))
-    step = covariance @ right
-    cost = logs + 2.0 * float(np.log(np.diag(factor)).sum()) + squared - float(right @ step)
-    slope = np.zeros(4)
-    for axis in problem.axes:
-        white, drift = np.exp(2.0 * theta[axis.group]), np.exp(2.0 * theta[2 + axis.group]) * axis.walk
-        variance = white + drift
-        left = (axis.residual - axis.jacobian @ step) ** 2
-        left += ((axis.jacobian @ covariance) * axis.jacobian).sum(axis=1)
-        by_variance = 2.0 * (1.0 / variance - left / variance**2)
-        slope[axis.group] += white * float(by_variance.sum())
-        slope[2 + axis.group] += float((drift * by_variance).sum())
-    if stated is not None:
-        spread = np.array([_NOISE_SPREAD] * 2 + [_DRIFT_SPREAD] * 2)
-        off = (theta - _prior_mean(stated)) / spread
-        cost += float((off**2).sum())
-        slope += 2.0 * off / spread
-    return cost, slope
-
-
-def _most_likely(
-    problem: _Linear, start: FloatArray, stated: FloatArray | None, least: FloatArray | None = None
-) -> FloatArray:
-    """Logarithms (4,) of white noise and drift, horizontal and vertical."""
-    bounds = [(value - _RANGE, value + _RANGE) for value in start]
-    if least is not None:
-        bounds[:2] = [(float(low), high) for low, (_, high) in zip(least, bounds, strict=False)]
-    return np.asarray(minimize(_cost_and_slope, start, (problem, stated), "L-BFGS-B", True, bounds=bounds).x)
-
-
-def _solution(problem: _Linear, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Step (7,) and its covariance; what nothing tells is as wide as it can be."""
-    matrix, right, _, _ = _normal(problem, theta)
-    covariance = np.linalg.inv(matrix)
-    return np.asarray(covariance @ right), np.asarray(covariance)
-
-
-def _modes(problem: _Linear, start: FloatArray, stated: FloatArray) -> list[FloatArray]:
-    """The most likely components, best first: from those at hand, and as if all were drift, or all noise."""
-    away = np.array([[-1.0, -1.0, 3.0, 3.0], [-1.0, 1.0, 3.0, -1.0], [1.0, -1.0, -1.0, 3.0]])
-    starts = [start, *(_prior_mean(stated) + away)]
-    found = [_most_likely(problem, at, stated) for at in starts]
-    return sorted(found, key=lambda theta: _cost(theta, problem, stated))
-
-
-def _integrated(
-    problem: _Linear, modes: list[FloatArray], stated: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Mean and covariance of the step over what the components may be."""
-    widths = np.array([_widths(problem, mode, stated) for mode in modes])
-    draws = np.random.default_rng(0).standard_t(_PROPOSAL, (len(modes), _SAMPLES // len(modes), 4))
-    at = (np.array(modes)[:, None] + widths[:, None] * draws).reshape(-1, 4)
-    off = (at[:, None] - np.array(modes)) / widths
-    parts = -0.5 * (_PROPOSAL + 1.0) * np.log1p(off**2 / _PROPOSAL).sum(axis=2) - np.log(widths).sum(axis=1)
-    density = np.logaddexp.reduce(parts, axis=1)
-    log_weight = np.array([-0.5 * _cost(theta, problem, stated) for theta in at]) - density
-    weights = np.exp(log_weight - log_weight.max())
-    weights /= weights.sum()
-    mean, spread = np.zeros(8), np.zeros((8, 8))
-    for theta, weight in zip(at, weights.tolist(), strict=True):
-        step, covariance = _solution(problem, theta)
-        mean += weight * step
-        spread += weight * (covariance + np.outer(step, step))
-    return mean, spread - np.outer(mean, mean)
-
-
-def _widths(problem: _Linear, theta: FloatArray, stated: FloatArray) -> FloatArray:
-    """(4,) standard deviations of the components, each by itself."""
-    base, widths = _cost(theta, problem, stated), np.empty(4)
-    for k in range(4):
-        step = np.zeros(4)
-        step[k] = _DELTA
-        bend = _cost(theta + step, problem, stated) + _cost(theta - step, problem, stated) - 2.0 * base
-        widths[k] = 1.0 / np.sqrt(max(bend / (2.0 * _DELTA**2), 1.0 / _DRIFT_SPREAD**2))
-    return widths
+    return MixedModel(axes, *state.known(data))
 
 
 def _walked(data: _Data, residual: FloatArray, weights: FloatArray, theta: FloatArray) -> FloatArray:
@@ -520,13 +376,13 @@ def _log_chance(data: _Data, state: _State, weights: FloatArray, total: int) -> 
     off = np.where(np.isfinite(data.sigmas), data.positions, 0.0)
     costs = []
     for residual in (state.residual(data), off - np.median(off, axis=0)):
-        problem = _Linear(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
+        problem = MixedModel(_axes(data, residual, shift, weights), np.eye(3) / _UNKNOWN_M, np.zeros(3))
         spread = [np.square(residual[known[:, axes[0]]][:, axes]) for axes in _AXES]
         size = np.array([float(np.sqrt(of.mean())) if of.size else 1.0 for of in spread])
         size = np.maximum(size, _LEAST_SHARE * data.stated)  # heights that are all the same are told in steps
         start = np.log(np.concatenate([size, size]))
         least = np.log(_LEAST_SHARE * data.stated)
-        costs.append(_cost(_most_likely(problem, start, None, least), problem, None))
+        costs.append(problem.cost(problem.most_likely(start, None, least), None))
     freedom, taken_up = int(known.sum()) - 3, 6 if data.speed.any() else 4
     half = (freedom - taken_up) / 2.0
     if half <= 0:

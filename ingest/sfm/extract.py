@@ -1,5 +1,6 @@
 """Stage: the features of each photo, on a pool of processes, one file each."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -105,21 +106,32 @@ def read_keypoints(path: Path) -> NDArray[np.float32]:
     return np.asarray(read_array(path, "xy"), dtype=np.float32)
 
 
-class FeatureFiles(Sequence[PhotoFeatures]):
-    """Features of many photos, each read from its file when it is asked for, and not kept."""
+class LazyFeatures(Sequence[PhotoFeatures], ABC):
+    """Features of many photos, each read when it is asked for, and not kept; a slice reads all of its own."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self.paths = tuple(paths)
+    @abstractmethod
+    def read(self, index: int) -> PhotoFeatures:
+        """Those of one photo."""
 
     @overload
     def __getitem__(self, index: int) -> PhotoFeatures: ...
 
     @overload
-    def __getitem__(self, index: slice) -> "FeatureFiles": ...
+    def __getitem__(self, index: slice) -> Sequence[PhotoFeatures]: ...
 
-    def __getitem__(self, index: int | slice) -> "PhotoFeatures | FeatureFiles":
+    def __getitem__(self, index: int | slice) -> PhotoFeatures | Sequence[PhotoFeatures]:
         if isinstance(index, slice):
-            return FeatureFiles(self.paths[index])
+            return [self.read(k) for k in range(len(self))[index]]
+        return self.read(index)
+
+
+class FeatureFiles(LazyFeatures):
+    """Features of many photos, a file each."""
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        self.paths = tuple(paths)
+
+    def read(self, index: int) -> PhotoFeatures:
         return read_features(self.paths[index])
 
     def __len__(self) -> int:

@@ -13,8 +13,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import PlanBox, load_cloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
-from ingest.register.anchor.start import RoughPose, prior_from_rough_pose
-from ingest.register.anchor.start_files import read_pose
+from ingest.register.anchor.start.files import read_pose
+from ingest.register.anchor.start.priors import RoughPose, prior_from_rough_pose
 from ingest.track.map_over_scan import MapOverScanFinder
 from ingest.track.scan_ground import ScanFinder
 from reloc.localiser import Localiser

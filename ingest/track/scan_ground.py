@@ -19,8 +19,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.candidates import available_sources
-from ingest.register.frame.confirmation import ConfirmOptions
-from ingest.register.frame.dense_fit import DenseFitOptions
+from ingest.register.frame.dense.confirmation import ConfirmOptions
+from ingest.register.frame.dense.fit import DenseFitOptions
 from ingest.register.frame.near import NoNearFit, fit_near
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame

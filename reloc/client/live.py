@@ -6,7 +6,6 @@ import uuid
 from collections import OrderedDict, deque
 from collections.abc import Iterator
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Self
 
 import zenoh
@@ -72,9 +71,7 @@ class LiveTrack:
         self.open()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failed: object) -> None:
         self.close()
 
     def open(self) -> None:

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from reloc.tracking.tracker import TrackedFrame
+from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.trajectory.values import TrajectoryPoint
 
 _LANDMARK_RGB, _OTHER_RGB = (60, 220, 60), (40, 160, 240)

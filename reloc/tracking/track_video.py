@@ -22,7 +22,8 @@ from reloc.tracking.film_end import until_it_ends
 from reloc.tracking.film_overlay import draw_frame
 from reloc.tracking.ground import Finder
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracker import TrackedFrame, Tracker
+from reloc.tracking.tracked_frame import TrackedFrame
+from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import Trajectory, TrajectoryPoint, point_of
 
 # Frames that one core decodes while the other tracks one, when no keyframe is in hand: some are left over.

@@ -5,15 +5,12 @@ from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.flow_track import FlowTrack, carried
 from reloc.tracking.ground import Finder, Ground, Keyframe, Unmatched
@@ -21,42 +18,13 @@ from reloc.tracking.lens_walk import LensWalk
 from reloc.tracking.options import TrackOptions
 from reloc.tracking.pose_fit import FittedPose
 from reloc.tracking.recent import RecentFrame, RecentFrames
+from reloc.tracking.tracked_frame import TrackedFrame, TrackState
 
-TrackState = Literal["tracking", "relocalised", "lost"]
 Answer = Keyframe | FlowTrack | Unmatched
 _FAR = sys.maxsize
 # What would be waited for in one go when it is due is waited for a little at each frame: for a search, and a
 # keyframe of many features, from the first; for another keyframe at the last ones, which it seldom needs.
 _PACE_S, _LAST_PACE_S, _LAST_FRAMES = 0.05, 0.02, 4
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class TrackedFrame:
-    """What is known of one frame.
-
-    Attributes:
-        index, time_s: of the frame.
-        state: tracking; relocalised, on the first frame after the track was lost or begun; lost: no pose.
-        cam_from_local: pose in the ground's frame, None where the track is lost.
-        covariance: (6, 6), see `FittedPose`; None with the pose.
-        camera: intrinsics in use; None with the pose. ground: in whose frame the pose is.
-        inliers: landmarks that agree with it. pixels, points: (k, 2), (k, 3) of them; rows: (k,) of the
-            ground's points.
-        detail: why there is no pose.
-    """
-
-    index: int
-    time_s: float
-    state: TrackState
-    cam_from_local: Rigid3 | None = None
-    covariance: FloatArray | None = None
-    camera: Camera | None = None
-    ground: Ground | None = None
-    inliers: int = 0
-    pixels: FloatArray | None = None
-    points: FloatArray | None = None
-    rows: NDArray[np.int64] | None = None
-    detail: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -125,9 +93,7 @@ class Tracker:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failed: object) -> None:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     @property

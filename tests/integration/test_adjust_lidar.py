@@ -14,12 +14,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.adjustment import (
-    AdjustLidarOptions,
-    LidarAdjustment,
-    adjust_to_scan,
-    adjusted_map,
-)
+from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, adjusted_map
+from ingest.register.structure.adjustment_options import AdjustLidarOptions
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, placed_map, project_structure
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map

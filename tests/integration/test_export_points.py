@@ -20,7 +20,7 @@ from featuredb.export.formats.las import write_las_files
 from featuredb.export.formats.ply import ROW, write_ply_files
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
-from featuredb.geo.crs import scan_crs
+from featuredb.geo.crs.scan import scan_crs
 from featuredb.lidar.formats.las_stream import LasStream, offset_and_step
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database

@@ -12,7 +12,8 @@ from pyproj import Transformer
 from rasterio.transform import Affine
 
 from featuredb.errors import GeodesyError, InvalidValueError, ScanFileError
-from featuredb.geo.crs import scan_crs, utm_transform
+from featuredb.geo.crs.scan import scan_crs
+from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geometry.arrays import FloatArray
 from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.nadir_view import NadirOptions

@@ -15,7 +15,7 @@ from featuredb.geometry.rotation import rotation_angle, so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
 from featuredb.render.renderer import render
-from ingest.register.frame.confirmation import confirm_pose
+from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.elsewhere import agreement_elsewhere
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from featuredb.cli import simworld as command
 from featuredb.errors import GeodesyError, InvalidValueError, MissingExtraError
-from featuredb.geo.crs import scan_crs
-from featuredb.geo.wkt import utm_wkt
+from featuredb.geo.crs.scan import scan_crs
+from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.lidar.formats.geotiff import write_geotiff
 from featuredb.lidar.formats.las_writer import write_las
 from featuredb.simworld import scan_world

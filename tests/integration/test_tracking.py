@@ -26,7 +26,8 @@ from reloc.localiser import Localiser
 from reloc.tracking.ground import Keyframe, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracker import TrackedFrame, Tracker
+from reloc.tracking.tracked_frame import TrackedFrame
+from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
 from tests.support.hill_photos import CAMERA, FRAME, _render
 from tests.support.hill_walk import WEST_M, anchored_database

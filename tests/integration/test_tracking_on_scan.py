@@ -22,7 +22,8 @@ from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder, Keyframe, Unmatched
 from reloc.tracking.map_ground import MapFinder, MapGround
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracker import TrackedFrame, Tracker
+from reloc.tracking.tracked_frame import TrackedFrame
+from reloc.tracking.tracker import Tracker
 from reloc.tracking.trajectory.read import read_trajectory_csv
 from reloc.tracking.trajectory.values import point_of
 from tests.support.hill_photos import CAMERA, FRAME, _render

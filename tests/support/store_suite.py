@@ -22,8 +22,9 @@ from featuredb.errors import (
     StoreError,
 )
 from featuredb.store import Database
-from featuredb.store.delta import StaleVersionError, Table
+from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
+from featuredb.store.retry import StaleVersionError
 from featuredb.store.sql import SqlSession
 from featuredb.store.verify import verify
 from tests.support.maps import EPSG, assert_same_map, random_map
@@ -156,7 +157,7 @@ class StoreSuite:
             raise StaleVersionError("someone was first")
 
         monkeypatch.setattr(Table, "swap", swap)
-        monkeypatch.setattr("featuredb.store.delta.ATTEMPTS", 3)
+        monkeypatch.setattr("featuredb.store.retry.ATTEMPTS", 3)
         with pytest.raises(ConflictError, match="3 attempts"):
             database.commit_map(random_map(1))
         monkeypatch.undo()

@@ -14,8 +14,9 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.levels import build_cloud
-from ingest.register.anchor.picks import Picks, pose_from_picks
-from ingest.register.anchor.start import (
+from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.picks import Picks, pose_from_picks
+from ingest.register.anchor.start.priors import (
     RoughPose,
     StartOptions,
     height_shift,
@@ -24,7 +25,6 @@ from ingest.register.anchor.start import (
     prior_from_map,
     prior_from_rough_pose,
 )
-from ingest.register.anchor.start_files import read_picks, read_pose
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1600, height=1200, params=(1300.0, 800.0, 600.0, 0.02))

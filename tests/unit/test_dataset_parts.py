@@ -12,12 +12,12 @@ from featuredb.errors import ExportError, GeodesyError, InvalidValueError, Store
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents, entry_of
 from featuredb.export.dataset.footprint import Footprint, footprint_of
-from featuredb.export.dataset.frames import earth_covariance
 from featuredb.export.dataset.geoparquet import point_columns, wkb_of
+from featuredb.export.dataset.partitions import earth_covariance
 from featuredb.export.dataset.sums import check_sums, write_sums
+from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import geodetic_from_utm
-from featuredb.geo.wkt import utm_projjson
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap

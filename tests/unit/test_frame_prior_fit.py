@@ -7,7 +7,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from ingest.register.frame.matching import FrameMatches
+from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame.prior_fit import (
     fitted_under_prior,
     loosened,

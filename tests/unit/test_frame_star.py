@@ -6,7 +6,12 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from ingest.register.frame.star import StarOptions, fan_headings_deg, star_poses, turned_about_vertical
+from ingest.register.frame.features.star import (
+    StarOptions,
+    fan_headings_deg,
+    star_poses,
+    turned_about_vertical,
+)
 from ingest.register.frame_registration import FramePrior
 
 CAMERA = Camera.from_focal(1600, 1200, 1200.0)

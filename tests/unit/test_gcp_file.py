@@ -5,7 +5,7 @@ import pytest
 from pyproj import Transformer
 
 from featuredb.errors import ControlFileError, GeodesyError
-from featuredb.geo.projected import geodetic_from_survey, survey_crs
+from featuredb.geo.crs.survey import geodetic_from_survey, survey_crs
 from ingest.register.control.control_file import parse_control_file, read_control_file
 
 _MARK = "456800.5 5429300.25 {z} 100.5 200.25 a.jpg gcp1"

@@ -18,7 +18,7 @@ from ingest.track.finders import FilmGround, finder_for
 from reloc.tracking.film_overlay import _words
 from reloc.tracking.map_ground import MapFinder
 from reloc.tracking.options import TrackOptions
-from reloc.tracking.tracker import TrackedFrame
+from reloc.tracking.tracked_frame import TrackedFrame
 from reloc.tracking.trajectory.files import CSV_COLUMNS, write_trajectory
 from reloc.tracking.trajectory.outputs import check_outputs_in_map, exit_code, write_outputs
 from reloc.tracking.trajectory.read import read_trajectory_csv

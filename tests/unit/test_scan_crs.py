@@ -5,8 +5,9 @@ import pytest
 from pyproj import CRS, Transformer
 
 from featuredb.errors import FeatureDbError, GeodesyError
-from featuredb.geo.crs import FOOT_M, US_SURVEY_FOOT_M, ScanCrs, scan_crs, utm_transform
-from featuredb.geo.geotiff_keys import crs_of_geo_keys
+from featuredb.geo.crs.geotiff_keys import crs_of_geo_keys
+from featuredb.geo.crs.scan import FOOT_M, US_SURVEY_FOOT_M, ScanCrs, scan_crs
+from featuredb.geo.crs.utm_transform import utm_transform
 from featuredb.geo.utm import utm_from_geodetic
 
 # Oregon's Lambert conformal conic on NAD83(HARN) in international feet, as the Autzen scan has it, user-

@@ -10,7 +10,7 @@ from featuredb.export.dataset.contents import Contents
 from featuredb.export.dataset.own_frame import FOLDER
 from featuredb.export.dataset.picture import places_of
 from featuredb.export.dataset.sums import SUMS
-from featuredb.geo.wkt import utm_projjson
+from featuredb.geo.crs.wkt import utm_projjson
 
 _WIDTH = 110
 _LONGEST_LIST = 200  # maps; maps.parquet has all of them

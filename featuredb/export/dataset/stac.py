@@ -9,7 +9,7 @@ from featuredb.errors import MissingExtraError
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
 from featuredb.extras import require
-from featuredb.geo.wkt import utm_projjson
+from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.store.tables import BOUNDS
 
 STAC_VERSION = "1.0.0"

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import ExportError
 from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_csv
-from featuredb.geo.wkt import utm_wkt
+from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, PointColumns
 from featuredb.maps.unplaced_map import AnyMap

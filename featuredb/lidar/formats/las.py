@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from featuredb.errors import ScanFileError
 from featuredb.extras import require
 from featuredb.file_digest import file_sha256
-from featuredb.geo.geotiff_keys import GeoKeys
+from featuredb.geo.crs.geotiff_keys import GeoKeys
 from featuredb.geometry.arrays import FloatArray
 
 NOISE_CLASSES = (7, 18)  # ASPRS: low noise, high noise

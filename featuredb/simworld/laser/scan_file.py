@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.geo.wkt import utm_wkt
+from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.lidar.formats.las_writer import Columns, write_las
 from featuredb.simworld.laser.airborne import AirborneScan
 

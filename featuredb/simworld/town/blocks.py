@@ -1,7 +1,7 @@
 """Fills the blocks between a town's streets: terraces, houses, flats, a market hall, a park, a square."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -84,22 +84,7 @@ class Layout:
             tint=tint,
         )
         grounds = [self.height(float(corner[1])) for corner in probe.footprint()]
-        building = Building(
-            x=x,
-            y=y,
-            yaw_deg=yaw_deg,
-            width=size[0],
-            depth=size[1],
-            base=min(grounds) - 0.3,
-            eaves=max(grounds) + storeys * STOREY_M,
-            ridge=ridge,
-            facade=facade,
-            roof=roof,
-            facade_u=look[0],
-            detail_u=look[1],
-            roof_u=look[2],
-            tint=tint,
-        )
+        building = replace(probe, base=min(grounds) - 0.3, eaves=max(grounds) + storeys * STOREY_M)
         self.buildings.append(building)
         return building
 

@@ -20,7 +20,7 @@ from ingest.register.anchor.proposals import (
     ProposalOptions,
     propose_frames,
 )
-from ingest.register.anchor.start import HeightShift, StartOptions, height_shift, prior_from_map
+from ingest.register.anchor.start.priors import HeightShift, StartOptions, height_shift, prior_from_map
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration

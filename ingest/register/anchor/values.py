@@ -6,7 +6,7 @@ from typing import Any, Literal
 from featuredb.maps.feature_map import FeatureMap
 from ingest.register.anchor.agreement import AgreementOptions, FrameAgreement
 from ingest.register.anchor.frames import FramesOptions, TriedFrame
-from ingest.register.structure.adjustment import AdjustLidarOptions
+from ingest.register.structure.adjustment_options import AdjustLidarOptions
 from ingest.register.structure.map_move import MapResidual
 from ingest.register.structure.projection import StructureOptions
 

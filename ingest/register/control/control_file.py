@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from featuredb.errors import ControlFileError, GeodesyError, InvalidValueError
-from featuredb.geo.projected import SurveyCrs, geodetic_from_survey, survey_crs
+from featuredb.geo.crs.survey import SurveyCrs, geodetic_from_survey, survey_crs
 from featuredb.geometry.arrays import FloatArray
 
 _COLUMNS = "geo_x geo_y geo_z im_x im_y image_name [gcp_name]"

@@ -7,16 +7,14 @@ from dataclasses import dataclass, replace
 
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
-from ingest.register.frame.confirmation import PictureConfirmation
-from ingest.register.frame.dense import (
+from ingest.register.frame.dense.confirmation import PictureConfirmation
+from ingest.register.frame.dense.hypotheses import (
     confirmed,
     dense_fitted,
     dense_hypotheses,
     searched_again,
 )
-from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.prior_fit import loosened
-from ingest.register.frame.search import (
+from ingest.register.frame.features.search import (
     FrameHypothesis,
     RenderGroup,
     fan_groups,
@@ -25,6 +23,8 @@ from ingest.register.frame.search import (
     search,
     star_groups,
 )
+from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.prior_fit import loosened
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 

@@ -14,9 +14,9 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.register.frame.confirmation import confirm_pose
-from ingest.register.frame.dense_search import DenseOptions, register_dense
-from ingest.register.frame.star import turned_about_vertical
+from ingest.register.frame.dense.confirmation import confirm_pose
+from ingest.register.frame.dense.search import DenseOptions, register_dense
+from ingest.register.frame.features.star import turned_about_vertical
 from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, RenderSource
 

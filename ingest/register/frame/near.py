@@ -13,10 +13,10 @@ from featuredb.geometry.camera import Camera
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import by_agreement, polished
-from ingest.register.frame.matching import joined
+from ingest.register.frame.features.matching import joined
+from ingest.register.frame.features.search import FrameHypothesis, pose_options
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened
-from ingest.register.frame.search import FrameHypothesis, pose_options
 from ingest.register.frame.uncertainty import frame_covariance
 from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior, FrameReason, RenderSource

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 
 from featuredb.errors import InvalidValueError
-from ingest.register.frame.confirmation import ConfirmOptions
-from ingest.register.frame.consistency import ConsistencyOptions
-from ingest.register.frame.dense_fit import DenseFitOptions
-from ingest.register.frame.pool import PoolOptions
-from ingest.register.frame.star import StarOptions
+from ingest.register.frame.dense.confirmation import ConfirmOptions
+from ingest.register.frame.dense.fit import DenseFitOptions
+from ingest.register.frame.features.consistency import ConsistencyOptions
+from ingest.register.frame.features.pool import PoolOptions
+from ingest.register.frame.features.star import StarOptions
 from ingest.register.frame.verdict import VerdictOptions
 from ingest.register.frame_registration import RenderSource
 

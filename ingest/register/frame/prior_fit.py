@@ -13,7 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp, so3_log
-from ingest.register.frame.matching import FrameMatches
+from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame_registration import FramePrior
 from reloc.localise.jacobians import pixel_jacobians
 from reloc.localise.options import PoseOptions

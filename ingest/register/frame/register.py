@@ -13,9 +13,9 @@ from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.candidates import Judged, best_candidate
 from ingest.register.frame.elsewhere import agreement_elsewhere
+from ingest.register.frame.features.search import FrameHypothesis, pose_options
 from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened, prior_sigmas
-from ingest.register.frame.search import FrameHypothesis, pose_options
 from ingest.register.frame.uncertainty import frame_covariance
 from ingest.register.frame.verdict import (
     FrameEvidence,

@@ -67,7 +67,7 @@ class FrameEvidence:
         inliers: independent correspondences that agree with the pose.
         candidates, log_nfa: matches of the first round and the evidence among them, see VerdictOptions.
         confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message:
-            see ingest.register.frame.confirmation.
+            see ingest.register.frame.dense.confirmation.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.

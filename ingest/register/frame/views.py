@@ -15,8 +15,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
+from ingest.register.frame.features.pool import Pool, pool_features
 from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.pool import Pool, pool_features
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 _LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover

@@ -19,12 +19,12 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.anchoring import Anchoring, AnchorRequest, anchor
-from ingest.register.anchor.first_place import chosen_scans
 from ingest.register.anchor.photo_files import PhotoFiles, find_photos
-from ingest.register.anchor.pick_fit import PickFit, PickFitOptions, fit_picks
-from ingest.register.anchor.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
-from ingest.register.anchor.start import StartOptions
+from ingest.register.anchor.start.first_place import chosen_scans
+from ingest.register.anchor.start.pick_fit import PickFit, PickFitOptions, fit_picks
+from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
+from ingest.register.anchor.start.priors import StartOptions
 from ingest.register.picks_page.ground import GroundPicture, ground_of
 
 _PHOTO_PX = 4096

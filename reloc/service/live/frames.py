@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
-from types import TracebackType
 from typing import Self
 
 import cv2
@@ -78,11 +77,9 @@ class FrameAnswerer:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *failed: object) -> None:
         if self._tracker is not None:
-            self._tracker.__exit__(kind, error, trace)
+            self._tracker.__exit__(*failed)
 
     @property
     def snapshot(self) -> int:

@@ -16,7 +16,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.unplaced_map import OwnFrame
 from reloc.tracking.ground import StandingInMap
-from reloc.tracking.tracker import TrackedFrame, TrackState
+from reloc.tracking.tracked_frame import TrackedFrame, TrackState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -10,8 +10,8 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
-from ingest.register.anchor.pick_fit import PickFit, PickFitOptions, fit_picks
-from ingest.register.anchor.start import StartOptions
+from ingest.register.anchor.start.pick_fit import PickFit, PickFitOptions, fit_picks
+from ingest.register.anchor.start.priors import StartOptions
 from ingest.register.frame_registration import FramePrior
 
 KNOWN_FOCAL_REL = 0.03  # EXIF rounds, and reconstructions over flat ground drift from it by as much

@@ -9,12 +9,12 @@ import numpy as np
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.consistency import ConsistencyOptions, consistent_matches
-from ingest.register.frame.matching import FrameMatches, guided_matches, joined, pooled_matches
+from ingest.register.frame.features.consistency import ConsistencyOptions, consistent_matches
+from ingest.register.frame.features.matching import FrameMatches, guided_matches, joined, pooled_matches
+from ingest.register.frame.features.pool import Pool
+from ingest.register.frame.features.star import fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.pool import Pool
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.star import fan_headings_deg, star_poses, turned_about_vertical
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.acceptance import independent_inliers, log_nfa

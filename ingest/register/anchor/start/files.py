@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, ValidationError, model_validator
 
 from featuredb.errors import RegistrationError
-from ingest.register.anchor.picks import Picks
-from ingest.register.anchor.start import RoughPose, look_at_angles
+from ingest.register.anchor.start.picks import Picks
+from ingest.register.anchor.start.priors import RoughPose, look_at_angles
 
 _COLUMNS = ("x", "y", "easting", "northing", "height")
 

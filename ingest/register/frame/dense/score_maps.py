@@ -2,7 +2,7 @@
 
 A map is kept instead of its highest peak. With laser intensity the peak is the right one in less than half
 of the pieces; summed over all pieces at the pixels that one pose predicts, the maps still have their maximum
-at the true pose (`ingest/register/frame/dense_search.py`).
+at the true pose (`ingest/register/frame/dense/search.py`).
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.oriented_gradients import FloatImage
+from ingest.register.frame.dense.oriented_gradients import FloatImage
 
 _MIN_OVERLAP = 0.6  # of a piece that lies over the photo's border
 

@@ -88,7 +88,7 @@ def consistent_matches(
         k = min(options.neighbours + 1, len(rows))
         distance, neighbour = tree.query(photo[rows], k=k, distance_upper_bound=options.reach_rel * side_px)
         neighbour = np.where(np.isfinite(distance), neighbour, -1).astype(np.int64)
-        loops = compiled_module("ingest.register.frame.consistency_loops")
+        loops = compiled_module("ingest.register.frame.features.consistency_loops")
         support[rows], expected[rows] = loops.neighbour_support(
             np.ascontiguousarray(photo[rows], dtype=np.float64),
             np.ascontiguousarray(reference[rows], dtype=np.float64),

@@ -20,11 +20,10 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
-from ingest.register.frame.prior_fit import prior_sigmas
-from ingest.register.frame.scan_resolution import finest_side_px, viewing_distance_m
-from ingest.register.frame.score_maps import (
+from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
+from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture, viewing_distance_m
+from ingest.register.frame.dense.score_maps import (
     ScoreMaps,
     TemplateOptions,
     cut_templates,
@@ -32,7 +31,7 @@ from ingest.register.frame.score_maps import (
     search_around,
     search_everywhere,
 )
-from ingest.register.frame.source_pictures import source_picture
+from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 

@@ -19,17 +19,16 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.pinhole_view import PinholeView, pinhole_view, with_margin
-from ingest.register.frame.scan_resolution import finest_side_px
-from ingest.register.frame.score_maps import (
+from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
+from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view, with_margin
+from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture
+from ingest.register.frame.dense.score_maps import (
     ScoreMaps,
     TemplateOptions,
     cut_templates,
     peaks,
     search_around,
 )
-from ingest.register.frame.source_pictures import source_picture
 from ingest.register.frame_registration import RenderSource
 
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not

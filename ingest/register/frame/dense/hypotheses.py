@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from ingest.register.frame.confirmation import PictureConfirmation, confirm_pose
-from ingest.register.frame.dense_fit import DenseFitOptions, near_places
-from ingest.register.frame.dense_search import register_dense, searched_near
-from ingest.register.frame.matching import joined
+from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
+from ingest.register.frame.dense.fit import DenseFitOptions, near_places
+from ingest.register.frame.dense.search import register_dense, searched_near
+from ingest.register.frame.features.matching import joined
+from ingest.register.frame.features.search import FrameHypothesis, independent
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.search import FrameHypothesis, independent
 from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.options import PoseOptions

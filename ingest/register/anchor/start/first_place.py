@@ -16,9 +16,9 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
-from ingest.register.anchor.picks import Picks, focal_sigma_rel, pose_from_picks
-from ingest.register.anchor.start import RoughPose, StartOptions, image_named, prior_from_rough_pose
-from ingest.register.anchor.start_files import read_picks, read_pose
+from ingest.register.anchor.start.files import read_picks, read_pose
+from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
+from ingest.register.anchor.start.priors import RoughPose, StartOptions, image_named, prior_from_rough_pose
 from ingest.register.frame_registration import FramePrior
 from ingest.register.place_map import place_by_photo
 

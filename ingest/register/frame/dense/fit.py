@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.matching import FrameMatches
-from ingest.register.frame.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.score_maps import TemplateOptions, cut_templates, peaks, search_around
-from ingest.register.frame.source_pictures import source_picture
+from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
+from ingest.register.frame.dense.scan_pictures import source_picture
+from ingest.register.frame.dense.score_maps import TemplateOptions, cut_templates, peaks, search_around
+from ingest.register.frame.features.matching import FrameMatches
 from ingest.register.frame_registration import RenderSource
 
 

@@ -12,7 +12,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.nearest import nearest
-from ingest.register.frame.pool import Pool
+from ingest.register.frame.features.pool import Pool
 
 _NEIGHBOURS = 8  # one place is in as many renders of the star; the next place must be among them
 

@@ -1,0 +1,1 @@
+"""Keypoints of renders around the prior, pooled, and matched with those of the photo."""
