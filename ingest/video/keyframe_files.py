@@ -12,15 +12,19 @@ from numpy.typing import NDArray
 from PIL import ExifTags, Image
 
 from featuredb.errors import VideoError
+from featuredb.features.exif.angles import XMP_ANGLES
 from featuredb.features.exif.write import gps_directory
+from featuredb.features.exif.xmp_write import with_properties
 from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
 from featuredb.video.frames import open_video
 from ingest.executor import Progress
 from ingest.video.burnt_in import BurntIn, BurntInOptions, find_burnt_in, painted_over
 from ingest.video.keyframes import KeyframeChoice
-from ingest.video.positions import Position
+from ingest.video.positions import GimbalAngles, Position
 from ingest.workspace import atomic_file
+
+_GIMBAL = XMP_ANGLES["drone-dji"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,11 +46,14 @@ def write_keyframes(
     film: Path,
     folder: Path,
     choice: KeyframeChoice,
-    places: Sequence[Position | None],
+    told: tuple[Sequence[Position | None], Sequence[GimbalAngles | None]],
     encoding: Encoding,
     progress: Progress,
 ) -> None:
     """Write the chosen frames as `folder`/NNNNNN.jpg, each named by its number in the film.
+
+    Args:
+        told: position and gimbal angles of each.
 
     Raises:
         VideoError: the film does not give the same frames again.
@@ -60,7 +67,7 @@ def write_keyframes(
                 continue
             camera = _camera(video.info, encoding.unnamed, choice.shot[k])
             with atomic_file(folder / keyframe_name(frame.index)) as file:
-                file.write_bytes(_jpeg(frame, video.info, camera, places[k], encoding.quality))
+                file.write_bytes(_jpeg(frame, video.info, camera, told[0][k], told[1][k], encoding.quality))
             left -= 1
             progress("keyframes", len(wanted) - left, len(wanted))
             if not left:
@@ -83,7 +90,12 @@ def _camera(info: VideoInfo, unnamed: str, shot: int) -> tuple[str, str]:
 
 
 def _jpeg(
-    frame: VideoFrame, info: VideoInfo, camera: tuple[str, str], place: Position | None, quality: int
+    frame: VideoFrame,
+    info: VideoInfo,
+    camera: tuple[str, str],
+    place: Position | None,
+    angles: GimbalAngles | None,
+    quality: int,
 ) -> bytes:
     """One keyframe, of a camera's make and model."""
     exif = Image.Exif()
@@ -99,8 +111,12 @@ def _jpeg(
         details[base.SubsecTimeOriginal.value] = f"{when.microsecond // 1000:03d}"
     if place is not None:
         exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps_directory(place))
+    xmp = b""
+    if angles is not None:
+        words = {f"drone-dji:{name}": f"{angle:+.2f}" for name, angle in zip(_GIMBAL, angles, strict=True)}
+        xmp = with_properties(b"", words)
     out = io.BytesIO()
-    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif)
+    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif, xmp=xmp)
     return out.getvalue()
 
 
@@ -127,12 +143,12 @@ def clean_keyframes(
 def _paint_over(file: Path, mask: NDArray[np.bool_], quality: int) -> None:
     """Paint over a keyframe's mask."""
     with Image.open(file) as picture:
-        rgb, exif = np.asarray(picture.convert("RGB")), picture.getexif()
+        rgb, exif, xmp = np.asarray(picture.convert("RGB")), picture.getexif(), picture.info.get("xmp", b"")
     size = (rgb.shape[1], rgb.shape[0])
     large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     with atomic_file(file) as target:
         Image.fromarray(painted_over(rgb, large)).save(
-            target, format="JPEG", quality=quality, subsampling=0, exif=exif
+            target, format="JPEG", quality=quality, subsampling=0, exif=exif, xmp=xmp
         )
 
 

@@ -1,4 +1,4 @@
-"""Where a film's keyframes were taken, by its telemetry."""
+"""Where a film's keyframes were taken and how the camera was turned, by its telemetry."""
 
 import hashlib
 
@@ -16,6 +16,9 @@ from ingest.video.motion import Motion
 
 Position = tuple[float, float, float]
 """Latitude and longitude in degrees, height in metres."""
+
+GimbalAngles = tuple[float, float, float]
+"""Yaw clockwise from true north, pitch (-90 looks down) and roll of the camera, degrees."""
 
 RELATIVE_HEIGHTS = "above the place of take-off"
 
@@ -52,7 +55,7 @@ def lateness(
 
 
 def digest_of_telemetry(telemetry: Telemetry | None) -> str:
-    """Of all that positions are made of."""
+    """Of all that positions and angles are made of."""
     if telemetry is None:
         return "none"
     columns = (
@@ -62,6 +65,7 @@ def digest_of_telemetry(telemetry: Telemetry | None) -> str:
         telemetry.height_m,
         telemetry.relative_height_m,
         telemetry.clock_s,
+        telemetry.gimbal_ypr_deg,
     )
     parts = [hashlib.sha256(np.ascontiguousarray(column).tobytes()).hexdigest() for column in columns]
     return digest(*parts, telemetry.height_datum, str(telemetry.in_video_time), telemetry.clock)
@@ -90,3 +94,18 @@ def positions_at(
         (float(at.latitude_deg[k]), float(at.longitude_deg[k]), float(height[k])) if known[k] else None
         for k in range(len(choice.index))
     ], heights
+
+
+def angles_at(
+    telemetry: Telemetry | None, choice: KeyframeChoice, late_s: float | None
+) -> list[GimbalAngles | None]:
+    """The gimbal's angles at each keyframe; None where yaw or pitch is not known, or all are zero."""
+    if telemetry is None or late_s is None:
+        return [None] * len(choice.index)
+    angles = telemetry.at(np.array(choice.time_s) + late_s).gimbal_ypr_deg
+    return [
+        (float(yaw), float(pitch), float(np.nan_to_num(roll)))
+        if np.isfinite([yaw, pitch]).all() and np.nan_to_num([yaw, pitch, roll]).any()
+        else None
+        for yaw, pitch, roll in angles
+    ]

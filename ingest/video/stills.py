@@ -24,7 +24,7 @@ from ingest.video.keyframe_files import Encoding, clean_keyframes, keyframe_name
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
 from ingest.video.lag import LagOptions
 from ingest.video.motion import FrameKind, Motion, MotionOptions, measure_motion
-from ingest.video.positions import digest_of_telemetry, lateness, positions_at
+from ingest.video.positions import angles_at, digest_of_telemetry, lateness, positions_at
 from ingest.workspace import write_json
 
 _DONE = "film.json"
@@ -140,12 +140,13 @@ def make_stills(
         )
         notes += said
     places, heights = positions_at(telemetry, choice, late_s)
+    angles = angles_at(telemetry, choice, late_s)
     encoding = Encoding(
         video=_video_options(options, options.max_side_px),
         quality=options.quality,
         unnamed=unnamed_model(content),
     )
-    write_keyframes(film, folder, choice, places, encoding, progress)
+    write_keyframes(film, folder, choice, (places, angles), encoding, progress)
     burnt_in = clean_keyframes(folder, choice, options.motion_side_px, options.quality, options.burnt_in)
     shots = tuple(_with_findings(number, shot, burnt_in) for number, shot in enumerate(shots))
     made = Stills(

@@ -103,6 +103,25 @@ def test_stills_are_photos_of_one_camera_with_positions(film: Path, tmp_path: Pa
         assert picture.size == (CAMERA.width, CAMERA.height)
 
 
+def test_gimbal_angles_of_the_telemetry_are_those_of_the_photos(film: Path, tmp_path: Path) -> None:
+    """A camera that looks ahead and down; the first two seconds tell no angles."""
+    telemetry = read_telemetry(film.with_suffix(".srt"))
+    angles = np.tile([-170.0, -84.0, 0.5], (len(telemetry), 1))
+    angles[telemetry.times_s < 2.0] = np.nan
+    stills = make_stills(
+        film, replace(telemetry, gimbal_ypr_deg=angles), tmp_path, StillsOptions(keyframes=_FEW)
+    )
+    told = {int(f.stem): read_exif(f.read_bytes()).angles for f in stills.folder.glob("*.jpg")}
+    assert told
+    for frame, found in told.items():
+        if frame < 20:
+            assert found is None
+        else:
+            assert found is not None
+            assert (found.yaw_deg, found.pitch_deg, found.roll_deg) == (-170.0, -84.0, 0.5)
+    assert len({found is None for found in told.values()}) == 2
+
+
 def test_telemetry_that_lags_is_taken_from_later(film: Path, tmp_path: Path) -> None:
     telemetry = read_telemetry(film.with_suffix(".srt"))
     late = make_stills(film, telemetry, tmp_path, StillsOptions(telemetry_late_s=0.2, keyframes=_FEW))
