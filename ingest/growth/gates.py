@@ -83,12 +83,11 @@ def residuals(offset_m: float, distance_m: float, limit: float) -> Gate:
     )
 
 
-def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, by: str = "") -> Gate:
-    """Share of the photos with a position that their place contradicts.
+def geotags(offsets_m: FloatArray, covariances: FloatArray, by: str = "") -> Gate:
+    """How often so many of the photos' positions contradict their place by accident.
 
-    Two must contradict before it counts: a photo may lie about its place. Then most of them may
-    not, and not more than honest positions do by accident: a tenth of a community's are wrong by kilometres.
-    Nineteen photos of a block's twin and one of the block were once half against their place, and taken.
+    A tenth of a community's positions are wrong by kilometres, so some may contradict; more than accident
+    explains may not.
 
     Args:
         offsets_m: (n, 2) placed centre minus position, east and north.
@@ -105,17 +104,16 @@ def geotags(offsets_m: FloatArray, covariances: FloatArray, limit: float, by: st
                 f" by {by}" * bool(by)
                 + f", which is {way_words(*np.median(offsets_m[contradict], axis=0))} of them"
             )
-    share = against / len(offsets_m) if len(offsets_m) else 0.0
-    by_accident = float(binom.sf(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
+    chance = float(binom.sf(against - 1, len(offsets_m), _WRONG_TAGS)) if against else 1.0
     return Gate(
         name="geotags",
         reason="CONTRADICTS_GPS",
-        figure=share,
-        limit=limit,
-        passes=against < 2 or (share <= limit and by_accident >= _ACCIDENT),
+        figure=chance,
+        limit=_ACCIDENT,
+        passes=chance >= _ACCIDENT,
         message=f"{against} of {len(offsets_m)} positions contradict the placement{where} (chi-square above "
-        f"{GPS_LIMIT}), a share of {limit:.0%} is allowed, and what happens once in {1 / _ACCIDENT:.0f} "
-        f"times if {_WRONG_TAGS:.0%} of all positions are wrong",
+        f"{GPS_LIMIT}): if {_WRONG_TAGS:.0%} of all positions are wrong, that happens {chance:.2%} of the "
+        f"time, and what happens less than {_ACCIDENT:.0%} is not taken",
     )
 
 

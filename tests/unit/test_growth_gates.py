@@ -28,41 +28,41 @@ def test_residuals() -> None:
 
 
 def test_a_lying_geotag_of_one_photo_does_not_matter() -> None:
-    spread = np.tile(np.eye(2) * 25.0, (3, 1, 1))
+    spread = np.tile(np.eye(2) * 25.0, (4, 1, 1))
     liar = np.array([[3.0, 1.0], [-2.0, 4.0], [5000.0, 0.0]])
-    assert gates.geotags(liar, spread, 0.5).passes
-    assert gates.geotags(liar[2:], spread[2:], 0.5).passes  # alone, too
-    most = np.array([[3.0, 1.0], [400.0, 0.0], [5000.0, 0.0]])
-    refused = gates.geotags(most, spread, 0.5)
+    assert gates.geotags(liar, spread[:3]).passes
+    assert gates.geotags(liar[2:], spread[:1]).passes  # alone, too
+    most = np.array([[400.0, 0.0], [400.0, 0.0], [400.0, 0.0], [5000.0, 0.0]])
+    refused = gates.geotags(most, spread)
     assert not refused.passes
-    assert refused.figure == pytest.approx(2 / 3)
-    assert "which is 2.7 km to the east" in refused.message
-    assert "placement by map, which is 5.0 km" in gates.geotags(liar, spread, 0.5, by="map").message
-    assert gates.geotags(np.zeros((0, 2)), np.zeros((0, 2, 2)), 0.5).passes
+    assert refused.figure == pytest.approx(0.15**4)
+    assert "which is 400 m to the east" in refused.message
+    assert "placement by map, which is 5.0 km" in gates.geotags(liar, spread[:3], by="map").message
+    assert gates.geotags(np.zeros((0, 2)), np.zeros((0, 2, 2))).passes
 
 
 def test_more_wrong_geotags_than_come_by_accident_are_none() -> None:
-    """Of many positions half is too much, of few it is not; a fifth never is."""
+    """Where 15 % are wrong, two of two happen 2.3 % of the time, three of three 0.3, eight of twenty 0.6."""
     spread = np.tile(np.eye(2) * 900.0, (20, 1, 1))
 
     def passes(wrong: int, count: int) -> bool:
         offsets = np.zeros((count, 2))
         offsets[:wrong] = (150.0, 0.0)
-        return gates.geotags(offsets, spread[:count], 0.5).passes
+        return gates.geotags(offsets, spread[:count]).passes
 
-    assert passes(2, 4)
+    assert passes(2, 2)
+    assert not passes(3, 3)
     assert passes(3, 6)
-    assert passes(4, 20)
-    assert not passes(10, 20)
+    assert passes(7, 20)
     assert not passes(8, 20)
-    assert "once in 100 times" in gates.geotags(np.zeros((2, 2)), spread[:2], 0.5).message
+    assert not passes(10, 20)
 
 
 def test_geotags_count_by_their_own_sigma() -> None:
     """Chi-square of (20, 0) is 16 at a sigma of 5 m and 25 at 4 m; the limit is 18.42."""
-    offsets = np.array([[20.0, 0.0], [20.0, 0.0]])
-    assert gates.geotags(offsets, np.tile(np.eye(2) * 25.0, (2, 1, 1)), 0.5).passes
-    assert not gates.geotags(offsets, np.tile(np.eye(2) * 16.0, (2, 1, 1)), 0.5).passes
+    offsets = np.tile([[20.0, 0.0]], (3, 1))
+    assert gates.geotags(offsets, np.tile(np.eye(2) * 25.0, (3, 1, 1))).passes
+    assert not gates.geotags(offsets, np.tile(np.eye(2) * 16.0, (3, 1, 1))).passes
 
 
 def test_photos_that_do_not_show_what_they_should() -> None:

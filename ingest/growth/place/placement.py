@@ -46,7 +46,6 @@ class PlacementOptions:
         max_residual: median distance of centres beyond their own uncertainty, over the viewing distance.
             Models of few photos, bent and with a lens not their own, reached 0.4 %; a placement by a
             look-alike place shows in pixels long before.
-        max_against_gps: share of the photos with a position.
         visibility: what a photo must show.
         max_blind: share of photos that show less of the existing points. Single ones are left out
             (`MapsPlacement.blind`).
@@ -57,7 +56,6 @@ class PlacementOptions:
     min_agreeing: int = 2
     min_agreeing_share: float = 0.66
     max_residual: float = 0.01
-    max_against_gps: float = 0.5
     visibility: VisibilityOptions = field(default_factory=VisibilityOptions)
     max_blind: float = 0.34
     parents: ParentOptions = field(default_factory=ParentOptions)
@@ -230,9 +228,7 @@ def _ask(
     return (
         gates.agreement(len(agree), len(own) - len(agree), options.min_agreeing, options.min_agreeing_share),
         gates.residuals(_typical_excess_m(model, sim, own, agree), reach, options.max_residual),
-        gates.geotags(
-            offsets_gps, spreads_gps, options.max_against_gps, by=", ".join(e.map_id for e in edges)
-        ),
+        gates.geotags(offsets_gps, spreads_gps, by=", ".join(e.map_id for e in edges)),
         gates.visibility(shows[np.isfinite(shows)], options.visibility.min_visible, options.max_blind),
     )
 
