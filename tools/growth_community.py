@@ -97,7 +97,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     growing = growing_options(args.max_features, args.workers, args.budget)
     if args.min_link is not None:
         growth = growing.growth
-        grow = replace(growth.grow.grow, settle=replace(growth.grow.grow.settle, min_link=args.min_link))
+        grow = replace(
+            growth.grow.grow, refinement=replace(growth.grow.grow.refinement, min_link=args.min_link)
+        )
         growing = replace(growing, growth=replace(growth, grow=replace(growth.grow, grow=grow)))
     with recording(args.out, album):
         report = grow_candidates(database, growing)

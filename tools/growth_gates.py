@@ -74,7 +74,7 @@ def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[N
         note = _Note(file=file, frame=frame, true_place=true_place)
         for module, name, wrapped in (
             (component, "place_by_maps", note.placing),
-            (component, "settle", note.refining),
+            (component, "refine_placed", note.refining),
             (run, "drift_gate", note.budget),
             (run, "with_drift", note.drifting),
             (run, "promote_confirmed", note.promoting),
@@ -101,17 +101,17 @@ class _Note:
         return place_by_maps
 
     def refining(self, step: Any) -> Any:
-        def settle(model: Any, held: Any, *more: Any) -> Any:
-            settled = step(model, held, *more)
-            refused = isinstance(settled, Refused)
-            gates = settled.gates if refused else settled.placement.gates
+        def refine_placed(model: Any, held: Any, *more: Any) -> Any:
+            refined = step(model, held, *more)
+            refused = isinstance(refined, Refused)
+            gates = refined.gates if refused else refined.placement.gates
             own = [gate for gate in gates if gate.name not in {g.name for g in held.placement.gates}]
             if refused and all(gate.passes for gate in own):  # by photos that are left out
-                own.append(_said_no(settled.reason))
+                own.append(_said_no(refined.reason))
             self._model("refine", model, held.placement, own)
-            return settled
+            return refined
 
-        return settle
+        return refine_placed
 
     def drifting(self, step: Any) -> Any:
         def with_drift(*args: Any) -> Any:

@@ -42,7 +42,7 @@ from ingest.growth.graph.joint.in_database import adjust_maps
 from ingest.growth.place.component import GrowOptions
 from ingest.growth.place.grow_photos import Grown, GrowPhotosOptions, grow_photos
 from ingest.growth.place.localised import localise_photos
-from ingest.growth.place.settle import SettleOptions
+from ingest.growth.place.refinement import RefinementOptions
 from ingest.growth.values import GrownMap
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
@@ -61,7 +61,7 @@ _LIMIT_M = 0.3
 _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
-_WITHOUT_BUDGET = GrowPhotosOptions(grow=GrowOptions(settle=SettleOptions(max_photo_bound_m=np.inf)))
+_WITHOUT_BUDGET = GrowPhotosOptions(grow=GrowOptions(refinement=RefinementOptions(max_photo_bound_m=np.inf)))
 
 
 @dataclass(slots=True, kw_only=True)

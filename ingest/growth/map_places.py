@@ -54,14 +54,14 @@ def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
     return dict(evidence.get(GROWTH) or {})
 
 
-def with_all_directions(feature_map: FeatureMap) -> FeatureMap:
-    """The map with its placement's covariance `in_all_directions`."""
+def inflated(feature_map: FeatureMap) -> FeatureMap:
+    """The map with its placement's covariance `isotropic_inflation`."""
     placement = feature_map.placement
-    alike = in_all_directions(feature_map, placement.covariance)
+    alike = isotropic_inflation(feature_map, placement.covariance)
     return replace(feature_map, placement=replace(placement, covariance=alike))
 
 
-def in_all_directions(feature_map: FeatureMap, covariance: FloatArray) -> FloatArray:
+def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> FloatArray:
     """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
 
     About the middle of its photos; not less, anywhere that the map answers for, than the given one says for

@@ -23,7 +23,7 @@ from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import ReplaceOptions, replace_descendants
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.not_found import NotFound, NotFoundRows
-from ingest.growth.place.component import AT_SEVERAL_PLACES, grow_component, taken_apart
+from ingest.growth.place.component import AT_SEVERAL_PLACES, grow_component, split
 from ingest.growth.place.grow_photos import GrowPhotosOptions, grow_photos
 from ingest.growth.place.localised import LocaliseEachOptions, localise_photos
 from ingest.growth.run_record import (
@@ -34,9 +34,9 @@ from ingest.growth.run_record import (
     note_refusal,
     split_reason,
 )
+from ingest.growth.trust.corroboration import NewPhotos
 from ingest.growth.trust.promotion import PromotionOptions, promote_confirmed
 from ingest.growth.trust.scan_check import ScanCheckOptions, scan_gate, with_gate
-from ingest.growth.trust.witnesses import NewPhotos
 from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
@@ -56,16 +56,16 @@ class GrowthOptions:
         drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
             a survey's points are usually wanted for. Photos beyond it wait for an anchor.
         max_rounds: a bound on one run; each round needs a promotion.
-        joint_links: a reconstruction whose photos are at several places is taken apart where its photos share
+        split_links: a reconstruction whose photos are at several places is split where its photos share
             less than the first of these of their points, its parts at the second, and so on. 194 photos
             of a simulated town that look-alikes had joined from five places fell apart at 0.10 into parts
-            of one place each, but for ten photos; at 0.25 (`SettleOptions.min_link`) right ones do, too.
+            of one place each, but for ten photos; at 0.25 (`RefinementOptions.min_link`) right ones do, too.
         localise, grow, scan, promotion, replacing: of the steps.
     """
 
     drift_budget_m: float = 0.5
     max_rounds: int = 10
-    joint_links: tuple[float, ...] = (0.10, 0.15, 0.25)
+    split_links: tuple[float, ...] = (0.10, 0.15, 0.25)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     grow: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
     scan: ScanCheckOptions = field(default_factory=ScanCheckOptions)
@@ -75,15 +75,15 @@ class GrowthOptions:
     def with_threads(self, threads: int) -> "GrowthOptions":
         """The same with so many photos localised at a time."""
         localise = replace(self.localise, threads=threads)
-        witnesses = self.promotion.witnesses
-        witnesses = replace(witnesses, localise=replace(witnesses.localise, threads=threads))
-        return replace(self, localise=localise, promotion=replace(self.promotion, witnesses=witnesses))
+        outside = self.promotion.corroboration
+        outside = replace(outside, localise=replace(outside.localise, threads=threads))
+        return replace(self, localise=localise, promotion=replace(self.promotion, corroboration=outside))
 
     def with_budget(self) -> "GrowthOptions":
         """The same where no photo of a map may be further off than the budget either."""
         growing = self.grow.grow
-        settle = replace(growing.settle, max_photo_bound_m=self.drift_budget_m)
-        return replace(self, grow=replace(self.grow, grow=replace(growing, settle=settle)))
+        refinement = replace(growing.refinement, max_photo_bound_m=self.drift_budget_m)
+        return replace(self, grow=replace(self.grow, grow=replace(growing, refinement=refinement)))
 
 
 def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOptions:
@@ -225,9 +225,9 @@ def _try_model(
     Where its photos are at several places, its parts: look-alikes join what does not belong together.
 
     Args:
-        links: at which it may be taken apart, weakest first.
+        links: at which it may be split, weakest first.
     """
-    links = options.joint_links if links is None else links
+    links = options.split_links if links is None else links
     part: Model | None = model
     for _ in range(3):  # the part that is left may lie otherwise, and be cut again
         assert part is not None
@@ -236,7 +236,7 @@ def _try_model(
             part, new.photos, new.features_of, localised, areas, _identity_of(new)(rows), options.grow.grow
         )
         if isinstance(outcome, Refused):
-            pieces = taken_apart(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
+            pieces = split(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
             if pieces is None:
                 note_refusal(outcome, new, run)
                 return
@@ -315,7 +315,7 @@ def _promote(
     work: Path,
 ) -> bool:
     """Confirm and promote; whether anything was."""
-    witnesses = NewPhotos(
+    outside = NewPhotos(
         photos=new.photos,
         rows=[row for row in range(len(new.photos)) if row not in run.map_of],
         features_of=new.features_of,
@@ -324,7 +324,7 @@ def _promote(
         overlaps=new.overlaps,
     )
     outcomes = promote_confirmed(
-        database, localiser, options.promotion, witnesses, budget_m=options.drift_budget_m, work=work
+        database, localiser, options.promotion, outside, budget_m=options.drift_budget_m, work=work
     )
     for outcome in outcomes:
         run.promotions[outcome.map_id] = outcome

@@ -34,7 +34,7 @@ def link_shares(model: Model) -> FloatArray:
     return np.asarray(shares)
 
 
-def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> FloatArray:
+def bottleneck_share(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> FloatArray:
     """(k,) of every photo: the weakest link of its firmest chain of photos to one that is held.
 
     Args:
@@ -60,7 +60,7 @@ def firmness(model: Model, held: Sequence[int], without: Sequence[int] = ()) -> 
     return firm
 
 
-def firm_parts(model: Model, least_share: float) -> list[list[int]]:
+def connected_parts(model: Model, least_share: float) -> list[list[int]]:
     """Rows of the photos that hang together by links of at least `least_share`, largest part first."""
     return _parts(model, sparse.csr_array(link_shares(model) >= least_share))
 

@@ -10,8 +10,8 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.trust.confirmation import (
     Confirmation,
     ConfirmationOptions,
+    CorroboratingImage,
     Source,
-    Witness,
     confirm,
     independent,
 )
@@ -120,8 +120,8 @@ def test_one_photo_confirms_nothing_alone() -> None:
     assert confirm(one, replace(_OPTIONS, trusted_owners=("anna",))).gate.passes
 
 
-def _witness(feature_map: FeatureMap, owner: str, points: int = 200) -> Witness:
-    return Witness(
+def _outside(feature_map: FeatureMap, owner: str, points: int = 200) -> CorroboratingImage:
+    return CorroboratingImage(
         name="w",
         source=Source(owner=owner),
         center=np.array([20.0, -50.0, 30.0]),
@@ -131,13 +131,13 @@ def _witness(feature_map: FeatureMap, owner: str, points: int = 200) -> Witness:
 
 def test_two_witnesses_of_other_owners_confirm_and_one_does_not() -> None:
     feature_map = _owned(["anna"])
-    assert _reason(confirm(feature_map, _OPTIONS, [_witness(feature_map, "ben")])) == "FEW_PAIRS"
-    two = [_witness(feature_map, "ben"), _witness(feature_map, "carl")]
+    assert _reason(confirm(feature_map, _OPTIONS, [_outside(feature_map, "ben")])) == "FEW_PAIRS"
+    two = [_outside(feature_map, "ben"), _outside(feature_map, "carl")]
     assert confirm(feature_map, _OPTIONS, two).gate.passes
-    found = confirm(feature_map, _OPTIONS, [_witness(feature_map, "anna")])
+    found = confirm(feature_map, _OPTIONS, [_outside(feature_map, "anna")])
     assert _reason(found) == "ONE_SOURCE"
-    assert found.witnesses == ()
-    few = confirm(feature_map, _OPTIONS, [_witness(feature_map, "ben", points=5)])
+    assert found.corroborating == ()
+    few = confirm(feature_map, _OPTIONS, [_outside(feature_map, "ben", points=5)])
     assert not few.gate.passes
 
 

@@ -23,7 +23,7 @@ from ingest.growth.place.drift import (
     shared_turn,
     turning_covariance,
 )
-from ingest.growth.place.settle import loose_photos
+from ingest.growth.place.refinement import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 

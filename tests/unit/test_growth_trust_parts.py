@@ -20,7 +20,7 @@ from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.place.overlaps import model_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
-from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witness
+from ingest.growth.trust.confirmation import ConfirmationOptions, CorroboratingImage, Source
 from ingest.growth.trust.promotion import Promotion, canary_gate
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
 from tests.support.scene_strip import EDGE, FRAME, east, strip_map
@@ -191,9 +191,11 @@ def test_only_points_of_two_sources_answer() -> None:
 def test_a_witness_makes_points_answer() -> None:
     feature_map = strip_map("m", 40.0, owners=["anna"])
     rows = np.arange(100, dtype=np.int64)
-    witness = Witness(name="w", source=Source(owner="ben"), center=np.array([0.0, -60.0, 20.0]), points=rows)
+    outside = CorroboratingImage(
+        name="w", source=Source(owner="ben"), center=np.array([0.0, -60.0, 20.0]), points=rows
+    )
     alone = confirmed_points(feature_map, ConfirmationOptions())
-    found = confirmed_points(feature_map, ConfirmationOptions(), [witness])
+    found = confirmed_points(feature_map, ConfirmationOptions(), [outside])
     assert not alone.any()
     assert found[rows].mean() > 0.9
     assert not found[100:].any()

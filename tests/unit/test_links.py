@@ -3,30 +3,30 @@
 import numpy as np
 
 from ingest.colmap.bridge import Model
-from ingest.growth.place.component import taken_apart
-from ingest.sfm.links import firm_parts, firmness
+from ingest.growth.place.component import split
+from ingest.sfm.links import bottleneck_share, connected_parts
 from tests.support.posed_models import model_of
 
 
 def test_the_weakest_link_of_the_firmest_chain_counts() -> None:
     # 0 is held, 1 shares half of its points with it; 2 and 3 share all but hang on 1 by 4 of 100.
     model = model_of(range(100), range(50, 150), range(146, 246), range(146, 246))
-    firm = firmness(model, [0])
+    firm = bottleneck_share(model, [0])
     assert firm[0] == np.inf
     np.testing.assert_allclose(firm[1:], [0.5, 0.04, 0.04])
     # Held at both ends the same photos hang well.
-    np.testing.assert_allclose(firmness(model, [0, 3])[1:3], [0.5, 1.0])
+    np.testing.assert_allclose(bottleneck_share(model, [0, 3])[1:3], [0.5, 1.0])
 
 
 def test_a_photo_of_few_points_hangs_by_its_own_share() -> None:
     model = model_of(range(1000), range(980, 1020))
-    np.testing.assert_allclose(firmness(model, [0])[1], 0.5)
+    np.testing.assert_allclose(bottleneck_share(model, [0])[1], 0.5)
 
 
 def test_photos_without_a_chain_hang_on_nothing() -> None:
     model = model_of(range(100), range(200, 300))
-    assert firmness(model, [0])[1] == 0.0
-    assert (firmness(model, []) == 0.0).all()
+    assert bottleneck_share(model, [0])[1] == 0.0
+    assert (bottleneck_share(model, []) == 0.0).all()
 
 
 def two_places() -> Model:
@@ -41,14 +41,14 @@ def two_places() -> Model:
 
 def test_parts_are_tied_by_less_than_their_photos_are() -> None:
     model = two_places()
-    assert firm_parts(model, 0.10) == [[0, 1, 2, 3, 4, 5, 6]]
-    assert firm_parts(model, 0.15) == [[3, 4, 5, 6], [0, 1, 2]]
-    assert firm_parts(model, 0.60) == [[k] for k in range(7)]
+    assert connected_parts(model, 0.10) == [[0, 1, 2, 3, 4, 5, 6]]
+    assert connected_parts(model, 0.15) == [[3, 4, 5, 6], [0, 1, 2]]
+    assert connected_parts(model, 0.60) == [[k] for k in range(7)]
 
 
 def test_a_reconstruction_of_two_places_is_taken_apart_at_its_weakest_joint() -> None:
     model = two_places()
-    found = taken_apart(model, (0.10, 0.15, 0.25))
+    found = split(model, (0.10, 0.15, 0.25))
     assert found is not None
     level, parts = found
     assert level == 0.15
@@ -56,8 +56,8 @@ def test_a_reconstruction_of_two_places_is_taken_apart_at_its_weakest_joint() ->
     # Points that only the joint had two views of are gone.
     assert len(parts[1].xyz) == 100
     # One place is left as it is, and so are links that nobody names.
-    assert taken_apart(parts[0], (0.10, 0.15, 0.25)) is None
-    assert taken_apart(model, ()) is None
+    assert split(parts[0], (0.10, 0.15, 0.25)) is None
+    assert split(model, ()) is None
     # Photos that hang on nothing are in no part.
-    level, parts = taken_apart(model, (0.60,)) or (0.0, [model])
+    level, parts = split(model, (0.60,)) or (0.0, [model])
     assert (level, parts) == (0.60, [])

@@ -11,7 +11,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from ingest.growth.gates import Gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, solve_with_new
-from ingest.growth.map_places import drift_m, growth_of, places_of, with_all_directions
+from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
 from ingest.growth.trust.confirmation import ConfirmationOptions, confirm, sources_json
 from ingest.growth.values import GrownMap
 
@@ -71,7 +71,7 @@ def with_drift(
         covariance=covariance,
         evidence={**feature_map.placement.evidence, GROWTH: growth},
     )
-    placed = with_all_directions(replace(feature_map, placement=placement))
+    placed = inflated(replace(feature_map, placement=placement))
     return replace(placed, status="quarantined"), drift, relative
 
 

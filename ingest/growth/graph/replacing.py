@@ -28,7 +28,7 @@ from ingest.growth.graph.map_graph import (
 )
 from ingest.growth.graph.new_overlaps import NewOverlaps, measure_new, overlaps_to_measure
 from ingest.growth.graph.pose_graph import GraphSolution, PoseGraphOptions, solve_pose_graph
-from ingest.growth.map_places import drift_m, growth_of, places_of, with_all_directions
+from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
 from ingest.growth.place.overlaps import OverlapOptions
 from ingest.growth.trust.canaries import CanaryCheck, CanaryOptions, CanaryRun, check_known
 from reloc.localiser import Localiser
@@ -187,7 +187,7 @@ def _commit(
         else:
             covariance = covariance_in_frame(solution.covariance[map_id], frame, maps[map_id].frame)
             there = move_map(snapshot.load_map(map_id), own, covariance=covariance)
-            moved[map_id] = there if maps[map_id].is_anchor else with_all_directions(there)
+            moved[map_id] = there if maps[map_id].is_anchor else inflated(there)
         corrections[map_id] = own
     places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
     contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}

@@ -22,11 +22,11 @@ from ingest.growth.place.localised import LocaliseEachOptions, in_frame, with_le
 from ingest.growth.place.parents import drift_covariance, map_agreements
 from ingest.growth.place.placement import PlacementOptions, SupportedPlacement, place_by_maps
 from ingest.growth.place.refine import adopt_lenses
-from ingest.growth.place.settle import SettleOptions, settle
+from ingest.growth.place.refinement import RefinementOptions, refine_placed
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
-from ingest.sfm.links import firm_parts
+from ingest.sfm.links import connected_parts
 from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ class GrowOptions:
     """From a reconstruction to a map.
 
     Attributes:
-        placement, settle: the steps.
+        placement, refinement: the steps.
         localise: how poses are found again with the lenses of the reconstruction.
         maps: what goes into the map; the height datum is that of the parents. Points of two photos carry
             descriptors: a handful of photos has hardly longer tracks, and the next photo needs them to be
@@ -45,7 +45,7 @@ class GrowOptions:
     """
 
     placement: PlacementOptions = field(default_factory=PlacementOptions)
-    settle: SettleOptions = field(default_factory=SettleOptions)
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     maps: MapOptions = field(default_factory=lambda: MapOptions(min_track_length=2))
 
@@ -105,27 +105,29 @@ def _grown(
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, mine, photos, near, keypoints, options.settle.refine)
+    model, lenses = adopt_lenses(model, mine, photos, near, keypoints, options.refinement.refine)
     mine, correspondences, held = _placed(model, mine, keypoints, photos, near, frame, options)
     placement = held.placement
     if placement.reason is not None or placement.local_from_sfm is None:
         return Refused(
             reason=placement.reason or "", message=placement.message, rows=rows, gates=placement.gates
         )
-    settled = settle(model, held, correspondences, mine, keypoints, lenses, options.placement, options.settle)
-    if isinstance(settled, Refused):
-        return settled
-    if needed and not set(needed) & set(settled.model.rows.tolist()):
-        reason, message = settled.left_out[needed[0]]
-        return Refused(reason=reason, message=message, rows=rows, gates=settled.placement.gates)
-    final, more = settled.placement, settled.evidence()
-    grown = assemble(settled.model, final, held, photos, features_of, near, identity, options, more)
+    refined = refine_placed(
+        model, held, correspondences, mine, keypoints, lenses, options.placement, options.refinement
+    )
+    if isinstance(refined, Refused):
+        return refined
+    if needed and not set(needed) & set(refined.model.rows.tolist()):
+        reason, message = refined.left_out[needed[0]]
+        return Refused(reason=reason, message=message, rows=rows, gates=refined.placement.gates)
+    final, more = refined.placement, refined.evidence()
+    grown = assemble(refined.model, final, held, photos, features_of, near, identity, options, more)
     if isinstance(grown, Refused):
         return grown
     return replace(
         grown,
-        feature_map=_with_covariances(grown.feature_map, settled.spread.poses),
-        left_out=settled.left_out,
+        feature_map=_with_covariances(grown.feature_map, refined.spread.poses),
+        left_out=refined.left_out,
     )
 
 
@@ -275,13 +277,13 @@ AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
 _LEAST_PHOTOS = 3
 
 
-def taken_apart(model: Model, links: Sequence[float]) -> tuple[float, list[Model]] | None:
+def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]] | None:
     """The parts of a reconstruction at the weakest of the links at which it falls apart, and that link.
 
     Photos that hang on nothing any more are in no part: they are localised by themselves, or wait.
     """
     for level in links:
-        parts = firm_parts(model, level)
+        parts = connected_parts(model, level)
         if len(parts) > 1:
             kept = [
                 keep_photos(model, rows, least=_LEAST_PHOTOS) for rows in parts if len(rows) >= _LEAST_PHOTOS

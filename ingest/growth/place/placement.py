@@ -100,7 +100,7 @@ def place_by_maps(
     )
     found = None
     if ranked and len(ranked[0][1]) >= 1:
-        found = _settled(model, ranked[0][0], ranked[0][1], own, correspondences, options)
+        found = _agreed(model, ranked[0][0], ranked[0][1], own, correspondences, options)
     if found is None:
         return _nowhere(model, own, 0 if not ranked else len(ranked[0][1]), correspondences, frame, options)
     fit, agree = found
@@ -135,7 +135,7 @@ def place_by_maps(
 
 def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: VisibilityOptions) -> set[int]:
     """Photos that show too little of what they should; those that disagree are left out as such."""
-    little = set(np.flatnonzero(shows.witnessed < options.min_witnessed).tolist()) - disagree
+    little = set(np.flatnonzero(shows.with_own < options.min_shown).tolist()) - disagree
     return little | {k for k in agree if shows.existing[k] < options.min_visible}
 
 
@@ -166,7 +166,7 @@ def _nowhere(
     )
 
 
-def _settled(
+def _agreed(
     model: Model,
     start: Sim3,
     agree: NDArray[np.int64],

@@ -32,18 +32,18 @@ class VisibilityOptions:
         min_visible: least share of the parts of a photo where existing points should be seen that shows some:
             as for a query (reloc.localise.acceptance). In a simulated community a re-upload 10.8 m off showed
             0.13 of its parts, right photos 0.22 and more.
-        min_witnessed: the same where the points of its own reconstruction are asked for as well. Another
+        min_shown: the same where the points of its own reconstruction are asked for as well. Another
             re-upload, 13.3 m off, showed 0.17; right photos of that database 0.32 and more, of the one that
             grew with this limit 0.23 and more.
         min_points: a photo that should see fewer says nothing.
-        min_witnesses: photos that see a point of the reconstruction before it may be asked for. What two
+        min_views: photos that see a point of the reconstruction before it may be asked for. What two
             photos alone see says where the one is from the other, not what is there.
     """
 
     min_visible: float = 0.2
-    min_witnessed: float = 0.25
+    min_shown: float = 0.25
     min_points: int = 30
-    min_witnesses: int = 3
+    min_views: int = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,11 +54,11 @@ class ShownParts:
 
     Attributes:
         existing: (k,) of the points of existing maps.
-        witnessed: (k,) of these and of the points of the model itself that several photos bear out.
+        with_own: (k,) of these and of the points of the model itself that several photos bear out.
     """
 
     existing: FloatArray
-    witnessed: FloatArray
+    with_own: FloatArray
 
 
 def shown_parts(
@@ -75,23 +75,23 @@ def shown_parts(
         sim: frame from the model's.
         held: pixels of the model's photos in which existing points are seen, where the placement has them.
     """
-    often = model.track_lengths() >= options.min_witnesses
+    often = model.track_lengths() >= options.min_views
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
-    existing, witnessed = np.full(len(model.rows), np.nan), np.full(len(model.rows), np.nan)
+    existing, with_own = np.full(len(model.rows), np.nan), np.full(len(model.rows), np.nan)
     for k, pose in enumerate(model.cam_from_sfm):
         camera = model.cameras[int(model.camera_of[k])]
         expected, seen = _existing(model, k, sim, areas, frame), held.pixels[held.photo_of == k]
         existing[k] = _share(camera, seen, expected, options)
         own = often & in_view(model.xyz, cones, camera, pose, EXPECTED_DEG)
         seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]
-        witnessed[k] = _share(
+        with_own[k] = _share(
             camera,
             np.concatenate([seen, camera.project(pose.act(model.xyz[seen_own]))]),
             np.concatenate([expected, camera.project(pose.act(model.xyz[own]))]),
             options,
         )
-    logger.debug("shares of what should be seen: %s", np.round(witnessed, 2).tolist())
-    return ShownParts(existing=existing, witnessed=witnessed)
+    logger.debug("shares of what should be seen: %s", np.round(with_own, 2).tolist())
+    return ShownParts(existing=existing, with_own=with_own)
 
 
 def _existing(model: Model, k: int, sim: Sim3, areas: Sequence[Area], frame: LocalFrame) -> FloatArray:

@@ -70,7 +70,7 @@ class ConfirmationOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Witness:
+class CorroboratingImage:
     """A photo that is not the map's own, and localised in it.
 
     Attributes:
@@ -93,13 +93,13 @@ class Confirmation:
         gate: the map is confirmed when it passes.
         sources: those among the photos that confirm each other, or are trusted.
         confirmed: image ids of the map.
-        witnesses: names of witnesses that confirm a photo of the map.
+        corroborating: names of photos from outside that confirm one of the map.
     """
 
     gate: Gate
     sources: tuple[Source, ...]
     confirmed: tuple[int, ...]
-    witnesses: tuple[str, ...] = ()
+    corroborating: tuple[str, ...] = ()
 
     @property
     def message(self) -> str:
@@ -131,24 +131,24 @@ def independent(a: Source, b: Source, by: Independence = "owner") -> bool:
 def confirm(
     feature_map: FeatureMap,
     options: ConfirmationOptions,
-    witnesses: Sequence[Witness] = (),
+    corroborating: Sequence[CorroboratingImage] = (),
     against: Sequence[str] = (),
 ) -> Confirmation:
     """How far independent sources confirm a map.
 
     A photo of the map is confirmed when it shares enough of the map's points with a photo of an independent
-    source, the map's own or a witness, or when its owner is trusted.
+    source, the map's own or one from outside, or when its owner is trusted.
 
     Args:
         against: sentences on photos from outside that the map has elsewhere than they are.
     """
     sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
     own = len(sources)
-    everyone = [*sources, *(w.source for w in witnesses)]
-    shared = _shared_points(feature_map, witnesses)
+    everyone = [*sources, *(w.source for w in corroborating)]
+    shared = _shared_points(feature_map, corroborating)
     agree = np.zeros_like(shared, dtype=np.bool_)
     enough = (shared >= options.min_shared_points) & (
-        parallax(feature_map, witnesses) >= options.min_parallax
+        parallax(feature_map, corroborating) >= options.min_parallax
     )
     for i, j in np.argwhere(np.triu(enough, 1)).tolist():
         agree[i, j] = agree[j, i] = independent(everyone[i], everyone[j], options.independent_by)
@@ -162,7 +162,7 @@ def confirm(
         gate=gate,
         sources=tuple(groups),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
-        witnesses=tuple(w.name for w, yes in zip(witnesses, vouching, strict=True) if yes),
+        corroborating=tuple(w.name for w, yes in zip(corroborating, vouching, strict=True) if yes),
     )
 
 
@@ -201,16 +201,16 @@ def _gate(confirmed: int, pairs: float, trusted: bool, against: Sequence[str]) -
     )
 
 
-def _shared_points(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> NDArray[np.int64]:
-    """Numbers of common points of the map's images and the witnesses, (n, n)."""
+def _shared_points(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> NDArray[np.int64]:
+    """Numbers of common points of the map's images and those from outside, (n, n)."""
     row = {image.image_id: i for i, image in enumerate(feature_map.images)}
     seen = feature_map.observations
     images = np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)
     points = seen.point_index
-    for k, witness in enumerate(witnesses, start=len(row)):
-        images = np.concatenate([images, np.full(len(witness.points), k)])
-        points = np.concatenate([points, witness.points])
-    count = len(row) + len(witnesses)
+    for k, outside in enumerate(corroborating, start=len(row)):
+        images = np.concatenate([images, np.full(len(outside.points), k)])
+        points = np.concatenate([points, outside.points])
+    count = len(row) + len(corroborating)
     sees = sparse.csr_array(
         (np.ones(len(images), dtype=np.int64), (images, points)),
         shape=(count, max(len(feature_map.points), 1)),
@@ -220,14 +220,14 @@ def _shared_points(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> NDA
     return np.asarray((sees @ sees.T).toarray(), dtype=np.int64)
 
 
-def parallax(feature_map: FeatureMap, witnesses: Sequence[Witness]) -> FloatArray:
+def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage]) -> FloatArray:
     """Distances of the cameras from each other over those from what they see, (n, n)."""
     points = feature_map.points_local()
     seen = feature_map.observations
     rows = [seen.point_index[seen.image_id == image.image_id] for image in feature_map.images]
-    rows += [w.points for w in witnesses]
+    rows += [w.points for w in corroborating]
     centers = np.array(
-        [image.cam_from_local.center for image in feature_map.images] + [w.center for w in witnesses]
+        [image.cam_from_local.center for image in feature_map.images] + [w.center for w in corroborating]
     ).reshape(-1, 3)
     reach = np.array(
         [

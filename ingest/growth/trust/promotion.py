@@ -12,9 +12,9 @@ from featuredb.store import Database, MapSummary, Snapshot
 from ingest.growth.gates import Gate
 from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, confirm
+from ingest.growth.trust.corroboration import CorroborationOptions, NewPhotos, corroborate
 from ingest.growth.trust.examined import question, recall, remember
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
-from ingest.growth.trust.witnesses import NewPhotos, WitnessOptions, hear_witnesses
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ class PromotionOptions:
 
     answer_with: Literal["confirmed", "all"] = "confirmed"
     confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
-    witnesses: WitnessOptions = field(default_factory=WitnessOptions)
+    corroboration: CorroborationOptions = field(default_factory=CorroborationOptions)
     canaries: CanaryOptions = field(default_factory=CanaryOptions)
 
 
@@ -92,7 +92,7 @@ def promote_confirmed(
 
     Args:
         localiser: of the active maps of the newest snapshot.
-        new: photos that may bear witness, beside the images of other maps.
+        new: photos that may corroborate a map, beside the images of other maps.
         budget_m: maps that have drifted further stay.
         work: work folder, where it is kept what was found out: without anything new nothing is asked again.
 
@@ -161,18 +161,18 @@ def examine(
     feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
 ) -> ExaminedMap:
     """How far others confirm a map: photos of its own, and from outside."""
-    heard = hear_witnesses(
+    heard = corroborate(
         feature_map,
         _others(feature_map.map_id, snapshot),
         new,
         options.confirmation,
-        options.witnesses,
+        options.corroboration,
         write_id=snapshot.get(feature_map.map_id).write_id,
     )
-    confirmation = confirm(feature_map, options.confirmation, heard.witnesses, heard.contradictions)
+    confirmation = confirm(feature_map, options.confirmation, heard.corroborating, heard.contradictions)
     part = feature_map
     if options.answer_with == "confirmed":
-        points = confirmed_points(feature_map, options.confirmation, heard.witnesses)
+        points = confirmed_points(feature_map, options.confirmation, heard.corroborating)
         part = answering_with(feature_map, points)
     return ExaminedMap(feature_map=part, confirmation=confirmation)
 

@@ -12,28 +12,34 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from featuredb.maps.feature_map import FeatureMap
-from ingest.growth.trust.confirmation import ConfirmationOptions, Witness, independent, parallax, source_of
+from ingest.growth.trust.confirmation import (
+    ConfirmationOptions,
+    CorroboratingImage,
+    independent,
+    parallax,
+    source_of,
+)
 
 
 def confirmed_points(
-    feature_map: FeatureMap, options: ConfirmationOptions, witnesses: Sequence[Witness] = ()
+    feature_map: FeatureMap, options: ConfirmationOptions, corroborating: Sequence[CorroboratingImage] = ()
 ) -> NDArray[np.bool_]:
-    """Which points (n,) photos of two independent sources see, own ones or witnesses, or trusted ones."""
+    """Which points (n,) photos of two independent sources see, the map's or from outside, or trusted ones."""
     sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
-    sources += [w.source for w in witnesses]
+    sources += [w.source for w in corroborating]
     row = {image.image_id: i for i, image in enumerate(feature_map.images)}
     seen = feature_map.observations
     images = [np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)]
     points = [seen.point_index]
-    for k, witness in enumerate(witnesses, start=len(row)):
-        images.append(np.full(len(witness.points), k, dtype=np.int64))
-        points.append(witness.points)
+    for k, outside in enumerate(corroborating, start=len(row)):
+        images.append(np.full(len(outside.points), k, dtype=np.int64))
+        points.append(outside.points)
     shape = (len(sources), max(len(feature_map.points), 1))
     entries = (np.concatenate(images), np.concatenate(points))
     sees = sparse.csr_array((np.ones(len(entries[0])), entries), shape=shape)
     sees.sum_duplicates()
     sees.data[:] = 1.0
-    apart = parallax(feature_map, witnesses) >= options.min_parallax
+    apart = parallax(feature_map, corroborating) >= options.min_parallax
     pairs = np.array(
         [[apart[i, j] and independent(a, b, options.independent_by) for j, b in enumerate(sources)]
          for i, a in enumerate(sources)],

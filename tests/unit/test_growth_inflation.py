@@ -7,10 +7,10 @@ from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.growth.map_places import (
     drift_m,
-    in_all_directions,
+    inflated,
+    isotropic_inflation,
     place_sigmas_m,
     places_of,
-    with_all_directions,
 )
 from tests.support.growth_box import existing
 
@@ -25,7 +25,7 @@ def weak_in_height() -> np.ndarray:
 
 def test_one_size_in_all_directions() -> None:
     feature_map = existing()
-    alike = in_all_directions(feature_map, weak_in_height())
+    alike = isotropic_inflation(feature_map, weak_in_height())
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     jacobian = point_jacobian(middle)
     shift, turn = jacobian @ alike @ jacobian.T, alike[1:4, 1:4]
@@ -38,14 +38,14 @@ def test_one_size_in_all_directions() -> None:
 def test_nowhere_less_than_in_the_worst_direction_before() -> None:
     feature_map, given = existing(), weak_in_height()
     places = places_of(feature_map)
-    alike = in_all_directions(feature_map, given)
+    alike = isotropic_inflation(feature_map, given)
     assert (place_sigmas_m(alike, places) >= 0.999 * place_sigmas_m(given, places)).mean() >= 0.99
     assert drift_m(given, places) <= drift_m(alike, places) < 1.5 * drift_m(given, places)
 
 
 def test_what_is_alike_already_stays() -> None:
     feature_map = existing(sigma_m=0.3)
-    again = with_all_directions(with_all_directions(feature_map)).placement.covariance
-    once = with_all_directions(feature_map).placement.covariance
+    again = inflated(inflated(feature_map)).placement.covariance
+    once = inflated(feature_map).placement.covariance
     np.testing.assert_allclose(again, once, rtol=1e-6, atol=1e-12)
     assert drift_m(once, places_of(feature_map)) == pytest.approx(1.96 * 0.3, rel=0.02)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.growth.place.settle import loose_photos, weak_photos
+from ingest.growth.place.refinement import loose_photos, weak_photos
 from tests.support.posed_models import model_of
 
 

@@ -86,13 +86,13 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOpt
     return grow(database, new, folder / "work", options)
 
 
-@pytest.mark.parametrize("links", [GrowthOptions().joint_links, ()], ids=["apart", "whole"])
+@pytest.mark.parametrize("links", [GrowthOptions().split_links, ()], ids=["split", "whole"])
 def test_both_places_become_maps(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, links: tuple[float, ...]
 ) -> None:
     """As a whole it is refused; then the photos that are localised by themselves form a group."""
     with caplog.at_level(logging.INFO, "ingest.growth"):
-        report = _grown(_groups(5, 5), tmp_path, replace(GrowthOptions(), joint_links=links))
+        report = _grown(_groups(5, 5), tmp_path, replace(GrowthOptions(), split_links=links))
     names = [set(m.photos) for m in report.maps if m.map_id]
     apart = [r.message for r in caplog.records if "at several places" in r.message]
     if not links:

@@ -37,7 +37,7 @@ from ingest.growth.place.refine import (
 )
 from ingest.growth.place.similarity_fit import FittedSimilarity, fit_similarity
 from ingest.growth.values import LocalisedPhoto, MapsPlacement, Refused
-from ingest.sfm.links import firmness
+from ingest.sfm.links import bottleneck_share
 
 # Reasons of photos that nothing holds well enough, of those that hang on others by little, and of those that
 # their own localisation has elsewhere.
@@ -47,14 +47,14 @@ _ELSEWHERE = "the photo by itself sees existing points elsewhere than the others
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SettleOptions:
+class RefinementOptions:
     """Which photos of a placed reconstruction are kept.
 
     Attributes:
         refine: the adjustment.
-        min_link: `firmness` that photos need which are not localised themselves. In simulated communities
-            photos tied to look-alike halls 68 and 78 m from theirs had 0.15 and 0.04; right photos nearly
-            all 0.46 and more, single ones 0.14. Those wait, and are localised by themselves once their
+        min_link: `bottleneck_share` that photos need which are not localised themselves. In simulated
+            communities photos tied to look-alike halls, 68 and 78 m off, had 0.15 and 0.04; right photos
+            nearly all 0.46 and more, single ones 0.14. Those wait, and are localised by themselves once their
             neighbours are in an active map.
         max_photo_bound_m: photos that may be further off (95 %), against the existing points and with what
             their lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
@@ -72,7 +72,7 @@ class SettleOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Settled:
+class Refinement:
     """A refined reconstruction.
 
     Attributes:
@@ -103,7 +103,7 @@ class Settled:
         }
 
 
-def settle(
+def refine_placed(
     model: Model,
     held: SupportedPlacement,
     correspondences: Correspondences,
@@ -111,8 +111,8 @@ def settle(
     keypoints: Sequence[FloatArray],
     lenses: Lenses,
     placing: PlacementOptions,
-    options: SettleOptions,
-) -> Settled | Refused:
+    options: RefinementOptions,
+) -> Refinement | Refused:
     """Refine an accepted placement with the existing points held fixed.
 
     Args:
@@ -186,7 +186,7 @@ def settle(
     turning = turning_covariance(adjusted.model, fit.covariance, spread)
     bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
     kept = [k for k in range(len(rows)) if k not in outside]
-    return Settled(
+    return Refinement(
         model=only_photos(whole, kept),
         placement=_widened(asked, turning + np.diag([0.0] * 4 + [bending_m2] * 3)),
         spread=spread.of(kept),
@@ -257,7 +257,7 @@ def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int], min_l
     Args:
         outside: photos that do not count. held: photos that are localised and agree.
     """
-    firm = firmness(model, held, outside)
+    firm = bottleneck_share(model, held, outside)
     return {
         k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
         f"{100 * min_link:.0f} % needed: look-alike places tie photos so"

@@ -12,7 +12,13 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_each
 from ingest.growth.place.overlaps import localise_image
-from ingest.growth.trust.confirmation import ConfirmationOptions, Source, Witness, independent, source_of
+from ingest.growth.trust.confirmation import (
+    ConfirmationOptions,
+    CorroboratingImage,
+    Source,
+    independent,
+    source_of,
+)
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
 from ingest.sfm.pairs import Pair
@@ -20,7 +26,7 @@ from reloc.localise.candidates import IndexedArea
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class WitnessOptions:
+class CorroborationOptions:
     """Who is asked.
 
     Attributes:
@@ -41,7 +47,7 @@ class WitnessOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class NewPhotos:
-    """New photos that may be witnesses.
+    """New photos that may corroborate.
 
     Attributes:
         rows: of `photos` that may be asked.
@@ -72,36 +78,36 @@ class NewPhotos:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Heard:
-    """What witnesses say: those that see the map's points, and sentences on those that contradict it."""
+class Corroboration:
+    """Photos from outside that see the map's points, and sentences on those that contradict it."""
 
-    witnesses: tuple[Witness, ...]
+    corroborating: tuple[CorroboratingImage, ...]
     contradictions: tuple[str, ...]
 
 
-def hear_witnesses(
+def corroborate(
     feature_map: FeatureMap,
     others: Sequence[FeatureMap],
     new: NewPhotos | None,
     by: ConfirmationOptions,
-    options: WitnessOptions | None = None,
+    options: CorroborationOptions | None = None,
     *,
     write_id: str,
-) -> Heard:
+) -> Corroboration:
     """Localise photos of sources that are not the map's own in the map alone.
 
     Args:
         others: maps around it, active or quarantined.
         write_id: of the map as it is.
     """
-    options = options or WitnessOptions()
+    options = options or CorroborationOptions()
     area = build_area([feature_map])
     if not len(area.points):
-        return Heard(witnesses=(), contradictions=())
+        return Corroboration(corroborating=(), contradictions=())
     indexed = IndexedArea(area=area, index=build_index(area.descriptors))
     own = {source_of(image, feature_map.camera_keys) for image in feature_map.images}
     names = {image.sha256 for image in feature_map.images}
-    witnesses: list[Witness] = []
+    corroborating: list[CorroboratingImage] = []
     against: list[str] = []
     for other, image in _images_around(feature_map, others, own, by, options):
         found = localise_image(other, image, 0, [indexed], options.localise)
@@ -112,10 +118,12 @@ def hear_witnesses(
         apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
         spread = _spread(found) + _center_variance(other, image)
         what = f"{image.name} of map {other.map_id}"
-        _sort_in(found, source_of(image, other.camera_keys), what, apart, spread, options, witnesses, against)
+        _sort_in(
+            found, source_of(image, other.camera_keys), what, apart, spread, options, corroborating, against
+        )
     if new is not None:
-        _hear_new(feature_map, write_id, indexed, new, own, names, by, options, witnesses, against)
-    return Heard(witnesses=tuple(witnesses), contradictions=tuple(against))
+        _hear_new(feature_map, write_id, indexed, new, own, names, by, options, corroborating, against)
+    return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
 
 
 def source_of_photo(photo: Photo) -> Source:
@@ -132,8 +140,8 @@ def _hear_new(
     own: set[Source],
     names: set[str],
     by: ConfirmationOptions,
-    options: WitnessOptions,
-    witnesses: list[Witness],
+    options: CorroborationOptions,
+    corroborating: list[CorroboratingImage],
     against: list[str],
 ) -> None:
     sources = {row: source_of_photo(new.photos[row]) for row in new.that_may_see(feature_map)}
@@ -155,7 +163,7 @@ def _hear_new(
             there = in_frame(new.localised[row], feature_map.frame)
             apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
             spread += _spread(there)
-        _sort_in(found, sources[row], new.photos[row].name, apart, spread, options, witnesses, against)
+        _sort_in(found, sources[row], new.photos[row].name, apart, spread, options, corroborating, against)
 
 
 def _sort_in(
@@ -164,16 +172,16 @@ def _sort_in(
     name: str,
     apart_m: float,
     variance: float,
-    options: WitnessOptions,
-    witnesses: list[Witness],
+    options: CorroborationOptions,
+    corroborating: list[CorroboratingImage],
     against: list[str],
 ) -> None:
-    """A witness that the map has where it is known to be speaks for it, another one against it."""
+    """A photo that the map has where it is known to be speaks for it, another one against it."""
     if apart_m > max(options.least_m, options.sigmas * float(np.sqrt(variance))):
         against.append(f"{name} is {apart_m:.2f} m from where the map has it")
         return
-    witnesses.append(
-        Witness(
+    corroborating.append(
+        CorroboratingImage(
             name=name,
             source=source,
             center=found.cam_from_local.center,
@@ -200,7 +208,7 @@ def _images_around(
     others: Sequence[FeatureMap],
     own: set[Source],
     by: ConfirmationOptions,
-    options: WitnessOptions,
+    options: CorroborationOptions,
 ) -> list[tuple[FeatureMap, MapImage]]:
     """Images of other maps by independent sources, nearest to the map's cameras first."""
     centers = np.array([image.cam_from_local.center for image in feature_map.images])
