@@ -96,7 +96,7 @@ def run_page(page: str, folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def in_short() -> Iterator[None]:
-    """Commands without workers, which take long to start, and what the same photo gave before is not sought anew.
+    """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
 
     README.md and docs/anchoring.md register the same frames on the same scan, with and without a person.
     """
