@@ -133,9 +133,9 @@ def ingest_world(world: "World", database: Any, report_folder: Path, *, exact_gp
 
     options = IngestOptions(
         gps_sigma_m=(_EXACT_SIGMA_M, _EXACT_SIGMA_M) if exact_gps else None,
-        # The town is rich in texture; half of the usual features halve the time of a first impression.
+        # The town is rich in texture; a quarter of the usual features make a first impression short.
         making=MapMakingOptions(
-            extractor=ExtractorOptions(max_features=6000), maps=MapOptions(height_datum="ellipsoidal")
+            extractor=ExtractorOptions(max_features=3000), maps=MapOptions(height_datum="ellipsoidal")
         ),
     )
     report = ingest_photos(database, world.folder / "drone", options)

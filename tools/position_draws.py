@@ -37,6 +37,7 @@ from tools.made_maps import all_maps, make, photo_names
 
 SIGMAS = np.array([DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_HORIZONTAL_M, DEFAULT_SIGMA_VERTICAL_M])
 _TRUE = Sim3(scale=8.5, rotation=so3_exp([0.1, -0.05, 2.0]), translation=np.array([4.0, -7.0, 50.0]))
+_SHUFFLES = 4  # of each flight
 PARTS = ("position", "orientation")
 LEVELS = (0.68, 0.95)
 _COMMON_ROLL_DEG = 1.5  # of simulated flights, as placements assume
@@ -131,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     real = [real_flight(folder, args.work) for folder in args.photos]
     with threadpool_limits(1):  # matrices are small
         figures = bounds(real, args.draws, args.seed)
-        figures |= unrelated([*real, *simulated_flights(args.seed, 0)], args.chance, args.seed)
+        figures |= unrelated([*real, *simulated_flights(args.seed, 0)], args.chance, args.seed, args.draws)
     write_figures(args.json, figures)
     count = figures["placed"] * figures["flights"]
     held = all(
@@ -203,8 +204,13 @@ def inside(scores: Sequence[dict[str, float]], part: str, level: float) -> float
     return float(np.mean([score[part] <= chi2.ppf(level, 3) for score in scores]))
 
 
-def unrelated(flights: Sequence[Flight], chance: int, seed: int) -> dict[str, float]:
-    """Positions that have nothing to do with the photos: how many flights would answer, or have a place."""
+def unrelated(flights: Sequence[Flight], chance: int, seed: int, most: int = _SHUFFLES) -> dict[str, float]:
+    """Positions that have nothing to do with the photos: how many flights would answer, or have a place.
+
+    Args:
+        chance: draws of random positions.
+        most: of shuffles of each flight's positions, and of other flights whose positions it is given.
+    """
     found: dict[str, list[GpsPlacement]] = {"random": [], "shuffled": [], "other": []}
     for draw in range(chance):
         rng = np.random.default_rng((seed, 99, draw))
@@ -217,10 +223,10 @@ def unrelated(flights: Sequence[Flight], chance: int, seed: int) -> dict[str, fl
         drawn = np.column_stack([rng.uniform(-500.0, 500.0, (count, 2)), rng.uniform(0.0, 100.0, count)])
         found["random"].append(part.placed(drawn))
     for k, flight in enumerate(flights):
-        for draw in range(4):
+        for draw in range(min(most, _SHUFFLES)):
             rng = np.random.default_rng((seed, 98, k, draw))
             found["shuffled"].append(flight.placed(flight.xyz[rng.permutation(len(flight.xyz))]))
-        for other in [*flights[:k], *flights[k + 1 :]]:
+        for other in [*flights[:k], *flights[k + 1 :]][:most]:
             found["other"].append(flight.placed(other.xyz[: len(flight.xyz)]))
     figures: dict[str, float] = {}
     for kind, placements in found.items():

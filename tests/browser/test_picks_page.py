@@ -36,7 +36,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> PickSession:
     root = tmp_path_factory.mktemp("picks")
     write_hill_photos(root / "photos", with_gps=False)
     database = Database.create(root / "db")
-    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1500)))
+    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1000)))
     ingest_photos(database, root / "photos", options)
     add_scan(database, [write_hill_scan(root / "s.laz", offset_m=tuple(OFFSET), texture_seed=1)])
     snapshot = database.snapshot()

@@ -41,7 +41,7 @@ def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     root = tmp_path_factory.mktemp("anchor")
     write_hill_photos(root / "photos")
     plain = Database.create(root / "plain")
-    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1500)))
+    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1000)))
     report = ingest_photos(plain, root / "photos", options)
     assert [m.status for m in report.maps] == ["committed"]
     for name, seed in (("right", 1), ("wrong", 7)):

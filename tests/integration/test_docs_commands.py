@@ -3,10 +3,12 @@
 import shutil
 import subprocess
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from ingest.register.anchor import frames
 from tests.support.doc_commands import (
     ROOT,
     Block,
@@ -21,6 +23,7 @@ from tests.support.doc_commands import (
 from tests.support.doc_folder import go_on, inside, make_folder
 from tests.support.doc_runner import CommandFailedError, PageRun, is_free, ports
 from tests.support.doc_usage import UsageError, check_usage
+from tests.support.remembered import remembered
 
 _REAL_DATA = "needs photos or scans that are not in the repository"
 _BY_HAND = "needs a person's clicks; tools/paper.py runs the same with picks, tests/browser the page"
@@ -92,7 +95,19 @@ def run_page(page: str, folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def after_readme(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def in_short() -> Iterator[None]:
+    """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
+
+    README.md and docs/anchoring.md register the same frames on the same scan, with and without a person.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.cpu_count", lambda: 1)
+        patch.setattr(frames, "register_frame", remembered(frames.register_frame))
+        yield
+
+
+@pytest.fixture(scope="module")
+def after_readme(in_short: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the simulated town, after all that the README shows."""
     folder = make_folder(tmp_path_factory.mktemp("documentation"))
     run_page(_FIRST, folder)

@@ -147,10 +147,6 @@ def _jpeg_of_size(width: int, height: int) -> bytes:
         (_png(0xFFFFFFFF, 1, b""), {"too_small"}),
         (_png(1000, 1000, zlib.compress(b"\0" * 1001 * 10)), {"broken"}),
         (_png(1000, 1000, b"nonsense"), {"broken"}),
-        (
-            _png(64, 64, zlib.compress(bytes(200 << 20), 9)),
-            {"ok"},
-        ),  # more pixels than claimed are not inflated
         (_jpeg_of_size(0, 0), {"too_small"}),
         (_jpeg_of_size(65535, 65535), {"too_large"}),
         (_jpeg_of_size(2000, 1900), {"truncated", "broken"}),
@@ -165,6 +161,11 @@ def _jpeg_of_size(width: int, height: int) -> bytes:
 @pytest.mark.timeout(60)
 def test_absurd_headers(data: bytes, codes: set[str]) -> None:
     assert _outcome(data) in codes
+
+
+@pytest.mark.timeout(60)
+def test_more_pixels_than_claimed_are_not_inflated() -> None:
+    assert _outcome(_png(64, 64, zlib.compress(bytes(200 << 20), 9))) == "ok"
 
 
 @pytest.mark.timeout(60)

@@ -14,7 +14,7 @@ from ingest.reconstruction import MapMakingOptions
 from ingest.sfm.mapper import SfmOptions
 from tests.support.hill_photos import FRAME, HillPhoto, hill_height, write_hill_photos
 
-_EXTRACTOR = ExtractorOptions(max_features=1500)
+_EXTRACTOR = ExtractorOptions(max_features=1000)
 _MAKING = MapMakingOptions(extractor=_EXTRACTOR)
 _TRUTH = IngestOptions(workers=1, gps_sigma_m=(0.02, 0.02), making=_MAKING)
 

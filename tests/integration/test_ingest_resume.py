@@ -2,6 +2,7 @@
 
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,10 +33,16 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> FeatureMap:
+def whole(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The database of an ingest that nothing disturbed."""
     database = tmp_path_factory.mktemp("undisturbed") / "db"
     assert _start(database, photos).wait(_TIMEOUT_S) == 0
-    return _only_map(database)
+    return database
+
+
+@pytest.fixture(scope="module")
+def undisturbed(whole: Path) -> FeatureMap:
+    return _only_map(whole)
 
 
 def _start(database: Path, photos: Path, *more: str, workers: int = 2) -> "subprocess.Popen[bytes]":
@@ -108,9 +115,14 @@ def _wait_for_workers(group: int) -> None:
         "maps/_delta_log/*1.json",
     ],
 )
-def test_killed_at_a_stage(pattern: str, photos: Path, undisturbed: FeatureMap, tmp_path: Path) -> None:
+def test_killed_at_a_stage(
+    pattern: str, photos: Path, whole: Path, undisturbed: FeatureMap, tmp_path: Path
+) -> None:
     database = tmp_path / "db"
-    # What comes after the models is the command's own work: it needs no workers, which take long to start.
+    # What comes after the models is the command's own work: it needs no workers, which take long to start,
+    # and begins with the models of the ingest that nothing disturbed.
+    if not pattern.startswith("_work/"):
+        shutil.copytree(whole / "_work", database / "_work")
     process = _start(database, photos, workers=2 if pattern.startswith("_work/") else 1)
     killed = _kill_when(process, lambda: any(database.glob(pattern)))
     if killed:

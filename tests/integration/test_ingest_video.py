@@ -62,7 +62,7 @@ def test_a_film_becomes_a_map_where_its_telemetry_says(
     film: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = ["ingest", "video", str(tmp_path / "db"), str(film), "--gps-sigma", "0.05", "--quiet"]
-    command += ["--workers", "1", "--max-features", "1500"]
+    command += ["--workers", "1", "--max-features", "800"]
     assert main(command) == 0
     said = capsys.readouterr().out
     assert "telemetry of hills.srt" in said
