@@ -75,9 +75,11 @@ class GrowthOptions:
     def with_threads(self, threads: int) -> "GrowthOptions":
         """The same with so many photos localised at a time."""
         localise = replace(self.localise, threads=threads)
-        outside = self.promotion.corroboration
-        outside = replace(outside, localise=replace(outside.localise, threads=threads))
-        return replace(self, localise=localise, promotion=replace(self.promotion, corroboration=outside))
+        corroboration = self.promotion.corroboration
+        corroboration = replace(corroboration, localise=replace(corroboration.localise, threads=threads))
+        return replace(
+            self, localise=localise, promotion=replace(self.promotion, corroboration=corroboration)
+        )
 
     def with_budget(self) -> "GrowthOptions":
         """The same where no photo of a map may be further off than the budget either."""

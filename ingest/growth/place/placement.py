@@ -102,14 +102,14 @@ def place_by_maps(
     if ranked and len(ranked[0][1]) >= 1:
         found = _agreed(model, ranked[0][0], ranked[0][1], own, correspondences, options)
     if found is None:
-        return _nowhere(model, own, 0 if not ranked else len(ranked[0][1]), correspondences, frame, options)
+        return _nowhere(model, own, correspondences, frame, options)
     fit, agree = found
     used = np.isin(correspondences.photo_of, list(agree)) | correspondences.carried
     used &= fit.errors_px < tolerances_px(model, correspondences, options.fit.tolerance_rel)
     maps = {m.map_id: m for area in areas for m in area.maps}
     edges = edges_of(model, fit, correspondences, used, options.parents, options.fit)
     if not edges:
-        return _nowhere(model, own, 0, correspondences, frame, options)
+        return _nowhere(model, own, correspondences, frame, options)
     on_earth = parents_covariance([(maps[e.map_id], e.shared_points) for e in edges], frame)
     sim, held = fit.local_from_sfm, correspondences.take(np.flatnonzero(used))
     shows = shown_parts(model, sim, held, areas, frame, options.visibility)
@@ -142,15 +142,12 @@ def _blind(shows: ShownParts, agree: set[int], disagree: set[int], options: Visi
 def _nowhere(
     model: Model,
     own: Mapping[int, LocalisedPhoto],
-    agreeing: int,
     correspondences: Correspondences,
     frame: LocalFrame,
     options: PlacementOptions,
 ) -> SupportedPlacement:
     """Nothing that photos agree upon, or no existing map that would hold them."""
-    gate = gates.agreement(
-        agreeing, len(own) - agreeing, max(options.min_agreeing, agreeing + 1), options.min_agreeing_share
-    )
+    gate = gates.agreement(0, len(own), options.min_agreeing, options.min_agreeing_share)
     placement = MapsPlacement(
         reason=gate.reason,
         message=f"no placement: {gate.message}",

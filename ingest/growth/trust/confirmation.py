@@ -178,7 +178,7 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
 def _gate(confirmed: int, pairs: float, trusted: bool, against: Sequence[str]) -> Gate:
     """Whether more pairs confirm the map than one and those that photos contradict it with."""
     needed = len(against) + (0.0 if trusted else _ONE_PAIR)
-    if against and pairs > _ONE_PAIR:
+    if against and (trusted or pairs > _ONE_PAIR):
         reason = "CONTRADICTED"
         message = (
             f"{len(against)} photos from outside contradict it, {pairs:g} pairs confirm it: {against[0]}"
