@@ -51,7 +51,8 @@ def film(tmp_path_factory: pytest.TempPathFactory) -> Path:
             blocks.append(
                 f"{i + 1}\n{_clock(i / _RATE_HZ)} --> {_clock((i + 1) / _RATE_HZ)}\nFrameCnt: {i + 1}\n"
                 f"2026-05-01 12:00:{i / _RATE_HZ:06.3f}\n[latitude: {place.latitude_deg:.9f}] [longitude: "
-                f"{place.longitude_deg:.9f}] [rel_alt: 0.0 abs_alt: {place.height_m:.4f}]\n\n"
+                f"{place.longitude_deg:.9f}] [rel_alt: 0.0 abs_alt: {place.height_m:.4f}] "
+                "[gb_yaw: 20.0 gb_pitch: -84.0 gb_roll: 0.0]\n\n"
             )
     (folder / "hills.srt").write_text("".join(blocks))
     return folder / "hills.mp4"
@@ -73,6 +74,9 @@ def test_a_film_becomes_a_map_where_its_telemetry_says(
     assert 6 <= len(feature_map.images) <= 25
     assert len(feature_map.cameras) == 1
     assert feature_map.cameras[0].focal_px == pytest.approx(CAMERA.focal_px, rel=0.02)
+    angles = feature_map.placement.evidence["angles"]  # the gimbal's, of the subtitles
+    assert angles["told"]
+    assert max(angles["tilt_off_deg"], angles["yaw_off_deg"]) < 1.0, angles
     own_from_hills = feature_map.frame.enu_from(FRAME)
     for image in feature_map.images:
         true = own_from_hills.act(_pose(int(Path(image.name).stem)).center)
