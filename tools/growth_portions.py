@@ -6,16 +6,15 @@
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
    (consecutive) or in a shuffled order. The first reconstruction of at least five photos is placed by GPS,
    or without GPS at a made-up place with a median viewing distance of 50 m. Photos of later portions are
-   localised by the maps that exist, reconstructed among themselves, placed and refined by growth. What
-   cannot be placed waits, is tried with the next portion, and once more at the end. With --adjust all
-   maps are then adjusted together, as `featuredb adjust` does.
+   reconstructed among themselves and go through `ingest.growth.run.grow`, as photos that their owner
+   contributed and who is trusted. What cannot be placed waits, is tried with the next portion, and once
+   more at the end. With --adjust all maps are then adjusted together, as `featuredb adjust` does.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
    which is in metres, is left out.
 
 Prints one line a photo with -v, and one line a set. Exit code 0 if all photos of the reference are
-registered and the median difference is at most 0.3 m, else 1. Grown maps are committed as active here: who
-confirms them is another question.
+registered and the median difference is at most 0.3 m, else 1.
 """
 
 import argparse
@@ -38,20 +37,19 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.store import Database
 from ingest.executor import InProcessExecutor
 from ingest.fingerprint import digest
+from ingest.growing import reconstructed_photos
 from ingest.growth.graph.joint.in_database import adjust_maps
-from ingest.growth.place.component import GrowOptions
-from ingest.growth.place.grow_photos import Grown, GrowPhotosOptions, grow_photos
-from ingest.growth.place.localised import localise_photos
-from ingest.growth.place.refinement import RefinementOptions
-from ingest.growth.values import GrownMap
+from ingest.growth.growth_report import GrowthReport
+from ingest.growth.run import GrowthOptions, grow
+from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.trust.promotion import PromotionOptions
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, require_usable, scan_folder
 from ingest.placed_models import Component, place_models
-from ingest.reconstruction import MapMakingOptions, reconstruct_photos
-from ingest.sfm.extract import PhotoFeatures, features_key, read_features
+from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
+from ingest.sfm.extract import features_key, read_features
 from ingest.workspace import Workspace
-from reloc.localiser import Localiser
 from tools.figures import add_json_option, write_figures
 from tools.growth_common import log_to_stderr
 from tools.growth_gates import recorded
@@ -61,7 +59,11 @@ _LIMIT_M = 0.3
 _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
-_WITHOUT_BUDGET = GrowPhotosOptions(grow=GrowOptions(refinement=RefinementOptions(max_photo_bound_m=np.inf)))
+_OWNER = "portions"
+_GROWTH = GrowthOptions(
+    promotion=PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=(_OWNER,)))
+)
+_NO_BUDGET_M = 1e6
 
 
 @dataclass(slots=True, kw_only=True)
@@ -72,7 +74,7 @@ class State:
         photos: all of the set. waiting: rows that are in no map yet.
         centers: of registered photos in the first map's frame, metres, by name.
         frame: of the first map.
-        growing: without a drift budget where the first map's metre is made up.
+        growth: without a drift budget where the first map's metre is made up.
         joint: camera centres of the joint reconstruction, in its own frame, by name.
         gates: where what the gates say is recorded, beside the joint reconstruction's places.
     """
@@ -85,20 +87,16 @@ class State:
     waiting: list[int] = field(default_factory=list)
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
-    growing: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
+    growth: GrowthOptions = field(default_factory=lambda: _GROWTH)
     joint: dict[str, FloatArray] = field(default_factory=dict)
     gates: Path | None = None
-
-    def features_of(self, row: int) -> PhotoFeatures:
-        """Features of a photo, from the cache of the ingest."""
-        workspace = Workspace(root=self.work, job_id="-")
-        return read_features(workspace.features(features_key(self.making.extractor), self.photos[row].sha256))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     log_to_stderr(args.verbose)
-    photos = list(require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2))
+    found = require_usable(scan_folder(args.photos, ScanOptions()), args.photos, least=2)
+    photos = [replace(photo, owner=_OWNER) for photo in found]
     making = MapMakingOptions()
     started = time.process_time()
     joint = _reconstruct(photos, list(range(len(photos))), making, args.work)[0]
@@ -136,21 +134,19 @@ def portions(count: int, cut: str, seed: int) -> list[list[int]]:
 
 
 def _take_in(state: State, what: str) -> None:
-    """Make the first map, or grow; as long as something new is registered."""
+    """Make the first map, or grow."""
     if state.frame is None:
         _first_map(state, what)
-    while state.frame is not None and state.waiting:
-        before = len(state.waiting)
-        grown = _grow(state)
-        for new in grown.maps:
-            _commit(state, replace(new.feature_map, status="active"))
-            print(f"  {what}: {_summary(new)}")
-        for refused in grown.refused:
-            print(f"  {what}: {len(refused.rows)} photos refused, {refused.reason}: {refused.message}")
-        if len(state.waiting) == before:
-            for row, reason in grown.waiting.items():
-                print(f"  {what}: {state.photos[row].name} waits, {reason}")
-            return
+    if state.frame is None or not state.waiting:
+        return
+    report = _grow(state)
+    _find_centers(state)
+    for entry in report.maps:
+        said = f"{entry.reason_code}: {entry.reason}" if entry.reason_code else _summary(state, entry.map_id)
+        print(f"  {what}: {len(entry.photos)} photos {entry.status}, {said}")
+    for photo in report.photos:
+        if photo.outcome != "promoted":
+            logging.info("  %s: %s waits, %s: %s", what, photo.name, photo.reason_code, photo.reason)
 
 
 def _first_map(state: State, what: str) -> None:
@@ -160,8 +156,9 @@ def _first_map(state: State, what: str) -> None:
         first = component.feature_map or _made_up(state, component)
         if first is not None:
             if component.feature_map is None:
-                state.growing = _WITHOUT_BUDGET
-            _commit(state, first)
+                state.growth = replace(_GROWTH, drift_budget_m=_NO_BUDGET_M)
+            state.database.commit_maps([first])
+            _find_centers(state)
             print(f"  {what}: first map of {len(first.images)} photos, placed by {first.placement.method}")
             return
     print(f"  {what}: no first map, {len(state.waiting)} photos wait")
@@ -180,8 +177,10 @@ def _made_up(state: State, component: Component) -> FeatureMap | None:
         residual_rms_m=0.0,
         evidence={"made_up": True},
     )
+    key = features_key(state.making.extractor)
+    read = Workspace(root=state.work, job_id="-").features
+    features = [read_features(read(key, photo.sha256)) for photo in component.photos]
     rows = [state.photos.index(photo) for photo in component.photos]
-    features = [state.features_of(r) for r in rows]
     return build_map(
         model, placement, _MADE_UP_FRAME, component.photos, features, _identity(rows), state.making.maps
     )
@@ -198,32 +197,11 @@ def _extent(centers: FloatArray) -> float:
     return float(np.linalg.norm(centers.max(axis=0) - centers.min(axis=0)))
 
 
-def _grow(state: State) -> Grown:
-    """One round over all waiting photos."""
-    areas = Localiser.open(state.database).areas
-    localised, reasons = localise_photos(state.photos, state.waiting, state.features_of, areas)
-    for row, reason in reasons.items():
-        logging.info("  %s: %s", state.photos[row].name, reason)
-    models = []
-    if len(state.waiting) >= 2:
-        for component in _reconstruct(state.photos, state.waiting, state.making, state.work):
-            rows = np.array([state.waiting[int(r)] for r in component.model.rows])
-            models.append(replace(component.model, rows=rows))
-    known: list[int] = []
-    if localised:
-        known = [r for r, photo in enumerate(state.photos) if photo.name in state.centers]
-    witnesses, _ = localise_photos(state.photos, known, state.features_of, areas)
+def _grow(state: State) -> GrowthReport:
+    """One run over all waiting photos."""
+    made = _reconstructed(state.photos, state.waiting, state.making, state.work)
     with nullcontext() if state.gates is None else _recording(state, state.gates):
-        return grow_photos(
-            models,
-            state.photos,
-            state.features_of,
-            localised,
-            areas,
-            _identity,
-            options=state.growing,
-            known=witnesses,
-        )
+        return grow(state.database, reconstructed_photos(made), state.work / "growth", state.growth)
 
 
 def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
@@ -242,12 +220,16 @@ def _recording(state: State, gates: Path) -> AbstractContextManager[None]:
     return recorded(gates, state.frame, place)
 
 
-def _commit(state: State, feature_map: FeatureMap) -> None:
-    state.database.commit_maps([feature_map])
-    state.frame = state.frame or feature_map.frame
-    to_first = state.frame.enu_from(feature_map.frame)
-    for image in feature_map.images:
-        state.centers.setdefault(image.name, to_first.act(image.cam_from_local.center))
+def _find_centers(state: State) -> None:
+    """Where the active maps have the photos, in the frame of the first map."""
+    snapshot = state.database.snapshot()
+    for summary in snapshot.maps():
+        if summary.status == "active":
+            feature_map = snapshot.load_map(summary.map_id)
+            state.frame = state.frame or feature_map.frame
+            to_first = state.frame.enu_from(feature_map.frame)
+            for image in feature_map.images:
+                state.centers[image.name] = to_first.act(image.cam_from_local.center)
     state.waiting = [r for r in state.waiting if state.photos[r].name not in state.centers]
 
 
@@ -262,25 +244,25 @@ def _adjust(state: State) -> None:
     for report in found.adjustment.reports:
         moved = f"moved {report.move_m:.2f} m, bent {report.shape_m:.2f} m"
         print(f"    {report.map_id}: {moved}, {report.kept:.1%} of its observations fit")
-    assert state.frame is not None
-    snapshot = state.database.snapshot()
-    for map_id in ids:
-        feature_map = snapshot.load_map(map_id)
-        to_first = state.frame.enu_from(feature_map.frame)
-        for image in feature_map.images:
-            state.centers[image.name] = to_first.act(image.cam_from_local.center)
+    _find_centers(state)
 
 
 def _reconstruct(
     photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
 ) -> list[Component]:
     """Reconstructions of the photos of the given rows, largest first."""
-    chosen = [photos[r] for r in rows]
-    job = Workspace(root=work, job_id=digest(making.fingerprint, *(p.sha256 for p in chosen))[:24])
     identity: Callable[[int], MapIdentity] = lambda number: _identity([*rows, number])  # noqa: E731
-    made = reconstruct_photos(chosen, job, making, InProcessExecutor())
+    made = _reconstructed(photos, rows, making, work)
     done = list(place_models(made, making, identity=identity))
     return sorted(done, key=lambda c: -len(c.photos))
+
+
+def _reconstructed(
+    photos: Sequence[Photo], rows: Sequence[int], making: MapMakingOptions, work: Path
+) -> Reconstructed:
+    chosen = [photos[r] for r in rows]
+    job = Workspace(root=work, job_id=digest(making.fingerprint, *(p.sha256 for p in chosen))[:24])
+    return reconstruct_photos(chosen, job, making, InProcessExecutor())
 
 
 def _identity(rows: Sequence[int]) -> MapIdentity:
@@ -288,13 +270,11 @@ def _identity(rows: Sequence[int]) -> MapIdentity:
     return MapIdentity(map_id=name, name=name, source="photos", licence="", provenance={})
 
 
-def _summary(new: GrownMap) -> str:
-    growth = new.feature_map.placement.evidence["growth"]
+def _summary(state: State, map_id: str) -> str:
+    feature_map = state.database.snapshot().load_map(map_id)
+    growth = feature_map.placement.evidence["growth"]
     figures = ", ".join(f"{name} {gate['figure']:.3g}" for name, gate in growth["gates"].items())
-    return (
-        f"{len(new.feature_map.images)} photos by {len(new.feature_map.parents)} maps, drift "
-        f"{growth['drift_m']:.2f} m; {figures}"
-    )
+    return f"by {len(feature_map.parents)} maps, drift {growth['drift_m']:.2f} m; {figures}"
 
 
 def _judge(state: State, joint: Component, args: argparse.Namespace, joint_s: float, grown_s: float) -> int:

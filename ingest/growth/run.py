@@ -7,7 +7,7 @@ Every step is a commit of its own and can be repeated: a run that was killed is 
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,9 +23,9 @@ from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import ReplaceOptions, replace_descendants
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.not_found import NotFound, NotFoundRows
-from ingest.growth.place.component import AT_SEVERAL_PLACES, grow_component, split
-from ingest.growth.place.grow_photos import GrowPhotosOptions, grow_photos
-from ingest.growth.place.localised import LocaliseEachOptions, localise_photos
+from ingest.growth.place.component import AT_SEVERAL_PLACES, GrowOptions, grow_component, split
+from ingest.growth.place.groups import GroupOptions, lone_groups
+from ingest.growth.place.localised import LocaliseEachOptions, localise_photos, with_shared_lenses
 from ingest.growth.run_record import (
     GrowthPhotos,
     Run,
@@ -40,6 +40,7 @@ from ingest.growth.trust.scan_check import ScanCheckOptions, scan_gate, with_gat
 from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
+from ingest.photos.cameras import shared_key
 from reloc.localise.candidates import IndexedArea
 from reloc.localiser import Localiser
 
@@ -60,14 +61,15 @@ class GrowthOptions:
             less than the first of these of their points, its parts at the second, and so on. 194 photos
             of a simulated town that look-alikes had joined from five places fell apart at 0.10 into parts
             of one place each, but for ten photos; at 0.25 (`RefinementOptions.min_link`) right ones do, too.
-        localise, grow, scan, promotion, replacing: of the steps.
+        localise, grow, groups, scan, promotion, replacing: of the steps.
     """
 
     drift_budget_m: float = 0.5
     max_rounds: int = 10
     split_links: tuple[float, ...] = (0.10, 0.15, 0.25)
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
-    grow: GrowPhotosOptions = field(default_factory=GrowPhotosOptions)
+    grow: GrowOptions = field(default_factory=GrowOptions)
+    groups: GroupOptions = field(default_factory=GroupOptions)
     scan: ScanCheckOptions = field(default_factory=ScanCheckOptions)
     promotion: PromotionOptions = field(default_factory=PromotionOptions)
     replacing: ReplaceOptions = field(default_factory=ReplaceOptions)
@@ -83,9 +85,8 @@ class GrowthOptions:
 
     def with_budget(self) -> "GrowthOptions":
         """The same where no photo of a map may be further off than the budget either."""
-        growing = self.grow.grow
-        refinement = replace(growing.refinement, max_photo_bound_m=self.drift_budget_m)
-        return replace(self, grow=replace(self.grow, grow=replace(growing, refinement=refinement)))
+        refinement = replace(self.grow.refinement, max_photo_bound_m=self.drift_budget_m)
+        return replace(self, grow=replace(self.grow, refinement=refinement))
 
 
 def extractor_for(snapshot: Snapshot, options: ExtractorOptions) -> ExtractorOptions:
@@ -150,14 +151,16 @@ def _round(
             continue
         _try_model(database, part, new, localised, localiser.areas, run, options)
     left = {row: photo for row, photo in localised.items() if row not in run.map_of}
-    grown = grow_photos(
-        [], new.photos, new.features_of, left, localiser.areas, _identity_of(new), options.grow
-    )
-    for found in grown.maps:
-        _take(database, found, new, run, options)
-    for refused in grown.refused:
-        note_refusal(refused, new, run)
-    run.why.update({row: split_reason(reason) for row, reason in grown.waiting.items()})
+    keys = {row: shared_key(new.photos[row], "shared") for row in left}
+    lone = with_shared_lenses(left, keys, options.grow.localise)
+    groups, waiting = lone_groups(lone, new.features_of, options.groups)
+    for group in groups:
+        outcome = _grown(group, new, lone, localiser.areas, options)
+        if isinstance(outcome, Refused):
+            note_refusal(outcome, new, run)
+        else:
+            _take(database, outcome, new, run, options)
+    run.why.update({row: split_reason(reason) for row, reason in waiting.items()})
     return localised
 
 
@@ -168,7 +171,7 @@ def _place_unplaced(
     steps = PlaceUnplacedOptions(
         drift_budget_m=options.drift_budget_m,
         localise=options.localise,
-        grow=options.grow.grow,
+        grow=options.grow,
         scan=options.scan,
         confirmation=options.promotion.confirmation,
     )
@@ -234,9 +237,7 @@ def _try_model(
     for _ in range(3):  # the part that is left may lie otherwise, and be cut again
         assert part is not None
         rows = tuple(int(r) for r in part.rows)
-        outcome = grow_component(
-            part, new.photos, new.features_of, localised, areas, _identity_of(new)(rows), options.grow.grow
-        )
+        outcome = _grown(part, new, localised, areas, options)
         if isinstance(outcome, Refused):
             pieces = split(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
             if pieces is None:
@@ -342,19 +343,21 @@ def _promote(
     return any(outcome.promoted for outcome in outcomes)
 
 
-def _identity_of(new: GrowthPhotos) -> Callable[[tuple[int, ...]], MapIdentity]:
-    """The map of some photos is named by them: the same photos give the same map."""
-
-    def identity(rows: tuple[int, ...]) -> MapIdentity:
-        photos = [new.photos[r] for r in rows]
-        key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
-        licences = sorted({p.licence for p in photos if p.licence})
-        return MapIdentity(
-            map_id=f"g{key}",
-            name=f"grown {key[:6]}",
-            source="growth",
-            licence=", ".join(licences),
-            provenance={"version": _VERSION, "photos": len(photos)},
-        )
-
-    return identity
+def _grown(
+    model: Model,
+    new: GrowthPhotos,
+    localised: Mapping[int, LocalisedPhoto],
+    areas: Sequence[IndexedArea],
+    options: GrowthOptions,
+) -> GrownMap | Refused:
+    """The map of a reconstruction; it is named by its photos: the same photos give the same map."""
+    photos = [new.photos[int(r)] for r in model.rows]
+    key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
+    identity = MapIdentity(
+        map_id=f"g{key}",
+        name=f"grown {key[:6]}",
+        source="growth",
+        licence=", ".join(sorted({p.licence for p in photos if p.licence})),
+        provenance={"version": _VERSION, "photos": len(photos)},
+    )
+    return grow_component(model, new.photos, new.features_of, localised, areas, identity, options.grow)

@@ -12,10 +12,8 @@ from featuredb.maps.move import move_map
 from ingest.colmap.anchored import with_observations
 from ingest.colmap.bridge import Model
 from ingest.growth.place.component import grow_component
-from ingest.growth.place.grow_photos import grow_photos
-from ingest.growth.place.localised import (
-    localise_photos,
-)
+from ingest.growth.place.groups import lone_groups
+from ingest.growth.place.localised import localise_photos
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from reloc.localise.candidates import IndexedArea
 from tests.support.growth_box import (
@@ -317,9 +315,10 @@ def test_two_maps_that_differ_say_so(new: NewPhotos) -> None:
 def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> None:
     """No reconstruction at all: localised photos whose matches fit their poses become a map."""
     found, _ = localise_photos(new.photos, range(3), new.features_of, [area])
-    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity(f"g{rows[0]}"))
-    assert not grown.waiting
-    (made,) = grown.maps
+    (group,), waiting = lone_groups(found, new.features_of)
+    assert not waiting
+    made = grow_component(group, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(made, GrownMap), made
     assert sorted(made.model.rows.tolist()) == [0, 1, 2]
     assert centers_error(made, new).max() < 0.1
     assert np.quantile(made.feature_map.points_local(FRAME)[:, 0], 0.9) > 25.0
@@ -327,9 +326,9 @@ def test_lone_photos_vouch_for_each_other(new: NewPhotos, area: IndexedArea) -> 
 
 def test_a_lone_photo_waits(new: NewPhotos, area: IndexedArea) -> None:
     found, _ = localise_photos(new.photos, [0], new.features_of, [area])
-    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
-    assert not grown.maps
-    assert grown.waiting[0].startswith("ALONE")
+    groups, waiting = lone_groups(found, new.features_of)
+    assert not groups
+    assert waiting[0].startswith("ALONE")
 
 
 def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, area: IndexedArea) -> None:
@@ -340,29 +339,7 @@ def test_lone_photos_whose_matches_contradict_their_poses_wait(new: NewPhotos, a
         cam_from_local=away.act_on_pose(found[1].cam_from_local),
         points=away.act(found[1].points),
     )
-    grown = grow_photos([], new.photos, new.features_of, found, [area], lambda rows: identity())
-    assert not grown.maps
-    assert [r.reason for r in grown.refused] == ["TOO_FEW_AGREE"]
-
-
-@pytest.mark.parametrize(("bystanders", "enough"), [(1, False), (2, True)])
-def test_photos_of_existing_maps_vouch_for_a_lone_one(
-    area: IndexedArea, bystanders: int, enough: bool
-) -> None:
-    """The last photo of a walk has no new neighbour; photos of the old map see what it sees."""
-    old = [ring(10)[7], ring(10)[8]]
-    both = take_photos(np.random.default_rng(21), POINTS, DESCRIPTORS, [*walk(1), *old], camera_key=KEY)
-    found, _ = localise_photos(both.photos, range(3), both.features_of, [area])
-    assert len(found) == 3
-    known = {r: found[r] for r in range(1, 1 + bystanders)}
-    grown = grow_photos(
-        [], both.photos, both.features_of, {0: found[0]}, [area], lambda rows: identity(), known=known
-    )
-    if not enough:
-        assert not grown.maps
-        assert "2 are needed" in grown.waiting[0]
-        return
-    assert not grown.waiting
-    (made,) = grown.maps
-    assert sorted(made.model.rows.tolist()) == [0, 1, 2]
-    assert centers_error(made, both).max() < 0.1
+    (group,), _ = lone_groups(found, new.features_of)
+    refused = grow_component(group, new.photos, new.features_of, found, [area], identity())
+    assert isinstance(refused, Refused)
+    assert refused.reason == "TOO_FEW_AGREE"

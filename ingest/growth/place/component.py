@@ -58,7 +58,6 @@ def grow_component(
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
     options: GrowOptions | None = None,
-    needed: Sequence[int] = (),
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
@@ -69,16 +68,13 @@ def grow_component(
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
         identity: of the new map.
-        needed: rows of photos without which there is nothing to add.
 
     Returns:
         The map, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this reconstruction
         and not the others of the run, nor the next run.
     """
     try:
-        return _grown(
-            model, photos, features_of, localised, areas, identity, options or GrowOptions(), needed
-        )
+        return _grown(model, photos, features_of, localised, areas, identity, options or GrowOptions())
     except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
         rows = tuple(int(r) for r in model.rows)
         _LOG.exception("a reconstruction of %d photos (%s ...)", len(rows), photos[rows[0]].name)
@@ -94,7 +90,6 @@ def _grown(
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
     options: GrowOptions,
-    needed: Sequence[int],
 ) -> GrownMap | Refused:
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
@@ -117,9 +112,6 @@ def _grown(
     )
     if isinstance(refined, Refused):
         return refined
-    if needed and not set(needed) & set(refined.model.rows.tolist()):
-        reason, message = refined.left_out[needed[0]]
-        return Refused(reason=reason, message=message, rows=rows, gates=refined.placement.gates)
     final, more = refined.placement, refined.evidence()
     grown = assemble(refined.model, final, held, photos, features_of, near, identity, options, more)
     if isinstance(grown, Refused):

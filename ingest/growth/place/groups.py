@@ -44,7 +44,6 @@ class GroupOptions:
         min_fitting: share of a pair's verified matches that must fit the poses.
         min_angle_deg: median angle between the rays. Below, any two photos from one spot fit, and two copies
             of one picture.
-        min_known: photos of existing maps that a new photo without another new one needs.
     """
 
     partners: int = 6
@@ -53,7 +52,6 @@ class GroupOptions:
     tolerance_px: float = 8.0
     min_fitting: float = 0.7
     min_angle_deg: float = 1.0
-    min_known: int = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,33 +79,17 @@ class PairCheck:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Group:
-    """Photos that vouch for each other.
-
-    Attributes:
-        model: of their matches alone, with the lenses of the localisations; near their poses.
-        new: rows that are new; the other rows of the model are photos of existing maps.
-        checks: of the pairs that agree.
-    """
-
-    model: Model
-    new: tuple[int, ...]
-    checks: tuple[PairCheck, ...]
-
-
 def lone_groups(
-    localised: Mapping[int, LocalisedPhoto],
-    new: Sequence[int],
-    features_of: FeaturesOf,
-    options: GroupOptions | None = None,
-) -> tuple[list[Group], dict[int, str]]:
-    """Groups among localised photos, and for the new photos in none the reason.
+    localised: Mapping[int, LocalisedPhoto], features_of: FeaturesOf, options: GroupOptions | None = None
+) -> tuple[list[Model], dict[int, str]]:
+    """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
     Args:
-        localised: lone new photos and, if there are any, photos of existing maps that were localised
-            again, by row.
-        new: which of them are new.
+        localised: the lone photos by row, those of one camera with one lens.
+
+    Returns:
+        A model of each group, of its matches alone, with the lenses of the localisations and near their
+        poses; its rows are those of the photos.
     """
     options = options or GroupOptions()
     if not localised:
@@ -115,37 +97,23 @@ def lone_groups(
     frame = next(iter(localised.values())).frame
     photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
     geometries: dict[tuple[int, int], TwoView] = {}
-    checks: list[PairCheck] = []
-    for pair in candidate_pairs(photos, set(new), options):
+    for pair in candidate_pairs(photos, options):
         view = _verified(photos, pair, features_of, options)
-        check = check_pair(photos[pair[0]], photos[pair[1]], view, features_of, options)
-        if check.agrees(options):
+        if check_pair(photos[pair[0]], photos[pair[1]], view, features_of, options).agrees(options):
             geometries[pair] = view
-            checks.append(check)
-    reasons = dict.fromkeys(new, "ALONE: no other photo bears its pose out")
-    groups: list[Group] = []
-    for rows in _connected(sorted(photos), [c.pair for c in checks]):
-        fresh = tuple(r for r in rows if r in set(new))
-        if not fresh or len(rows) < 2:
-            continue
-        if len(fresh) == 1 and len(rows) - 1 < options.min_known:
-            reasons[fresh[0]] = (
-                f"ALONE: {len(rows) - 1} photos of existing maps bear its pose out, "
-                f"{options.min_known} are needed"
-            )
-            continue
-        own = tuple(c for c in checks if c.pair[0] in rows)
-        model = _triangulated(rows, photos, {c.pair: geometries[c.pair] for c in own}, features_of)
-        groups.append(Group(model=model, new=fresh, checks=own))
-        for r in fresh:
-            reasons.pop(r)
+    reasons = dict.fromkeys(photos, "ALONE: no other photo bears its pose out")
+    groups: list[Model] = []
+    for rows in _connected(sorted(photos), list(geometries)):
+        if len(rows) >= 2:
+            own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
+            groups.append(_triangulated(rows, photos, own, features_of))
+            for r in rows:
+                reasons.pop(r)
     return groups, reasons
 
 
-def candidate_pairs(
-    photos: Mapping[int, LocalisedPhoto], new: set[int], options: GroupOptions
-) -> list[tuple[int, int]]:
-    """Pairs with a new photo that share existing points or look at the same place, most shared first."""
+def candidate_pairs(photos: Mapping[int, LocalisedPhoto], options: GroupOptions) -> list[tuple[int, int]]:
+    """Pairs that share existing points or look at the same place, most shared first."""
     seen = {
         r: {(p.map_ids[m], q) for m, q in zip(p.map_of.tolist(), p.point_of.tolist(), strict=True)}
         for r, p in photos.items()
@@ -156,7 +124,7 @@ def candidate_pairs(
         for r, p in photos.items()
     }
     pairs: set[tuple[int, int]] = set()
-    for r in sorted(new):
+    for r in photos:
         scores = []
         for other in photos:
             if other == r:
