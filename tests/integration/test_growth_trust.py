@@ -23,7 +23,16 @@ from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from tests.support.scene_strip import DESCRIPTORS, FRAME, POINTS, east, error_m, strip_map
-from tests.support.scenes import CAMERA, looking_at, pixels_inside, query_features
+from tests.support.scenes import (
+    CAMERA,
+    box_points,
+    looking_at,
+    pixels_inside,
+    query_features,
+    random_descriptors,
+    ring,
+    scene_map,
+)
 
 _BUDGET_M = 0.5
 
@@ -154,6 +163,29 @@ def test_own_canaries_are_right_while_nothing_is_wrong(tmp_path: Path, more: str
     assert all(check.before == "right" and check.after == "right" for check in run.checks)
     assert run.regressions == ()
     assert "no known queries" in run.note
+
+
+def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: Path) -> None:
+    """A map of few points in one corner of its photos; a new one has the whole of what they look at."""
+    rng = np.random.default_rng(5)
+    corner, everything = box_points(rng, 120), box_points(rng, 1500)
+    corner[:, :2] = np.abs(corner[:, :2])
+    anchor, more = (
+        scene_map(
+            points=points,
+            descriptors=random_descriptors(rng, len(points)),
+            poses=ring(6),
+            map_id=map_id,
+            fingerprint=_ANCHOR.extractor_fingerprint,
+        )
+        for map_id, points in (("A", corner), ("m", everything))
+    )
+    database = _database(tmp_path, anchor, replace(more, status="quarantined"))
+    before = Localiser.open(database)
+    after = Localiser.open(database, previous=before, also=["m"])
+    run = run_canaries(database, before, after, [more])
+    assert [check.before for check in run.checks] == ["right"] * 6
+    assert run.regressions == ()
 
 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:

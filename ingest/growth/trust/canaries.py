@@ -25,12 +25,17 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
 from ingest.growth.map_images import features_of_image
+from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.result import LocalisedPose, LocaliseRequest, LocaliseResult
 from reloc.localiser import Localiser
 from reloc.service.handler import localise_request
 from reloc.wire.query import LocaliseWireRequest
+
+# What a map keeps of its images shows its own points alone: that an image does not show what a new map adds
+# around them says nothing against either.
+_OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
@@ -271,7 +276,7 @@ def _ask(
 ) -> LocaliseResult:
     areas = [a for a in localiser.areas_of(map_ids) if a.area.extractor_fingerprint == features.fingerprint]
     upright = "-upright-" in features.fingerprint
-    options = LocaliseOptions(extractor=ExtractorOptions(upright=upright))
+    options = LocaliseOptions(extractor=ExtractorOptions(upright=upright), acceptance=_OWN_FEATURES)
     return localise_features(features, request, areas, options).result
 
 
