@@ -181,7 +181,8 @@ class Problem:
             if prior is not None and found.lens_start[c] >= 0:
                 off = np.array(self._lenses[c]) - np.array(prior.mean.params)
                 information = np.linalg.inv(prior.covariance)
-                weight = 1.0 / (1.0 + float(off @ information @ off) / _LETS_GO**2)  # of the Cauchy loss
+                squares = float(off @ information @ off)
+                weight = 1.0 / (1.0 + squares / _LETS_GO**2) if prior.robust else 1.0  # of the Cauchy loss
                 part += found.by_lens_prior(c, np.asarray(weight**2 * information))
         return part
 
@@ -243,7 +244,9 @@ class Problem:
         for params, prior in zip(self._lenses, priors, strict=True):
             if prior is not None and self._has(params):
                 cost = pyceres.factors.NormalPrior(np.array(prior.mean.params), unit * prior.covariance)
-                self._diluted.append(self._ceres.add_residual_block(cost, loss, [params]))
+                self._diluted.append(
+                    self._ceres.add_residual_block(cost, loss if prior.robust else None, [params])
+                )
 
     def _add_points(self, priors: PointPriors) -> None:
         unit = 1.0 / self._terms.keypoint_px**2

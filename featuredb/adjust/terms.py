@@ -35,10 +35,12 @@ class LensPrior:
     Attributes:
         mean: expected intrinsics, of the block's model and size.
         covariance: (p, p) of its parameters.
+        robust: what was said of the lens may be wrong altogether, as EXIF of a cropped photo is.
     """
 
     mean: Camera
     covariance: FloatArray
+    robust: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,8 +122,8 @@ class Targets:
 class Terms:
     """All that an adjustment is made of beside the block.
 
-    Everything but targets counts with a Cauchy loss on its whitened residual, of one sigma, for lenses of
-    two.
+    Everything but targets and lenses that are known for certain counts with a Cauchy loss on its whitened
+    residual, of one sigma, for lenses of two.
 
     Attributes:
         keypoint_px: standard deviation of a keypoint's coordinate.
@@ -143,7 +145,7 @@ class Terms:
     held_photos: tuple[int, ...] = field(default=())
 
 
-def lens_prior(mean: Camera, widths: LensWidths) -> LensPrior:
+def lens_prior(mean: Camera, widths: LensWidths, *, robust: bool = True) -> LensPrior:
     """The prior of a lens of any model."""
     template = mean.to_pycolmap()
     names = [name.strip() for name in template.params_info.split(",")]
@@ -160,7 +162,7 @@ def lens_prior(mean: Camera, widths: LensWidths) -> LensPrior:
     if len(focal) == 1:
         covariance[focal[0], focal[0]] = 0.0
     covariance[np.ix_(focal, focal)] += (widths.focal_rel * mean.focal_px) ** 2
-    return LensPrior(mean=mean, covariance=covariance)
+    return LensPrior(mean=mean, covariance=covariance, robust=robust)
 
 
 def surface_priors(xyz: FloatArray, offset: FloatArray, normals: FloatArray, sigma_m: float) -> PointPriors:

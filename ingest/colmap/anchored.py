@@ -36,8 +36,9 @@ class AnchoredOptions:
         error_reference_side_px: keypoints are located on images of about this size.
         rounds: of adjusting and dropping.
         lent: of a lens that a map lends, against that map's points. They were made with that very lens: what
-            it trades for height, they trade alike. Of the coefficients of a lens that is not whole no more is
-            known than of any lens.
+            it trades for height, they trade alike. Photos were localised with it, so it is no mistake that
+            photos could find out, and its prior never lets go. Of the coefficients of a lens that is not
+            whole no more is known than of any lens.
         mapping: what is known of other lenses, what observations count against it, and the solver, all as
             where reconstructions are made.
     """
@@ -48,7 +49,7 @@ class AnchoredOptions:
     rounds: int = 3
     lent: LensWidths = field(
         default_factory=lambda: LensWidths(
-            focal_rel=0.001, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005
+            focal_rel=0.003, aspect_rel=0.0005, center_rel=0.001, radial=0.0005, tangential=0.0005
         )
     )
     mapping: AdjustOptions = field(default_factory=AdjustOptions)
@@ -83,7 +84,7 @@ class Lenses:
                 if lens != self.lent[c]:  # the map did not ask for the other coefficients
                     any_lens = options.mapping.lens
                     widths = replace(widths, radial=any_lens.radial, tangential=any_lens.tangential)
-                return lens_prior(lens, widths)
+                return lens_prior(lens, widths, robust=False)
             return lens_prior_of(whole_camera(camera), self.focal_px.get(c), options.mapping)
 
         return tuple(prior(c, camera) for c, camera in enumerate(cameras))

@@ -127,6 +127,21 @@ def test_no_direction_lowers_the_cost_of_what_is_found() -> None:
         assert _cost(other, terms) >= least
 
 
+@pytest.mark.parametrize(("robust", "focal_px"), [(True, 1008.3), (False, 995.0)])
+def test_a_prior_lets_go_unless_the_lens_is_known_for_certain(robust: bool, focal_px: float) -> None:
+    """Known points say 1010 px; 990 px within 1 px were told, which a robust prior takes for a mistake."""
+    block = _block(noise_px=0.5)
+    told = replace(TRUE, params=(990.0, 989.5, *TRUE.params[2:]))
+    terms = Terms(
+        keypoint_px=0.5,
+        lenses=(lens_prior(told, replace(WIDTHS, focal_rel=1e-3), robust=robust),),
+        marks=Marks(xyz=block.xyz[block.point_of], photo_of=block.photo_of, xy=block.xy, sigma_px=0.5),
+    )
+    problem = Problem(block, terms)
+    problem.solve(100, 1e-12)
+    assert problem.block().cameras[0].focal_px == pytest.approx(focal_px, abs=1.0)
+
+
 def test_the_whole_lens_is_found_through_a_plain_prior() -> None:
     block = _block(points=200, noise_px=0.2)
     terms = _terms(block, replace(TRUE, params=(1000.0, 1000.0, 600.0, 450.0, 0.0, 0.0, 0.0, 0.0)), 0.2)
