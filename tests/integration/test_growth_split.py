@@ -15,7 +15,7 @@ from featuredb.store import Database
 from ingest.colmap.bridge import Model
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.place.component import AT_SEVERAL_PLACES
-from ingest.growth.run import GrowthOptions, grow
+from ingest.growth.run import grow
 from ingest.growth.run_record import GrowthPhotos
 from ingest.growth.values import Refused
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, existing, prior, walk
@@ -69,7 +69,7 @@ def _groups(south: int, north: int, *, tagged: bool = False) -> tuple[NewPhotos,
     )  # fmt: skip
 
 
-def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOptions) -> GrowthReport:
+def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path) -> GrowthReport:
     south, north = groups
     photos = [
         *(replace(p, owner="anna") for p in south.photos),
@@ -83,22 +83,15 @@ def _grown(groups: tuple[NewPhotos, NewPhotos], folder: Path, options: GrowthOpt
     database.commit_map(existing())
     model = _joined(south.model, north.model)
     new = GrowthPhotos(photos=photos, features_of=features.__getitem__, models=lambda: [model])
-    return grow(database, new, folder / "work", options)
+    return grow(database, new, folder / "work")
 
 
-@pytest.mark.parametrize("links", [GrowthOptions().split_links, ()], ids=["split", "whole"])
-def test_both_places_become_maps(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, links: tuple[float, ...]
-) -> None:
-    """As a whole it is refused; then the photos that are localised by themselves form a group."""
+def test_both_places_become_maps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As a whole it is refused."""
     with caplog.at_level(logging.INFO, "ingest.growth"):
-        report = _grown(_groups(5, 5), tmp_path, replace(GrowthOptions(), split_links=links))
+        report = _grown(_groups(5, 5), tmp_path)
     names = [set(m.photos) for m in report.maps if m.map_id]
     apart = [r.message for r in caplog.records if "at several places" in r.message]
-    if not links:
-        assert not apart
-        assert [len(photos) for photos in names] == [10]
-        return
     assert len(apart) == 1
     assert apart[0].startswith("10 photos are at several places: ")
     assert apart[0].endswith("apart at links of 0.1")
@@ -123,13 +116,13 @@ def test_geotags_that_contradict_are_not_cut_away(
 
     monkeypatch.setattr(grow_module, "grow_component", noted)
     with caplog.at_level(logging.INFO, "ingest.growth"):
-        report = _grown(_groups(7, 3, tagged=True), tmp_path, GrowthOptions())
-    assert reasons == ["CONTRADICTS_GPS"]
+        report = _grown(_groups(7, 3, tagged=True), tmp_path)
+    assert reasons == ["CONTRADICTS_GPS", None]  # the group of the lone photos
     assert not [r for r in caplog.records if "at several places" in r.message]
     assert [len(m.photos) for m in report.maps if m.map_id] == [10]
 
 
-@pytest.mark.parametrize("reason", [*AT_SEVERAL_PLACES, "CONTRADICTS_GPS", "TOO_FEW_AGREE"])
+@pytest.mark.parametrize("reason", [AT_SEVERAL_PLACES[0], "CONTRADICTS_GPS"])
 def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
@@ -142,7 +135,8 @@ def test_what_is_refused_as_a_whole_is_tried_in_parts_if_places_may_be_mixed(
         return Refused(reason=reason, message="as told", rows=rows) if len(asked) == 1 else real(model, *args)
 
     monkeypatch.setattr(grow_module, "grow_component", refused_first)
-    report = _grown(_groups(5, 5), tmp_path, GrowthOptions())
-    assert asked == ([10, 5, 5] if reason in AT_SEVERAL_PLACES else [10])
+    report = _grown(_groups(5, 5), tmp_path)
+    # What is not split is in a group of lone photos afterwards.
+    assert asked == ([10, 5, 5] if reason in AT_SEVERAL_PLACES else [10, 10])
     maps = [len(m.photos) for m in report.maps if m.map_id]
-    assert maps == ([5, 5] if reason in AT_SEVERAL_PLACES else [10])  # lone photos form a group
+    assert maps == ([5, 5] if reason in AT_SEVERAL_PLACES else [10])
