@@ -162,15 +162,11 @@ class Authority:
 
 def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port: int) -> _Config:
     reached = [f"tls/{f'[{host}]' if ':' in host else host}:{port}" for host in hosts or (_LOCALHOST,)]
-    tls = {
-        "listen_certificate_base64": _base64(server.certificate),
-        "listen_private_key_base64": _base64(server.key),
-    }
     config = {
         # Not a peer: that would leave questions about liveliness to any client that calls itself a router.
         "mode": "router",
         "listen": {"endpoints": [f"tls/[::]:{port}"] if hosts else reached},
-        **_common(authority, tls),
+        **_common(authority, {"listen": server, "connect": server}),
         "metadata": {_ENDPOINTS: reached},
         "access_control": access_control(_SERVER, ()),
     }
@@ -179,25 +175,27 @@ def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port:
 
 
 def _client(name: str, authority: Identity, client: Identity, endpoints: list[str]) -> _Config:
-    tls = {
-        "verify_name_on_connect": True,
-        "connect_certificate_base64": _base64(client.certificate),
-        "connect_private_key_base64": _base64(client.key),
-    }
     return {
         "mode": "client",
         "connect": {"endpoints": endpoints, "timeout_ms": _CONNECT_TIMEOUT_MS},
-        **_common(authority, tls),
+        **_common(authority, {"connect": client}),
         "metadata": {CLIENT_SETTING: name},
     }
 
 
-def _common(authority: Identity, tls: _Config) -> _Config:
-    """What both have: nobody is looked for, and who connects shows a certificate of the authority."""
-    mutual = {"enable_mtls": True, "root_ca_certificate_base64": _base64(authority.certificate)}
+def _common(authority: Identity, shown: dict[str, Identity]) -> _Config:
+    """What both have: nobody is looked for, and both sides of a connection show a certificate."""
+    tls: _Config = {
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "root_ca_certificate_base64": _base64(authority.certificate),
+    }
+    for side, identity in shown.items():
+        tls[f"{side}_certificate_base64"] = _base64(identity.certificate)
+        tls[f"{side}_private_key_base64"] = _base64(identity.key)
     return {
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"shared_memory": {"enabled": False}, "link": {"tls": {**mutual, **tls}}},
+        "transport": {"shared_memory": {"enabled": False}, "link": {"tls": tls}},
     }
 
 

@@ -1,6 +1,5 @@
 """`featuredb keys`: the folder of an authority."""
 
-import json
 import stat
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import pytest
 from cryptography import x509
 
 from featuredb.cli.main import main
+from tests.support.strangers import config_of
 
 
 @pytest.fixture
@@ -18,12 +18,6 @@ def folder(tmp_path: Path) -> Path:
     )
     assert main(["keys", "client", str(tmp_path / "keys"), "phone"]) == 0
     return tmp_path / "keys"
-
-
-def config_of(path: Path) -> dict[str, dict[str, object]]:
-    lines = path.read_text().splitlines()
-    found: dict[str, dict[str, object]] = json.loads("\n".join(x for x in lines if not x.startswith("//")))
-    return found
 
 
 def subjects(folder: Path) -> list[str]:

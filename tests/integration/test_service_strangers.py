@@ -21,7 +21,7 @@ from reloc.wire.query import encode
 from reloc.wire.track import LiveStatus, TrackEvent, TrackFrame
 from tests.support.live import LENS, SOON_S, jpeg, wait_until
 from tests.support.service import photo
-from tests.support.strangers import Wire, free_port, guarded_wire, keys, open_wire, restarted
+from tests.support.strangers import Wire, config_of, free_port, guarded_wire, keys, open_wire, restarted
 
 _ROOT = "featuredb/town"
 _VICTIM, _ATTACKER = "alice", "mallory"
@@ -218,7 +218,7 @@ def test_who_has_no_certificate_of_the_authority_stays_outside(
         for part in ("certificate", "private_key"):
             config.insert_json5(f"transport/link/tls/connect_{part}_base64", "null")
         config.insert_json5("transport/link/tls/enable_mtls", "false")
-    config.insert_json5("connect/endpoints", json.dumps(listening(guarded)))
+    config.insert_json5("connect/endpoints", json.dumps(listening(guarded.keys)))
     config.insert_json5("connect/timeout_ms", "500")
     if who == "a client":
         zenoh.open(config).close()
@@ -227,24 +227,14 @@ def test_who_has_no_certificate_of_the_authority_stays_outside(
             zenoh.open(config)
 
 
-def listening(wire: Wire) -> list[str]:
-    assert wire.keys is not None
-    config = zenoh.Config.from_file(str(wire.keys / "server.json5"))
-    endpoints: list[str] = json.loads(config.get_json("listen/endpoints"))
-    return endpoints
-
-
 @pytest.mark.parametrize("certificate", ["clients/mallory.json5", "server.json5"])
 def test_a_client_s_certificate_is_no_server_s(guarded: Wire, certificate: str) -> None:
     assert guarded.keys is not None
-    text = (guarded.keys / certificate).read_text()
-    shown = json.loads("\n".join(line for line in text.splitlines() if not line.startswith("//")))
-    tls = shown["transport"]["link"]["tls"]
-    side = "listen" if certificate == "server.json5" else "connect"
+    tls = config_of(guarded.keys / certificate)["transport"]["link"]["tls"]
     endpoint = f"tls/localhost:{free_port()}"
     false_server = zenoh.Config.from_file(str(guarded.keys / "server.json5"))
     for part in ("certificate", "private_key"):
-        value = json.dumps(tls[f"{side}_{part}_base64"])
+        value = json.dumps(tls[f"connect_{part}_base64"])
         false_server.insert_json5(f"transport/link/tls/listen_{part}_base64", value)
     false_server.insert_json5("listen/endpoints", json.dumps([endpoint]))
     victim = zenoh.Config.from_file(str(guarded.keys / "clients" / f"{_VICTIM}.json5"))
@@ -283,6 +273,26 @@ def live_status(wire: Wire) -> LiveStatus:
     status = wire.server.status().live
     assert status is not None
     return status
+
+
+def test_a_server_answers_the_clients_of_another_one_of_its_authority(guarded: Wire) -> None:
+    assert guarded.keys is not None
+    config = config_of(guarded.keys / "server.json5")
+    config["connect"] = {"endpoints": listening(guarded.keys)}
+    config["listen"]["endpoints"] = [f"tls/localhost:{free_port()}"]
+    (guarded.keys / "second.json5").write_text(json.dumps(config))
+    with (
+        restarted(guarded.keys, "second.json5", "hamlet"),
+        Client(database="hamlet", config_path=guarded.keys / "clients" / f"{_VICTIM}.json5") as client,
+    ):
+        assert client.localise(photo()).status == "localised"
+        with client.track(LENS) as live:
+            exchange(live)
+
+
+def listening(folder: Path) -> list[str]:
+    endpoints: list[str] = config_of(folder / "server.json5")["listen"]["endpoints"]
+    return endpoints
 
 
 def exchange(live: LiveTrack) -> TrackPose:

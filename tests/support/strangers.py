@@ -1,10 +1,12 @@
 """The same wire twice: a server as `featuredb keys` ships it, and one that nothing guards."""
 
+import json
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
@@ -72,15 +74,22 @@ def guarded_wire(folder: Path, *clients: str) -> Iterator[Wire]:
 
 
 @contextmanager
-def restarted(folder: Path) -> Iterator[Wire]:
-    """The server of an authority that is there already."""
-    with _serving(ServeOptions(listen=(), config_path=folder / "server.json5"), folder) as wire:
+def restarted(folder: Path, config: str = "server.json5", database: str = DATABASE) -> Iterator[Wire]:
+    """A server of an authority that is there already."""
+    with _serving(ServeOptions(listen=(), config_path=folder / config), folder, database) as wire:
         yield wire
 
 
 def keys(action: str, folder: Path, *arguments: str) -> None:
     """`featuredb keys`."""
     assert main(["keys", action, str(folder), *arguments]) == 0
+
+
+def config_of(path: Path) -> dict[str, dict[str, Any]]:
+    """A Zenoh configuration that `featuredb keys` has written."""
+    lines = path.read_text().splitlines()
+    found: dict[str, dict[str, Any]] = json.loads("\n".join(x for x in lines if not x.startswith("//")))
+    return found
 
 
 def free_port() -> int:
@@ -90,8 +99,8 @@ def free_port() -> int:
 
 
 @contextmanager
-def _serving(options: ServeOptions, folder: Path | None) -> Iterator[Wire]:
+def _serving(options: ServeOptions, folder: Path | None, database: str = DATABASE) -> Iterator[Wire]:
     given = MemoryInbox()
     source = MemorySource(area_of(localiser()))
-    with Server.start(source, options, DATABASE, Inbox(given)) as server:
+    with Server.start(source, options, database, Inbox(given)) as server:
         yield Wire(server=server, keys=folder, contributions=given)
