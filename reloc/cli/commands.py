@@ -34,7 +34,17 @@ def register(subparsers: Any) -> None:
         metavar="ENDPOINT",
         help=f"Zenoh endpoint, may be repeated; default {_DEFAULT_ENDPOINT} where no --config is given",
     )
-    serve.add_argument("--config", type=Path, metavar="FILE", help="Zenoh configuration (JSON5)")
+    serve.add_argument(
+        "--config",
+        type=Path,
+        metavar="FILE",
+        help="Zenoh configuration (JSON5), such as `featuredb keys` makes",
+    )
+    serve.add_argument(
+        "--insecure",
+        action="store_true",
+        help="start even where machines that nobody has authenticated can reach the server",
+    )
     serve.add_argument("--name", default="", help="database name on the wire; default: the folder's name")
     serve.add_argument("--workers", type=int, default=2, help="queries localised at a time; default 2")
     serve.add_argument("--max-queue", type=int, default=32, help="queries that may wait; default 32")
@@ -141,6 +151,7 @@ def _serve(args: argparse.Namespace) -> int:
     options = ServeOptions(
         listen=listen,
         config_path=args.config,
+        insecure=args.insecure,
         name=args.name,
         workers=args.workers,
         max_queue=args.max_queue,

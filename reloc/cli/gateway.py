@@ -26,6 +26,11 @@ def register(subparsers: Any) -> None:
     )
     gateway.add_argument("--database", metavar="NAME", help="default: the only one that is served")
     gateway.add_argument("--host", default="127.0.0.1", help="address to listen on; default 127.0.0.1")
+    gateway.add_argument(
+        "--insecure",
+        action="store_true",
+        help="listen on an address that other machines reach; the gateway speaks no TLS and checks nobody",
+    )
     gateway.add_argument("--port", type=int, default=8080, help="default 8080; 0 takes a free one")
     gateway.add_argument(
         "--prefix", default="", metavar="/PATH", help="stands before every path, such as /vps"
@@ -57,6 +62,7 @@ def _run(args: argparse.Namespace) -> int:
         config_path=args.config,
         database=args.database,
         host=args.host,
+        insecure=args.insecure,
         port=args.port,
         prefix=args.prefix,
         timeout_s=args.timeout,

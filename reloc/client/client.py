@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 from featuredb.errors import InvalidValueError, ServiceError
 from reloc.client.live import LiveTrack
 from reloc.client.replies import NO_SERVER, TIMEOUT, read_message, service_error
+from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
 from reloc.wire.query import (
     CameraRequest,
     LocaliseReply,
@@ -37,7 +38,8 @@ _ASK_AGAIN_S = 0.05  # while no server is there yet
 class Client:
     """Connection to a relocalisation server; a context manager.
 
-    `database=None` takes the only database that is served at the endpoint.
+    `database=None` takes the only database that is served at the endpoint. `config_path`: a Zenoh
+    configuration instead of `connect`, such as `featuredb keys client` writes.
 
         with Client("tcp/127.0.0.1:7447") as client:
             reply = client.localise("photo.jpg")
@@ -48,6 +50,9 @@ class Client:
 
     Methods raise ServiceError; its `code` is one of reloc.wire.query.ErrorCode, or NO_SERVER (nobody
     answers), TIMEOUT (no answer in time), BAD_REPLY (an answer that is none).
+
+    Attributes:
+        name: of this client on the wire; its configuration says it.
     """
 
     def __init__(
@@ -63,6 +68,7 @@ class Client:
         self._config_path = config_path
         self._connect_timeout_s = connect_timeout_s
         self._open_session: zenoh.Session | None = None
+        self.name = ANONYMOUS
 
     def __enter__(self) -> Self:
         self.open()
@@ -79,9 +85,7 @@ class Client:
         """
         session = self._connected_session()
         try:
-            self._database = _wait_for_database(
-                session, self._database, self._connect, self._connect_timeout_s
-            )
+            self._database = _wait_for_database(session, self._database, self._where, self._connect_timeout_s)
         except ServiceError:
             session.close()
             raise
@@ -152,15 +156,16 @@ class Client:
             )
         except ValidationError as error:
             raise InvalidValueError(f"localise: {error}") from error
-        return self._ask("localise", LocaliseReply, timeout_s, payload=data, attachment=encode(request))
+        key = self._keys.localise(self.name)
+        return self._ask(key, LocaliseReply, timeout_s, payload=data, attachment=encode(request))
 
     def status(self, timeout_s: float = _TIMEOUT_S) -> StatusReply:
         """Counts, latencies, snapshot and limits of the server."""
-        return self._ask("status", StatusReply, timeout_s)
+        return self._ask(self._keys.of("status"), StatusReply, timeout_s)
 
     def maps(self, timeout_s: float = _TIMEOUT_S) -> MapsReply:
         """The maps that the server answers from."""
-        return self._ask("maps", MapsReply, timeout_s)
+        return self._ask(self._keys.of("maps"), MapsReply, timeout_s)
 
     def track(
         self,
@@ -181,13 +186,13 @@ class Client:
             prior: where the first frame may have been taken (degrees, metres).
             timeout_s: the longest wait for the session to open.
         """
-        return LiveTrack(self._session(), f"featuredb/{self._database}", camera, prior, timeout_s)
+        return LiveTrack(self._session(), self._keys, self.name, camera, prior, timeout_s)
 
     @contextmanager
     def watch_events(self) -> Iterator["EventStream"]:
         """Within the block, what the server publishes: maps that come and go, reloads, its end."""
         stream = EventStream()
-        with self._session().declare_subscriber(self._key("events"), stream.receive):
+        with self._session().declare_subscriber(self._keys.of("events"), stream.receive):
             yield stream
 
     def _session(self) -> zenoh.Session:
@@ -197,13 +202,19 @@ class Client:
             )
         return self._open_session
 
-    def _key(self, leaf: str) -> str:
-        return f"featuredb/{self._database}/{leaf}"
+    @property
+    def _where(self) -> str:
+        return str(self._config_path or self._connect)
+
+    @property
+    def _keys(self) -> Keys:
+        return Keys(database=str(self._database))
 
     def _connected_session(self) -> zenoh.Session:
         try:
             if self._config_path is not None:
                 config = zenoh.Config.from_file(str(self._config_path))
+                self.name = _name_in(config)
             else:
                 config = zenoh.Config()
                 config.insert_json5("mode", '"client"')
@@ -213,23 +224,22 @@ class Client:
                 config.insert_json5("transport/shared_memory/enabled", "false")
             return zenoh.open(config)
         except zenoh.ZError as error:
-            where = self._config_path or self._connect
             raise ServiceError(
                 NO_SERVER,
-                f"nobody answers at {where} ({str(error).split(' at /')[0]}); is `featuredb serve` running, "
-                "and is this its --listen endpoint?",
+                f"nobody answers at {self._where} ({str(error).split(' at /')[0]}); is `featuredb serve` "
+                "running, and is this its --listen endpoint?",
             ) from error
 
     def _ask(
         self,
-        leaf: str,
+        key: str,
         model: type[_Message],
         timeout_s: float,
         payload: bytes | None = None,
         attachment: bytes | None = None,
     ) -> _Message:
         replies = self._session().get(
-            self._key(leaf),
+            key,
             payload=payload,
             attachment=attachment,
             timeout=timeout_s,
@@ -245,10 +255,16 @@ class Client:
                 raise service_error(reply.err.payload.to_bytes(), timeout_s)
         waited_s = time.perf_counter() - start
         if waited_s >= 0.9 * timeout_s:
-            raise ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s from {self._key(leaf)}")
+            raise ServiceError(TIMEOUT, f"no answer within {timeout_s:g} s from {key}")
         raise ServiceError(
-            NO_SERVER, f"no server of database {self._database!r} answers any more at {self._connect}"
+            NO_SERVER, f"no server of database {self._database!r} answers any more at {self._where}"
         )
+
+
+def _name_in(config: zenoh.Config) -> str:
+    """What a configuration calls its client."""
+    metadata = json.loads(config.get_json("metadata"))
+    return str(metadata.get(CLIENT_SETTING, ANONYMOUS)) if isinstance(metadata, dict) else ANONYMOUS
 
 
 class EventStream:
@@ -278,7 +294,7 @@ def _wait_for_database(session: zenoh.Session, database: str | None, where: str,
     Asks again and again instead of subscribing: a Zenoh 1.10 session that had a liveliness subscriber and
     gave it up gets incomplete answers to later liveliness queries now and then.
     """
-    pattern = f"featuredb/{database or '*'}/servers/*"
+    pattern = Keys(database=database or "*").server_token("*")
     end = time.perf_counter() + timeout_s
     while True:
         left_s = max(0.1, end - time.perf_counter())
@@ -289,7 +305,10 @@ def _wait_for_database(session: zenoh.Session, database: str | None, where: str,
         time.sleep(_ASK_AGAIN_S)
     if not found:
         named = "" if database is None else f" of database {database!r}"
-        raise ServiceError(NO_SERVER, f"no server{named} answers at {where} within {timeout_s:g} s")
+        raise ServiceError(
+            NO_SERVER,
+            f"no server{named} answers at {where} within {timeout_s:g} s, or none that lets this client in",
+        )
     if len(found) > 1:
         raise ServiceError(NO_SERVER, f"{where} serves {', '.join(sorted(found))}; name the database to ask")
     return found.pop()

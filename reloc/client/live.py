@@ -14,6 +14,7 @@ from zenoh.handlers import Callback
 
 from featuredb.errors import ServiceError
 from reloc.client.replies import BAD_REPLY, NO_SERVER, TIMEOUT, read_message, service_error
+from reloc.wire.keys import Keys
 from reloc.wire.query import CameraRequest, PriorRequest, encode
 from reloc.wire.track import TrackEvent, TrackFrame, TrackOpened, TrackOpenRequest, TrackPose
 
@@ -38,22 +39,23 @@ class LiveTrack:
     def __init__(
         self,
         session: zenoh.Session,
-        key: str,
+        keys: Keys,
+        client: str,
         camera: CameraRequest | None = None,
         prior: PriorRequest | None = None,
         timeout_s: float = 10.0,
     ) -> None:
         """
         Args:
-            key: of the database on the wire.
+            keys: of the database on the wire. client: the name of this client.
             camera: intrinsics of the frames, of any size of the same picture; None: estimated.
             prior: where the first frame may have been taken (degrees, metres).
             timeout_s: the longest wait for the session to open.
         """
         self.name = uuid.uuid4().hex
         self.refusals: deque[TrackEvent] = deque(maxlen=_KEPT_REFUSALS)
-        self._session, self._database_key = session, key
-        self._key = f"{key}/track/{self.name}"
+        self._session, self._keys = session, keys
+        self._key = keys.track(client, self.name)
         self._request = TrackOpenRequest(camera=camera, prior=prior)
         self._timeout_s = timeout_s
         self._opened: TrackOpened | None = None
@@ -193,7 +195,7 @@ class LiveTrack:
 
     def _check_server(self) -> None:
         """End the session when its server is not there any more."""
-        token = f"{self._database_key}/servers/{self.opened.server_id}"
+        token = self._keys.server_token(self.opened.server_id)
         replies = self._session.liveliness().get(token, timeout=_SERVER_ANSWERS_S)
         self._heard = time.monotonic()
         if not any(reply.ok is not None for reply in replies):

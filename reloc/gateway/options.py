@@ -17,6 +17,7 @@ class GatewayOptions:
         connect: Zenoh endpoint of the server. config_path: a Zenoh configuration instead of it.
         database: name on the wire; None takes the only one that is served there.
         host, port: where HTTP is listened to; port 0 takes a free one.
+        insecure: listen also where other machines reach it, without TLS and without knowing who asks.
         prefix: stands before every path, such as "/vps".
         timeout_s: the longest wait for the server's answer to one photo; Zenoh's own default.
         connect_timeout_s: the longest wait for a server to be there; who asks hears soon that none is.
@@ -38,6 +39,7 @@ class GatewayOptions:
     database: str | None = None
     host: str = "127.0.0.1"
     port: int = 8080
+    insecure: bool = False
     prefix: str = ""
     timeout_s: float = 10.0
     connect_timeout_s: float = 2.0

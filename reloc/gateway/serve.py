@@ -11,6 +11,7 @@ from featuredb.errors import FeatureDbError
 from featuredb.stop_signals import on_stop_signals
 from reloc.gateway.app import create_app
 from reloc.gateway.options import GatewayOptions
+from reloc.wire.endpoints import is_loopback
 
 _BACKLOG = 128
 # Connections, idle ones with them; who needs more stands behind a proxy that holds them.
@@ -26,8 +27,14 @@ def listen(options: GatewayOptions) -> socket.socket:
     """A listening socket.
 
     Raises:
-        GatewayStartError: the port is taken, or the host is not this machine's.
+        GatewayStartError: the port is taken, the host is not this machine's, or other machines reach it
+            and `insecure` is not set.
     """
+    if not (options.insecure or is_loopback(options.host)):
+        raise GatewayStartError(
+            f"{options.host} can be reached by other machines, and the gateway speaks no TLS and checks "
+            "nobody; let it listen on 127.0.0.1 behind a proxy that does, or say --insecure"
+        )
     family = socket.AF_INET6 if ":" in options.host else socket.AF_INET
     try:
         bound = socket.create_server((options.host, options.port), family=family, backlog=_BACKLOG)

@@ -9,9 +9,9 @@ from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
 from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
+from reloc.wire.keys import NAME_PATTERN
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +21,7 @@ class ServeOptions:
     Attributes:
         listen: Zenoh endpoints to listen on; port 0 takes a free one. Empty where `config_path` says it.
         config_path: a Zenoh configuration (JSON5); `listen` is added to it.
+        insecure: start also where whoever reaches the server could answer in its place.
         name: the database's name on the wire; "" takes the name of the database's folder.
         workers: queries localised at a time; two fill the reference machine's two cores.
         threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
@@ -42,6 +43,7 @@ class ServeOptions:
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     config_path: Path | None = None
+    insecure: bool = False
     name: str = ""
     workers: int = 2
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
@@ -78,7 +80,7 @@ def check_wire_name(name: str) -> str:
     Raises:
         InvalidValueError: it cannot.
     """
-    if not _NAME.fullmatch(name):
+    if not re.fullmatch(NAME_PATTERN, name):
         raise InvalidValueError(
             "database name on the wire: expected 1..64 letters, digits, '_', '.', '-', beginning with a "
             f"letter or digit, found {name!r}; choose one with --name"

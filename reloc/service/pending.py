@@ -18,6 +18,9 @@ class PendingQuery:
 
     A worker, the deadline watch and the shutdown may all want to answer; the first one does. Answering
     drops the Zenoh query, without which the client would wait for its timeout.
+
+    Attributes:
+        identity: name of the client, where the server authenticates its clients.
     """
 
     __slots__ = (
@@ -27,12 +30,22 @@ class PendingQuery:
         "_metrics",
         "_query",
         "deadline",
+        "identity",
         "received",
         "request_id",
         "size",
     )
 
-    def __init__(self, query: zenoh.Query, key: str, deadline_s: float, metrics: ServerMetrics) -> None:
+    def __init__(
+        self,
+        query: zenoh.Query,
+        key: str,
+        deadline_s: float,
+        metrics: ServerMetrics,
+        *,
+        identity: str | None,
+    ) -> None:
+        self.identity = identity
         self._query = query
         self._key = key
         self._metrics = metrics
@@ -77,6 +90,7 @@ class PendingQuery:
                 "fields": {
                     "event": "answered",
                     "request_id": self.request_id,
+                    "client": self.identity,
                     "status": reply.status,
                     "reason": reply.reason,
                     "inliers": reply.inliers,
@@ -106,6 +120,7 @@ class PendingQuery:
                 "fields": {
                     "event": "refused",
                     "request_id": self.request_id,
+                    "client": self.identity,
                     "code": error.code,
                     "refusal": error.message,
                     "bytes": self.size,

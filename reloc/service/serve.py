@@ -21,7 +21,7 @@ def start_server(
     """Load the database's maps and listen; the server runs until `close`.
 
     Raises:
-        ServiceStartError: cannot listen (port taken, bad endpoint, bad configuration).
+        ServiceStartError: cannot listen (port taken, bad endpoint, bad configuration), or open to strangers.
         FeatureDbError: the maps cannot be loaded.
     """
     options = options or ServeOptions()

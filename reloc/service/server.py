@@ -1,5 +1,6 @@
 """The relocalisation server: Zenoh in front, workers behind, the store watched."""
 
+import json
 import logging
 import threading
 import time
@@ -10,16 +11,18 @@ from typing import Self
 import zenoh
 
 from reloc.service.contributions.inbox import Inbox
+from reloc.service.exposure import authenticates, check_exposure
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue
-from reloc.service.session import Keys, ServiceStartError, bind_free_port, open_server_session
+from reloc.service.session import ServiceStartError, bind_free_port, open_server_session, server_config
 from reloc.service.source import AreaSource, ServedArea
 from reloc.service.watcher import AreaWatcher
 from reloc.service.worker import WorkerPool
-from reloc.wire.query import WIRE_VERSION, ErrorCode, RequestError, encode
+from reloc.wire.keys import Keys, client_of
+from reloc.wire.query import MESSAGE_HEADROOM, WIRE_VERSION, ErrorCode, RequestError, encode
 from reloc.wire.server import (
     Event,
     EventType,
@@ -33,8 +36,6 @@ from reloc.wire.server import (
 logger = logging.getLogger(__name__)
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
-# A message larger than this is not even gathered by Zenoh; up to it the client hears TOO_LARGE.
-_MESSAGE_HEADROOM = 4
 
 
 class Server:
@@ -56,12 +57,14 @@ class Server:
         database: str,
         options: ServeOptions,
         inbox: Inbox | None,
+        authenticates: bool,
     ) -> None:
         self.database = database
         self.endpoints = endpoints
         self.server_id = str(session.zid())
         self._session = session
         self._options = options
+        self._authenticates = authenticates
         self._keys = Keys(database=database)
         self._area = area
         self._started = time.perf_counter()
@@ -95,14 +98,19 @@ class Server:
             inbox: takes contributed photos, and is started and closed by the server; None: it takes none.
 
         Raises:
-            ServiceStartError: cannot listen.
+            ServiceStartError: cannot listen, or strangers could reach it and `insecure` is not set.
             FeatureDbError: the area cannot be loaded.
         """
+        config = server_config(
+            options.listen, options.config_path, MESSAGE_HEADROOM * options.limits.max_bytes
+        )
+        if not options.insecure:
+            check_exposure(config)
         area = source.load()
         endpoints = tuple(bind_free_port(endpoint) for endpoint in options.listen)
-        session = open_server_session(
-            endpoints, options.config_path, _MESSAGE_HEADROOM * options.limits.max_bytes
-        )
+        if endpoints:
+            config.insert_json5("listen/endpoints", json.dumps(endpoints))
+        session = open_server_session(config, ", ".join(endpoints) or str(options.config_path))
         server = cls(
             source=source,
             area=area,
@@ -111,6 +119,7 @@ class Server:
             database=database,
             options=options,
             inbox=inbox,
+            authenticates=authenticates(config),
         )
         try:
             server._declare()
@@ -125,14 +134,12 @@ class Server:
         self._watch.start()
         self._workers.start()
         # `complete`: of several servers of one database the nearest answers, not all of them.
-        for leaf, callback in (
-            ("localise", self._on_localise),
-            ("status", self._on_status),
-            ("maps", self._on_maps),
+        for key, callback in (
+            (self._keys.localise("*"), self._on_localise),
+            (self._keys.of("status"), self._on_status),
+            (self._keys.of("maps"), self._on_maps),
         ):
-            self._queryables.append(
-                self._session.declare_queryable(self._keys.of(leaf), callback, complete=True)
-            )
+            self._queryables.append(self._session.declare_queryable(key, callback, complete=True))
         self._live.start()
         self._advertise(self._area)  # after the queryables: who sees the token can ask at once
         self._watcher.start()
@@ -201,7 +208,14 @@ class Server:
 
     def _on_localise(self, query: zenoh.Query) -> None:
         self._metrics.received()
-        item = PendingQuery(query, self._keys.of("localise"), self._options.deadline_s, self._metrics)
+        client = client_of(str(query.key_expr))
+        item = PendingQuery(
+            query,
+            self._keys.localise(client),
+            self._options.deadline_s,
+            self._metrics,
+            identity=client if self._authenticates else None,
+        )
         try:
             if item.size > self._options.limits.max_bytes:
                 raise RequestError(

@@ -1,16 +1,14 @@
-"""Zenoh sessions and keys of the service."""
+"""Zenoh sessions of the service."""
 
 import json
 import re
 import socket
-from dataclasses import dataclass
 from pathlib import Path
 
 import zenoh
 
 from featuredb.errors import FeatureDbError
 
-KEY_ROOT = "featuredb"
 EXAMPLE_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
@@ -18,35 +16,11 @@ class ServiceStartError(FeatureDbError):
     """The server cannot start: port taken, bad endpoint, bad configuration."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Keys:
-    """The keys of one database on the wire."""
-
-    database: str
-
-    def of(self, leaf: str) -> str:
-        return f"{KEY_ROOT}/{self.database}/{leaf}"
-
-    def track(self, session: str, leaf: str = "") -> str:
-        """Key of a live session, or of a leaf of it: frames, poses, events, client."""
-        return self.of(f"track/{session}/{leaf}" if leaf else f"track/{session}")
-
-    def server_token(self, server_id: str) -> str:
-        """Liveliness token of a server."""
-        return self.of(f"servers/{server_id}")
-
-    def tile_token(self, server_id: str, tile: str) -> str:
-        """Liveliness token of a tile that a server answers for; the tile's slashes become dashes."""
-        return self.of(f"tiles/{tile.replace('/', '-')}/{server_id}")
-
-
-def open_server_session(
-    listen: tuple[str, ...], config_path: Path | None, max_message_bytes: int
-) -> zenoh.Session:
-    """A Zenoh session that listens.
+def server_config(listen: tuple[str, ...], config_path: Path | None, max_message_bytes: int) -> zenoh.Config:
+    """The Zenoh configuration of a server.
 
     Raises:
-        ServiceStartError: the configuration cannot be read, or an endpoint cannot be listened on.
+        ServiceStartError: the file cannot be read.
     """
     config = _base_config(config_path)
     if config_path is None:
@@ -60,10 +34,18 @@ def open_server_session(
         config.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
     if listen:
         config.insert_json5("listen/endpoints", json.dumps(list(listen)))
+    return config
+
+
+def open_server_session(config: zenoh.Config, where: str) -> zenoh.Session:
+    """A Zenoh session that listens.
+
+    Raises:
+        ServiceStartError: an endpoint cannot be listened on, or the configuration is none.
+    """
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        where = ", ".join(listen) or str(config_path)
         hint = "is another server running there? Choose another port with --listen tcp/HOST:PORT"
         if "in use" not in str(error):
             hint = f"expected endpoints like {EXAMPLE_ENDPOINT}"

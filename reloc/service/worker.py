@@ -167,7 +167,7 @@ def _answer_and_keep(
         if not answered:
             place.cancel()
     if answered:
-        place.submit(lambda: contribution_of(data, request, reply, received_at))
+        place.submit(lambda: contribution_of(data, request, reply, received_at, item.identity))
 
 
 def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:

@@ -13,8 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from featuredb.errors import ServiceError
 
-WIRE_VERSION = "1"
+WIRE_VERSION = "2"  # 2: keys name the client
 MAX_ATTACHMENT_BYTES = 65_536  # a request needs a few hundred; more is a mistake or an attack
+# A message larger than so many largest payloads is not even gathered; up to it the client hears TOO_LARGE.
+MESSAGE_HEADROOM = 4
 _SHOWN_INPUT_CHARS = 80  # of a refused value, in the message that refuses it
 
 

@@ -20,9 +20,6 @@ from reloc.wire.query import (
     UtmPose,
 )
 
-# One chunk of a Zenoh key; the client chooses it, at random, so that nobody else can guess it.
-SESSION_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"
-SessionName = Annotated[str, Field(pattern=SESSION_PATTERN)]
 # JSON's numbers are exact up to here.
 Sequence = Annotated[int, Field(ge=0, le=2**53 - 1)]
 
@@ -96,7 +93,7 @@ TrackStateText = Literal["tracking", "relocalised", "lost"]
 
 
 class TrackPose(Answer):
-    """Publication on `.../track/<session>/poses`: one for each frame that was looked at, in their order.
+    """Publication on `.../<session>/poses`: one for each frame that was looked at, in their order.
 
     The pose's fields are those of a localise reply, and null while the track is lost; `detail` then says why.
     `dropped`: frames of this session up to this one that were not looked at. `received_at`, `answered_at`: by
@@ -138,7 +135,7 @@ class TrackPose(Answer):
 
 
 class TrackEvent(Answer):
-    """Publication on `.../track/<session>/events`.
+    """Publication on `.../track/<client>/<session>/events`.
 
     `refused`: a frame cannot be used, the session goes on; `code` is one of reloc.wire.query.ErrorCode,
     `sequence` the frame's number where it could be read. `ended`: the session is over; `code` is an

@@ -43,7 +43,7 @@ def messages() -> dict[str, list[bytes]]:
     found: dict[str, list[bytes]] = {"track_pose": [], "track_event": [], "track_opened": [], "status": []}
     with running_server(localiser(), ServeOptions()) as server, client_of(server) as client:
         session = client._session()
-        key = "featuredb/town/track/*"
+        key = "featuredb/town/track/anonymous/*"
         with (
             session.declare_subscriber(
                 f"{key}/poses", lambda s: found["track_pose"].append(s.payload.to_bytes())

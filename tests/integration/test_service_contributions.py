@@ -45,7 +45,9 @@ def exif() -> Image.Exif:
 def raw(session, payload: bytes, request: object) -> tuple[bool, dict]:
     """One query as any client may send it: whether it got a reply, and the reply or error."""
     attachment = request if isinstance(request, bytes) else json.dumps(request).encode()
-    (reply,) = session.get("featuredb/town/localise", payload=payload, attachment=attachment, timeout=10)
+    (reply,) = session.get(
+        "featuredb/town/localise/anonymous", payload=payload, attachment=attachment, timeout=10
+    )
     return reply.ok is not None, json.loads((reply.ok or reply.err).payload.to_bytes())
 
 

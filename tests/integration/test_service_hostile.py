@@ -189,7 +189,10 @@ def test_fuzzed_queries_each_get_one_answer_and_the_server_lives(served):
     for number in range(QUERIES):
         replies = list(
             session.get(
-                "featuredb/town/localise", payload=_payload(rng), attachment=_attachment(rng), timeout=10
+                "featuredb/town/localise/anonymous",
+                payload=_payload(rng),
+                attachment=_attachment(rng),
+                timeout=10,
             )
         )
         assert len(replies) == 1, f"query {number} got {len(replies)} answers"

@@ -281,7 +281,7 @@ class Raw:
     """A client that says what it likes under the keys of one session."""
 
     def __init__(self, session: zenoh.Session, name: str) -> None:
-        self._session, self._key = session, f"featuredb/town/track/{name}"
+        self._session, self._key = session, f"featuredb/town/track/anonymous/{name}"
         self.events: list[dict[str, object]] = []
         self.poses: list[dict[str, object]] = []
 

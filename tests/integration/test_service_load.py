@@ -281,7 +281,7 @@ def test_a_client_that_goes_away_costs_its_query_only():
     gate = Gate()
     with running_server(gated(1, gate), ServeOptions(workers=1)) as server, client_of(server) as client:
         with Client(server.endpoints[0], "town") as gone:
-            gone._session().get("featuredb/town/localise", payload=photo(), timeout=10)
+            gone._session().get("featuredb/town/localise/anonymous", payload=photo(), timeout=10)
             assert gate.entered.acquire(timeout=10)
         gate.open()
         assert client.localise(photo()).status == "not_localised"

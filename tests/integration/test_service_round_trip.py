@@ -248,7 +248,10 @@ def test_a_bad_attachment_is_refused_with_what_was_expected(shared_server, attac
     server, session = shared_server
     replies = list(
         session.get(
-            f"featuredb/{server.database}/localise", payload=photo(), attachment=attachment, timeout=10
+            f"featuredb/{server.database}/localise/anonymous",
+            payload=photo(),
+            attachment=attachment,
+            timeout=10,
         )
     )
     assert len(replies) == 1
@@ -266,14 +269,14 @@ def shared_server():
 
 def test_a_query_without_payload_or_attachment_is_answered_with_an_error(shared_server):
     server, session = shared_server
-    (reply,) = session.get(f"featuredb/{server.database}/localise", timeout=10)
+    (reply,) = session.get(f"featuredb/{server.database}/localise/anonymous", timeout=10)
     assert json.loads(reply.err.payload.to_bytes())["code"] == "BAD_IMAGE"
 
 
 def test_a_wildcard_selector_is_answered_under_the_server_s_own_key(shared_server):
     server, session = shared_server
-    (reply,) = session.get("featuredb/*/localise", payload=photo(), timeout=10)
-    assert str(reply.ok.key_expr) == f"featuredb/{server.database}/localise"
+    (reply,) = session.get("featuredb/*/localise/*", payload=photo(), timeout=10)
+    assert str(reply.ok.key_expr) == f"featuredb/{server.database}/localise/anonymous"
     assert LocaliseReply.model_validate_json(reply.ok.payload.to_bytes()).status == "localised"
 
 
@@ -305,7 +308,7 @@ def test_the_client_s_own_timeout_is_an_error_of_its_own(shared_server):
     # A queryable that keeps its query without answering, as a server would that hangs.
     kept = []
     with (
-        session.declare_queryable("featuredb/mute/localise", kept.append, complete=True),
+        session.declare_queryable("featuredb/mute/localise/*", kept.append, complete=True),
         session.liveliness().declare_token("featuredb/mute/servers/x"),
         Client(server.endpoints[0], "mute") as client,
         pytest.raises(ServiceError) as caught,
@@ -350,7 +353,7 @@ def test_of_two_servers_of_one_database_one_answers():
         config.insert_json5("listen/endpoints", "[]")
         with zenoh.open(config) as session:
             servers = [r for r in session.liveliness().get("featuredb/town/servers/*", timeout=10) if r.ok]
-            replies = list(session.get("featuredb/town/localise", payload=photo(), timeout=10))
+            replies = list(session.get("featuredb/town/localise/anonymous", payload=photo(), timeout=10))
     assert len(servers) == 2
     assert len(replies) == 1
     assert sum(len(localiser.requests) for localiser in localisers) == 1

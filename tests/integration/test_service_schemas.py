@@ -73,15 +73,17 @@ def messages():
         ):
             for attachment in (b"", b'{"options": {"inliers": true}}', b'{"request_id": "r1"}'):
                 found["localise_reply"].append(
-                    raw(session, "localise", payload=photo(), attachment=attachment)
+                    raw(session, "localise/anonymous", payload=photo(), attachment=attachment)
                 )
             gift = b'{"contribute": true, "owner": "A", "licence": "CC0-1.0"}'
             for seed in (1, 2):
                 found["localise_reply"].append(
-                    raw(session, "localise", payload=photo(seed=seed), attachment=gift)
+                    raw(session, "localise/anonymous", payload=photo(seed=seed), attachment=gift)
                 )
             for payload, attachment in ((b"x", b""), (photo(), b"{"), (bytes(200_000), b"")):
-                found["error"].append(raw(session, "localise", payload=payload, attachment=attachment))
+                found["error"].append(
+                    raw(session, "localise/anonymous", payload=payload, attachment=attachment)
+                )
             found["status"].append(raw(session, "status"))
             found["maps"].append(raw(session, "maps"))
             with client.watch_events() as events:

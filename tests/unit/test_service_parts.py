@@ -16,8 +16,9 @@ from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
-from reloc.service.session import Keys, bind_free_port
+from reloc.service.session import bind_free_port
 from reloc.service.threads import capped_process
+from reloc.wire.keys import Keys
 from reloc.wire.query import ContributionReply, encode, parse_request
 from tests.support.service import localised, not_localised
 
@@ -36,7 +37,7 @@ from tests.support.service import localised, not_localised
 )
 def test_the_wire_name_of_a_database(url, name):
     assert wire_name_of(url) == name
-    assert Keys(database=name).of("localise") == f"featuredb/{name}/localise"
+    assert Keys(database=name).localise("phone") == f"featuredb/{name}/localise/phone"
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "*", "a b", "-x", "a" * 65, "a?", "$x"])

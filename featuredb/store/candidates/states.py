@@ -35,7 +35,8 @@ class Contribution:
         owner, licence: who gives it, and under what terms; never empty.
         client_id: what the sender calls itself, "" where it does not.
         received_at: aware time.
-        request: camera, prior, options and EXIF of the query, JSON-able.
+        request: camera, prior, options and EXIF of the query, and `identity`: the name by which its client
+            was authenticated, None where it was not; JSON-able.
         answer: summary of the answer (status, reason, pose, accuracy, maps), JSON-able.
         snapshot: version of the database that answered.
 

@@ -41,9 +41,16 @@ class DatabaseInbox:
 
 
 def contribution_of(
-    data: bytes, request: LocaliseWireRequest, reply: LocaliseReply, received_at: datetime
+    data: bytes,
+    request: LocaliseWireRequest,
+    reply: LocaliseReply,
+    received_at: datetime,
+    identity: str | None = None,
 ) -> Contribution:
-    """The row of a contributed photo out of its query, which has been answered and found valid."""
+    """The row of a contributed photo out of its query, which has been answered and found valid.
+
+    `identity`: the name by which the client was authenticated; None: it was not.
+    """
     header = read_header(data)
     asked = request.model_dump(mode="json", include={"request_id", "camera", "prior", "options"})
     return Contribution(
@@ -54,7 +61,7 @@ def contribution_of(
         licence=request.licence or "",
         client_id=request.client_id or "",
         received_at=received_at,
-        request={**asked, "exif": _told(read_exif(data, header))},
+        request={**asked, "identity": identity, "exif": _told(read_exif(data, header))},
         answer=reply.model_dump(mode="json", include=_ANSWER),
         snapshot=reply.snapshot,
     )

@@ -38,7 +38,7 @@ class LiveSession:
         idle_timeout_s: float,
         publish: Callable[[str, BaseModel], None],
         metrics: LiveMetrics,
-        on_end: Callable[["LiveSession"], None],
+        on_end: Callable[[], None],
     ) -> None:
         """
         Args:
@@ -83,7 +83,7 @@ class LiveSession:
                 "live session failed", extra={"fields": {"event": "internal", "session": self.name}}
             )
             self.end(EndReason.INTERNAL)
-        self._on_end(self)
+        self._on_end()
         self._say_ended()
 
     def _answer_frames(self) -> None:

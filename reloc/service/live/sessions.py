@@ -1,13 +1,14 @@
 """A server's live sessions on Zenoh: opened by a query, fed by publications, ended with their clients."""
 
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 
 import zenoh
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel
 from zenoh.handlers import Callback
 
 from reloc.service.live.frames import FrameAnswerer
@@ -15,8 +16,8 @@ from reloc.service.live.latest import Arrival
 from reloc.service.live.metrics import LiveMetrics
 from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
-from reloc.service.session import Keys
 from reloc.service.source import ServedArea
+from reloc.wire.keys import NAME_PATTERN, Keys
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
     ErrorCode,
@@ -28,7 +29,6 @@ from reloc.wire.query import (
 from reloc.wire.track import (
     EndReason,
     LiveStatus,
-    SessionName,
     TrackLimits,
     TrackOpened,
     TrackOpenRequest,
@@ -37,7 +37,6 @@ from reloc.wire.track import (
 logger = logging.getLogger(__name__)
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
-_NAME: TypeAdapter[str] = TypeAdapter(SessionName)
 
 
 class LiveSessions:
@@ -59,7 +58,7 @@ class LiveSessions:
         self._options, self._server_id = options, server_id
         self._metrics = LiveMetrics()
         self._lock = threading.Lock()
-        self._open: dict[str, LiveSession] = {}
+        self._open: dict[str, LiveSession] = {}  # by key
         self._frames: dict[str, zenoh.Subscriber[None]] = {}
         self._closed = False
         self._queryable: zenoh.Queryable[None] | None = None
@@ -68,11 +67,11 @@ class LiveSessions:
     def start(self) -> None:
         """Take sessions from now on."""
         self._tokens = self._session.liveliness().declare_subscriber(
-            self._keys.track("*", "client"), self._on_token
+            self._keys.track("*", "*", "client"), self._on_token
         )
         # `complete`: of several servers of one database the nearest takes the session.
         self._queryable = self._session.declare_queryable(
-            self._keys.of("track/*"), self._on_open, complete=True
+            self._keys.track("*", "*"), self._on_open, complete=True
         )
 
     def close(self, timeout_s: float) -> None:
@@ -97,73 +96,74 @@ class LiveSessions:
     # Zenoh calls these in threads of its own; they must return at once.
 
     def _on_open(self, query: zenoh.Query) -> None:
-        name = str(query.key_expr).rpartition("/")[2]
+        rest, _, name = str(query.key_expr).rpartition("/")
+        client = rest.rpartition("/")[2]
         with query:
             try:
-                reply = encode(self._opened(name, query))
+                reply = encode(self._opened(client, name, query))
             except RequestError as error:
-                self._refuse(query, name, error)
+                self._refuse(query, client, name, error)
                 return
             except Exception:
                 logger.exception("live session not opened", extra={"fields": {"event": "internal"}})
                 text = "the server failed to open the session; its log says why"
-                self._refuse(query, name, RequestError(ErrorCode.INTERNAL, text))
+                self._refuse(query, client, name, RequestError(ErrorCode.INTERNAL, text))
                 return
-            query.reply(self._keys.track(name), reply, encoding=_JSON)
-        _log("live session opened", "live_opened", name)
+            query.reply(self._keys.track(client, name), reply, encoding=_JSON)
+        _log("live session opened", "live_opened", client, name)
 
-    def _refuse(self, query: zenoh.Query, name: str, error: RequestError) -> None:
+    def _refuse(self, query: zenoh.Query, client: str, name: str, error: RequestError) -> None:
         self._metrics.open_refused(error.code)
         refusal = ErrorReply(code=error.code, message=error.message, request_id=None)
         query.reply_err(encode(refusal), encoding=_JSON)
-        _log("live session refused", "live_refused", name[:80], code=error.code, refusal=error.message)
+        refused = {"code": error.code, "refusal": error.message}
+        _log("live session refused", "live_refused", client[:80], name[:80], **refused)
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         """A client's token has come or gone."""
         if sample.kind != zenoh.SampleKind.DELETE:
             return
-        name = str(sample.key_expr).split("/")[-2]
         with self._lock:
-            session = self._open.get(name)
+            session = self._open.get(str(sample.key_expr).rpartition("/")[0])
         if session is not None:
             session.end(EndReason.CLIENT_GONE)
 
-    def _opened(self, name: str, query: zenoh.Query) -> TrackOpened:
-        """Open the session of this name.
+    def _opened(self, client: str, name: str, query: zenoh.Query) -> TrackOpened:
+        """Open the client's session of this name.
 
         Raises:
             RequestError: why it is not opened.
         """
-        try:
-            _NAME.validate_python(name)
-        except ValidationError as error:
-            raise RequestError(
-                ErrorCode.BAD_REQUEST,
-                "session: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit, "
-                f"found {name[:80]!r}",
-            ) from error
+        for what, found in (("client", client), ("session", name)):
+            if not re.fullmatch(NAME_PATTERN, found):
+                raise RequestError(
+                    ErrorCode.BAD_REQUEST,
+                    f"{what}: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or "
+                    f"digit, found {found[:80]!r}",
+                )
+        key = self._keys.track(client, name)
         attachment = None if query.attachment is None else query.attachment.to_bytes()
         request = parse_attachment(TrackOpenRequest, attachment)
         with self._lock:
-            self._check_room(name)
+            self._check_room(key)
             answerer = FrameAnswerer(name, request, self._area, self._options)
             session = LiveSession(
                 name,
                 answerer,
                 idle_timeout_s=self._options.idle_timeout_s,
-                publish=lambda leaf, message: self._publish(self._keys.track(name, leaf), message),
+                publish=lambda leaf, message: self._publish(f"{key}/{leaf}", message),
                 metrics=self._metrics,
-                on_end=self._forget,
+                on_end=lambda: self._forget(key),
             )
 
             def take(sample: zenoh.Sample) -> None:
                 self._on_frame(session, sample)
 
             # Called by Zenoh's own thread, not by one behind an unbounded queue of samples.
-            self._frames[name] = self._session.declare_subscriber(
-                self._keys.track(name, "frames"), Callback(take, indirect=False)
+            self._frames[key] = self._session.declare_subscriber(
+                f"{key}/frames", Callback(take, indirect=False)
             )
-            self._open[name] = session
+            self._open[key] = session
             session.start()
         self._metrics.opened()
         limits = self._options.limits
@@ -180,7 +180,7 @@ class LiveSessions:
             ),
         )
 
-    def _check_room(self, name: str) -> None:
+    def _check_room(self, key: str) -> None:
         if self._closed:
             raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
         if self._options.max_sessions == 0:
@@ -188,9 +188,10 @@ class LiveSessions:
                 ErrorCode.UNSUPPORTED,
                 "this server takes no live sessions; start it with --live-sessions 1 or more",
             )
-        if name in self._open:
+        if key in self._open:
             raise RequestError(
-                ErrorCode.BAD_REQUEST, f"session: {name!r} is open; choose another name, at random"
+                ErrorCode.BAD_REQUEST,
+                f"session: {key.rpartition('/')[2]!r} is open; choose another name, at random",
             )
         if len(self._open) >= self._options.max_sessions:
             raise RequestError(
@@ -214,13 +215,13 @@ class LiveSessions:
             )
         )
 
-    def _forget(self, session: LiveSession) -> None:
+    def _forget(self, key: str) -> None:
         """Nothing is left of the session; called by its thread."""
         with self._lock:
-            frames = self._frames.pop(session.name)
+            frames = self._frames.pop(key)
         frames.undeclare()
         with self._lock:
-            del self._open[session.name]
+            del self._open[key]
 
     def _publish(self, key: str, message: BaseModel) -> None:
         try:
@@ -236,5 +237,5 @@ class LiveSessions:
             logger.warning("a live session's message could not be published", exc_info=True)
 
 
-def _log(message: str, event: str, name: str, **fields: object) -> None:
-    logger.info(message, extra={"fields": {"event": event, "session": name, **fields}})
+def _log(message: str, event: str, client: str, session: str, **fields: object) -> None:
+    logger.info(message, extra={"fields": {"event": event, "client": client, "session": session, **fields}})

@@ -1,0 +1,218 @@
+"""The folder of an authority: its key, the server's configuration, one of each client.
+
+ca.pem, ca.key          the authority; nobody but this folder needs the key
+server.json5            Zenoh configuration of the server, with its key and the rules of all clients
+clients/NAME.json5      Zenoh configuration of a client, with its key: all that its device needs
+issued/NAME.pem         certificates of clients that the rules name
+revoked/NAME.pem        those of clients that they do not name any more
+"""
+
+import base64
+import json
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+from featuredb.errors import FeatureDbError, InvalidValueError
+from featuredb.features.decode import DecodeLimits
+from reloc.authority.access_rules import access_control
+from reloc.authority.certificates import Identity
+from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, NAME_PATTERN
+from reloc.wire.query import MESSAGE_HEADROOM
+
+DEFAULT_PORT = 7447  # Zenoh's own
+_SERVER = "server"
+_LOCALHOST = "localhost"
+_HOST = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]*[A-Za-z0-9])?|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
+_ENDPOINTS = "featuredb_endpoints"  # in the server's `metadata`: where clients connect
+_CONNECT_TIMEOUT_MS = 5000
+_HEAD = "// Written by `featuredb keys`. Holds a private key.\n"
+_SERVER_HEAD = (
+    _HEAD
+    + "// Each client that comes or goes: access_control is written anew, comments go, the rest stays.\n"
+)
+
+_Config = dict[str, Any]
+
+
+class AuthorityError(FeatureDbError):
+    """A folder that is no authority, or what one does not do."""
+
+
+class Authority:
+    """An authority in a folder; `create` makes one."""
+
+    def __init__(self, folder: Path) -> None:
+        """
+        Raises:
+            AuthorityError: there is none.
+        """
+        self.folder = folder
+        self.server_config = folder / "server.json5"
+        try:
+            self._identity = Identity(
+                certificate=(folder / "ca.pem").read_bytes(), key=(folder / "ca.key").read_bytes()
+            )
+        except OSError as error:
+            raise AuthorityError(
+                f"{folder}: expected an authority, found none ({error.strerror}); make it by `featuredb keys "
+                f"init {folder}`"
+            ) from error
+
+    @classmethod
+    def create(cls, folder: Path, hosts: tuple[str, ...] = (), port: int = DEFAULT_PORT) -> "Authority":
+        """Make the folder, with the configuration of a server.
+
+        Args:
+            hosts: names and addresses by which clients reach the server, tried in this order. None: it
+                listens on this machine only, as localhost.
+
+        Raises:
+            AuthorityError: the folder holds something already.
+            InvalidValueError: no host, or no port.
+        """
+        for host in hosts:
+            if not _HOST.fullmatch(host):
+                raise InvalidValueError(f"host: expected a name or an address, found {host!r}")
+        if not 0 < port < 65_536:
+            raise InvalidValueError(f"port: expected 1..65535, found {port}")
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise AuthorityError(
+                f"{folder}: expected no such folder, or an empty one; nothing is overwritten"
+            )
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        identity = Identity.authority()
+        server = identity.server(_SERVER, tuple(dict.fromkeys((*hosts, _LOCALHOST))))
+        _write_new(folder / "server.json5", _SERVER_HEAD + _text(_server(identity, server, hosts, port)))
+        _write_new(folder / "ca.pem", identity.certificate.decode())
+        _write_new(folder / "ca.key", identity.key.decode())
+        return cls(folder)
+
+    def clients(self) -> list[str]:
+        """Names of the clients that the rules know."""
+        return sorted(path.stem for path in (self.folder / "issued").glob("*.pem"))
+
+    def add_client(self, name: str) -> Path:
+        """Make a client known; its configuration. The server knows it after a restart.
+
+        Raises:
+            InvalidValueError: no name for a client.
+            AuthorityError: the name was given before, or the server's configuration cannot be read.
+        """
+        if not re.fullmatch(NAME_PATTERN, name) or name in (_SERVER, ANONYMOUS):
+            raise InvalidValueError(
+                "client: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit, "
+                f"not {_SERVER!r} nor {ANONYMOUS!r}, found {name!r}"
+            )
+        if self._revoked(name).exists():
+            # The certificate that was revoked has this name for ever, and would be let in again.
+            raise AuthorityError(f"client {name!r} was revoked; choose another name")
+        path = self.folder / "clients" / f"{name}.json5"
+        for made in (self._issued(name), path):
+            if made.exists():
+                raise AuthorityError(f"client {name!r}: {made} is there already; nothing is overwritten")
+        config = self._server()
+        client = self._identity.client(name)
+        endpoints = config.get("metadata", {}).get(_ENDPOINTS, [])
+        self._write_rules(config, [*self.clients(), name])
+        _write_new(self._issued(name), client.certificate.decode())
+        _write_new(path, _HEAD + _text(_client(name, self._identity, client, endpoints)))
+        return path
+
+    def revoke(self, name: str) -> None:
+        """Let a client do nothing any more, and give its name to nobody. The server knows after a restart.
+
+        Raises:
+            AuthorityError: no such client, or the server's configuration cannot be read.
+        """
+        config, clients = self._server(), self.clients()
+        if name not in clients:
+            raise AuthorityError(
+                f"client: expected one that is known ({', '.join(clients) or 'none is'}), found {name!r}"
+            )
+        self._write_rules(config, [client for client in clients if client != name])
+        (self.folder / "revoked").mkdir(mode=0o700, exist_ok=True)
+        self._issued(name).rename(self._revoked(name))
+        (self.folder / "clients" / f"{name}.json5").unlink(missing_ok=True)
+
+    def _issued(self, name: str) -> Path:
+        return self.folder / "issued" / f"{name}.pem"
+
+    def _revoked(self, name: str) -> Path:
+        return self.folder / "revoked" / f"{name}.pem"
+
+    def _server(self) -> _Config:
+        try:
+            lines = self.server_config.read_text(encoding="utf-8").splitlines()
+            config: _Config = json.loads("\n".join(x for x in lines if not x.lstrip().startswith("//")))
+        except (OSError, ValueError) as error:
+            raise AuthorityError(
+                f"{self.server_config}: expected JSON, and lines of comment that begin with //, found {error}"
+            ) from error
+        return config
+
+    def _write_rules(self, config: _Config, clients: list[str]) -> None:
+        config["access_control"] = access_control(_SERVER, clients)
+        new = self.server_config.with_suffix(".new")
+        new.unlink(missing_ok=True)
+        _write_new(new, _SERVER_HEAD + _text(config))
+        new.replace(self.server_config)
+
+
+def _server(authority: Identity, server: Identity, hosts: tuple[str, ...], port: int) -> _Config:
+    reached = [f"tls/{f'[{host}]' if ':' in host else host}:{port}" for host in hosts or (_LOCALHOST,)]
+    config = {
+        # Not a peer: that would leave questions about liveliness to any client that calls itself a router.
+        "mode": "router",
+        "listen": {"endpoints": [f"tls/[::]:{port}"] if hosts else reached},
+        **_common(authority, {"listen": server, "connect": server}),
+        "metadata": {_ENDPOINTS: reached},
+        "access_control": access_control(_SERVER, ()),
+    }
+    config["transport"]["link"]["rx"] = {"max_message_size": MESSAGE_HEADROOM * DecodeLimits().max_bytes}
+    return config
+
+
+def _client(name: str, authority: Identity, client: Identity, endpoints: list[str]) -> _Config:
+    return {
+        "mode": "client",
+        "connect": {"endpoints": endpoints, "timeout_ms": _CONNECT_TIMEOUT_MS},
+        **_common(authority, {"connect": client}),
+        "metadata": {CLIENT_SETTING: name},
+    }
+
+
+def _common(authority: Identity, shown: dict[str, Identity]) -> _Config:
+    """What both have: nobody is looked for, and both sides of a connection show a certificate."""
+    tls: _Config = {
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+        "root_ca_certificate_base64": _base64(authority.certificate),
+    }
+    for side, identity in shown.items():
+        tls[f"{side}_certificate_base64"] = _base64(identity.certificate)
+        tls[f"{side}_private_key_base64"] = _base64(identity.key)
+    return {
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {"shared_memory": {"enabled": False}, "link": {"tls": tls}},
+    }
+
+
+def _base64(pem: bytes) -> str:
+    return base64.b64encode(pem).decode()
+
+
+def _text(config: _Config) -> str:
+    return json.dumps(config, indent=2) + "\n"
+
+
+def _write_new(path: Path, text: str) -> None:
+    """Write a file that only its owner may read.
+
+    Raises:
+        FileExistsError
+    """
+    path.parent.mkdir(mode=0o700, exist_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
+        file.write(text)

@@ -1,0 +1,46 @@
+"""The keys of a database on the wire. `docs/wire.md` lists them.
+
+`<client>` is the name that the server knows a client by: rules by certificate hold it to its own, so that a
+query's key says who asked. Where a server authenticates nobody it says nothing.
+"""
+
+import re
+from dataclasses import dataclass
+
+KEY_ROOT = "featuredb"
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$"  # of databases, clients and live sessions: one chunk
+ANONYMOUS = "anonymous"  # a client that has no name
+CLIENT_SETTING = "featuredb_client"  # in `metadata` of a Zenoh configuration: the client's name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Keys:
+    """The keys of one database, or of all with `database="*"`."""
+
+    database: str
+
+    def of(self, leaf: str) -> str:
+        """Key of what the server says of itself: status, maps, events."""
+        return f"{KEY_ROOT}/{self.database}/{leaf}"
+
+    def localise(self, client: str) -> str:
+        """Key under which a client asks where a photo was taken."""
+        return self.of(f"localise/{client}")
+
+    def track(self, client: str, session: str, leaf: str = "") -> str:
+        """Key of a client's live session, or of a leaf of it: frames, poses, events, client."""
+        return self.of(f"track/{client}/{session}" + (f"/{leaf}" if leaf else ""))
+
+    def server_token(self, server_id: str) -> str:
+        """Liveliness token of a server."""
+        return self.of(f"servers/{server_id}")
+
+    def tile_token(self, server_id: str, tile: str) -> str:
+        """Liveliness token of a tile that a server answers for; the tile's slashes become dashes."""
+        return self.of(f"tiles/{tile.replace('/', '-')}/{server_id}")
+
+
+def client_of(key: str) -> str:
+    """The client that a query to `Keys.localise` names; ANONYMOUS where that is a wildcard."""
+    last = key.rpartition("/")[2]
+    return last if re.fullmatch(NAME_PATTERN, last) else ANONYMOUS
