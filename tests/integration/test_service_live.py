@@ -260,21 +260,26 @@ def test_maps_that_are_reloaded_are_tracked_by() -> None:
         until_tracking(live)
         nothing = localiser(2)
         nothing.areas = ()
-        with client.watch_events() as events:
-            source.publish(area_of(nothing))
-            while (event := events.next(SOON_S)) is not None and event.type != "reloaded":
-                pass
-        number = 5000
+        source.publish(area_of(nothing))
+        pose = _by_snapshot(live, 2, first=5000)
+        assert pose.state == "lost"
+        assert "the maps have changed" in pose.detail
+        source.publish(area_of(localiser(3)))
+        _by_snapshot(live, 3, first=5500)
+        assert until_tracking(live, first=6000)[-1].snapshot == 3
+
+
+def _by_snapshot(live: LiveTrack, snapshot: int, first: int) -> TrackPose:
+    """The first pose by the maps of a snapshot, once they are loaded."""
+    end = time.monotonic() + SOON_S
+    for number in range(first, 10**6):
+        assert time.monotonic() < end, f"no pose by snapshot {snapshot}"
         live.send(jpeg(0), number / 30.0, number)
         pose = live.next(SOON_S)
         assert pose is not None
-        assert (pose.state, pose.snapshot) == ("lost", 2)
-        assert "the maps have changed" in pose.detail
-        with client.watch_events() as events:
-            source.publish(area_of(localiser(3)))
-            while (event := events.next(SOON_S)) is not None and event.type != "reloaded":
-                pass
-        assert until_tracking(live, first=6000)[-1].snapshot == 3
+        if pose.snapshot == snapshot:
+            return pose
+    raise AssertionError
 
 
 class Raw:
