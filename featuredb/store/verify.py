@@ -288,12 +288,14 @@ def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
-    present = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
+    present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
     orphans = present - write_ids_of_history(database, first)
     if has_scans(database):
-        orphans |= write_ids_in(database.table(LIDAR_POINTS)) - {r["write_id"] for r in scan_rows(database)}
+        orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
+            r["write_id"] for r in scan_rows(database)
+        }
     if has_candidates(database):
-        orphans |= write_ids_in(database.table(CANDIDATE_IMAGES)) - named_writes(database)
+        orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
 
 

@@ -1,0 +1,147 @@
+"""A table's log as files: which entries there are, whether each is whole, which one was acknowledged last.
+
+An entry says in its first line how many files it adds and removes, so that one that was cut off between two
+lines is found, too. A commit that is done leaves its version as the name of an empty file in `_acknowledged`
+and removes the names below it; the highest name there is the last acknowledged version. Names are only ever
+made, and those below one's own removed: concurrent writers need no lock, object stores no conditional write.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
+
+import pyarrow.fs as fs
+
+from featuredb.errors import StoreError
+
+LOG, ACKNOWLEDGED = "_delta_log", "_acknowledged"
+_ENTRY = re.compile(r"(\d{20})\.json")
+_CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
+_NAME = re.compile(r"\d{20}")
+_ADDED, _REMOVED = ("num_added_files", "numFilesAdded"), ("num_removed_files", "numFilesRemoved")
+
+Action = dict[str, Any]
+
+
+def entry_name(version: int) -> str:
+    """File name of a log entry."""
+    return f"{version:020d}.json"
+
+
+def read_actions(content: bytes) -> list[Action]:
+    """The actions of a log entry.
+
+    Raises:
+        ValueError: it is empty or torn; the message says how.
+    """
+    if not content.strip():
+        raise ValueError(f"it is empty ({len(content)} bytes)")
+    try:
+        actions = [json.loads(line) for line in content.splitlines() if line.strip()]
+    except ValueError as error:
+        raise ValueError(f"it is torn or broken ({len(content)} bytes: {error})") from error
+    if not all(isinstance(action, dict) for action in actions):
+        raise ValueError("it has lines that are no actions")
+    info = next((action["commitInfo"] for action in actions if "commitInfo" in action), None)
+    if not isinstance(info, dict):
+        raise ValueError("its line commitInfo is missing")
+    if info.get("operation") == "CREATE TABLE" and not any("metaData" in action for action in actions):
+        raise ValueError("it is torn: its line metaData is missing")
+    metrics = info.get("operationMetrics")
+    for kind, names in (("add", _ADDED), ("remove", _REMOVED)):
+        expected = (
+            next((metrics[n] for n in names if n in metrics), None) if isinstance(metrics, dict) else None
+        )
+        found = sum(kind in action for action in actions)
+        if expected is not None and found != expected:
+            raise ValueError(f"it is torn: expected {expected} lines {kind!r}, found {found}")
+    return actions
+
+
+def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
+    """The versions of which there is a log entry, in order, and when the store got each, UTC."""
+    return dict(sorted(_numbered(files, LOG, _ENTRY)))
+
+
+def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
+    """The actions of a table's log entry.
+
+    Raises:
+        StoreError: it is missing, empty or torn.
+    """
+    problem = entry_problem(files, version)
+    if problem is not None:
+        raise StoreError(f"log entry {entry_name(version)}: {problem}; run `featuredb verify`")
+    return read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+
+
+def entry_problem(files: fs.FileSystem, version: int) -> str | None:
+    """What is wrong with a log entry, or None."""
+    try:
+        read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+    except FileNotFoundError:
+        return "it is missing"
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def acknowledged(files: fs.FileSystem) -> int | None:
+    """The last version of which a writer was told that it is done; None in tables of older releases."""
+    return max((version for version, _ in _numbered(files, ACKNOWLEDGED, _NAME)), default=None)
+
+
+def acknowledge(files: fs.FileSystem, version: int) -> None:
+    """Note that a version is committed. Without waiting for the disk: what a power cut takes of this is only
+    what `verify` would have compared with."""
+    files.create_dir(ACKNOWLEDGED)
+    files.open_output_stream(f"{ACKNOWLEDGED}/{version:020d}").close()
+    for older, _ in _numbered(files, ACKNOWLEDGED, _NAME):
+        if older < version:
+            try:
+                files.delete_file(f"{ACKNOWLEDGED}/{older:020d}")
+            except FileNotFoundError:  # another writer was faster
+                continue
+
+
+def log_problems(files: fs.FileSystem) -> Iterator[tuple[str, str]]:
+    """What is wrong with a table's log: which file of it, and what. Reads every entry."""
+    head = acknowledged(files)
+    versions = list(list_entries(files))
+    newest = max(versions, default=-1)
+    for version in sorted(set(range(newest)) - set(versions)):
+        yield entry_name(version), "it is missing, and newer ones are there"
+    for version in versions:
+        problem = entry_problem(files, version)
+        if problem is not None:
+            yield entry_name(version), problem
+    if head is not None and head > newest:
+        yield (
+            entry_name(head),
+            f"it is missing: the log ends at {newest}, but version {head} was acknowledged",
+        )
+    for version, _ in _numbered(files, LOG, _CHECKPOINT):
+        if version > newest:
+            yield f"checkpoint of version {version}", f"the log ends before it, at {newest}"
+
+
+def _numbered(files: fs.FileSystem, folder: str, name: re.Pattern[str]) -> Iterator[tuple[int, datetime]]:
+    """Numbers in the names of a folder's files, and the time of each."""
+    for info in files.get_file_info(fs.FileSelector(folder, allow_not_found=True)):
+        if match := name.fullmatch(info.base_name):
+            number = re.match(r"\d{20}", match[0])
+            assert number is not None
+            yield int(number[0]), utc(info.mtime)
+
+
+def utc(time: datetime) -> datetime:
+    """A file's time with its zone."""
+    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+
+
+def _read(files: fs.FileSystem, path: str) -> bytes:
+    with files.open_input_file(path) as stream:
+        content: bytes = stream.read()
+    return content
