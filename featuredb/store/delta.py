@@ -8,10 +8,9 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
   the next log entry exists already, it raises. All commits to `maps` go this way.
 """
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -31,13 +30,19 @@ from deltalake import (
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from featuredb.errors import ConflictError, DatabaseNotFoundError, SnapshotNotFoundError, StoreError
-from featuredb.store.durable.ages import old_files, old_scratch_folders
+from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.local import Sight, commit_locally, create_locally
-from featuredb.store.durable.making import create_table, description, writer_properties
-from featuredb.store.durable.publish import flush
+from featuredb.store.durable.log import acknowledge, check_end, damaged, log_problems
+from featuredb.store.durable.making import (
+    check_format,
+    create_table,
+    description,
+    format_of,
+    writer_properties,
+)
 from featuredb.store.retry import ATTEMPTS, StaleVersionError, retry_stale
-from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
+from featuredb.store.tables import FORMAT_VERSION, TableSpec
 
 T = TypeVar("T")
 
@@ -90,6 +95,7 @@ class Table:
                 create_table(url, spec, storage_options)
             else:
                 create_locally(Path(url), lambda work: create_table(work, spec, None))
+            acknowledge(table_files(url, storage_options), 0)
         except (DeltaError, OSError, StaleVersionError) as error:
             # Two creators at once: the loser finds the winner's table.
             if isinstance(error, OSError) or not cls.exists(url, storage_options):
@@ -108,15 +114,11 @@ class Table:
         """
         try:
             delta = DeltaTable(url, version=version, storage_options=storage_options)
-        except TableNotFoundError as error:
-            raise DatabaseNotFoundError(
-                f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
-            ) from error
         except (DeltaError, OSError) as error:
-            if version is not None:
-                raise SnapshotNotFoundError(f"{url} has no version {version}: {error}") from error
-            raise StoreError(f"cannot open {url}: {error}") from error
-        _check_format(url, spec, delta)
+            raise _why_not_opened(url, storage_options, version, error) from error
+        if version is None:
+            check_end(url, table_files(url, storage_options), int(delta.version()))
+        check_format(url, spec, delta.metadata())
         return cls(url, delta, spec, storage_options)
 
     @property
@@ -131,7 +133,7 @@ class Table:
     @property
     def format(self) -> int:
         """Format of the table, one of READABLE_FORMATS."""
-        return int(_format_of(self._delta.metadata()))
+        return int(format_of(self._delta.metadata()))
 
     def upgrade(self, rows: pa.Table | None = None, metadata: Mapping[str, str] | None = None) -> None:
         """Make a table of the newest format of one of an older one; harmless where it is of the newest.
@@ -169,6 +171,7 @@ class Table:
         """
         with _as_store_error(f"cannot read the log of {self._url}"):
             self._delta.update_incremental()
+            check_end(self._url, self.storage, self.version)
 
     def dataset(self, pruning: Sequence[tuple[str, str, Any]] = ()) -> ds.Dataset:
         """An Arrow dataset over the files that the log does not exclude by (column, operator, value)."""
@@ -308,18 +311,8 @@ class Table:
             old = old_files(self.storage, [str(path) for path in unused], grace) if unused else []
             folders = old_scratch_folders(self.storage, grace) if untracked else []
             if not dry_run:
-                self._remove(old, folders)
+                remove_files(self._url, self.storage, old, folders)
         return [*old, *folders]
-
-    def _remove(self, paths: Sequence[str], folders: Sequence[str]) -> None:
-        for path in paths:
-            with suppress(FileNotFoundError):  # another vacuum was faster
-                self.storage.delete_file(path)
-        for folder in folders:
-            self.storage.delete_dir(folder)
-        if "://" not in self._url:
-            for parent in {Path(self._url, path).parent for path in paths}:
-                flush(parent)
 
     def _write(
         self,
@@ -350,10 +343,12 @@ class Table:
         """
         try:
             if "://" not in self._url:
-                return commit_locally(Path(self._url), self._delta, operation, sight, rebase=rebase)
-            # What an object store has taken is durable, and deltalake gives it data files before the entry.
-            result = operation(self._delta)
-            return self.version, result
+                done = commit_locally(Path(self._url), self._delta, operation, sight, rebase=rebase)
+            else:  # what an object store has taken is durable, and it gets data files before the entry
+                result = operation(self._delta)
+                done = self.version, result
+            acknowledge(self.storage, done[0])
+            return done
         except CommitFailedError as error:
             raise StaleVersionError(f"{what} of {self._url}: {error}") from error
         except (DeltaError, OSError) as error:
@@ -384,17 +379,19 @@ def _as_store_error(what: str) -> Iterator[None]:
         raise StoreError(f"{what}: {error}") from error
 
 
-def _check_format(url: str, spec: TableSpec, delta: Any) -> None:
-    metadata = delta.metadata()
-    if metadata.name != f"featuredb.{spec.name}":
-        raise DatabaseNotFoundError(f"{url} is a Delta table named {metadata.name!r}, not one of featuredb")
-    found = _format_of(metadata)
-    if found not in READABLE_FORMATS:
-        raise StoreError(
-            f"{url} has featuredb format {found}, expected {READABLE_FORMATS[-1]} or older; "
-            "use a newer featuredb"
+def _why_not_opened(
+    url: str, storage_options: dict[str, str] | None, version: int | None, error: Exception
+) -> StoreError:
+    try:
+        problem = next(log_problems(table_files(url, storage_options)), None)
+    except (OSError, pa.ArrowException):
+        problem = None
+    if problem is not None:
+        return damaged(url, problem)
+    if isinstance(error, TableNotFoundError):
+        return DatabaseNotFoundError(
+            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
         )
-
-
-def _format_of(metadata: Any) -> Any:
-    return json.loads(metadata.description or "{}").get("featuredb_format")
+    if version is not None:
+        return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
+    return StoreError(f"cannot open {url}: {error}")

@@ -1,5 +1,6 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -8,7 +9,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
 
-from featuredb.errors import FeatureDbError
+from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
@@ -19,6 +20,8 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
+from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.log import LOG, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
 from featuredb.store.scans import (
@@ -43,8 +46,11 @@ from featuredb.store.tables import (
     OBSERVATIONS,
     OWN_COORDINATES,
     POINTS,
+    SPECS,
     TABLES,
 )
+
+logger = logging.getLogger(__name__)
 
 _LIGHT_COLUMNS = {
     IMAGES: ["image_index", "image_id", "camera_id", "easting", "northing", "height", "zone", "tile"],
@@ -67,7 +73,7 @@ class VerifyReport:
     """What was looked at and what is wrong.
 
     Attributes:
-        version: of the snapshot that was checked.
+        version: of the snapshot that was checked; -1 where a log is so damaged that none can be read.
         maps, scans, candidates, canaries, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
@@ -93,12 +99,19 @@ def verify(database: Database) -> VerifyReport:
     """Check the newest snapshot, scans, contributed photos and known queries; reads all of them once.
 
     Raises:
-        StoreError: the table `maps` itself, without which nothing can be said, is not readable.
+        StoreError: the store cannot be reached, or there is no database.
     """
-    snapshot = database.snapshot()
-    problems: list[DatabaseProblem] = []
+    problems = list(check_logs(database))
+    try:
+        snapshot = database.snapshot()
+        scans = list_scans(database)
+        growth_tables(database)
+    except StoreError as error:
+        if not problems:
+            raise
+        logger.debug("nothing but the logs can be checked: %s", error)
+        return _report_of_logs(problems)
     files = rows = 0
-    scans = list_scans(database)
     lidar = LIDAR_TABLES if has_scans(database) else ()
     for name in (*TABLES, *lidar, *growth_tables(database)):
         table = database.table(name)
@@ -123,6 +136,29 @@ def verify(database: Database) -> VerifyReport:
         rows=rows,
         problems=tuple(problems),
         orphans=tuple(orphans),
+    )
+
+
+def check_logs(database: Database) -> Iterator[DatabaseProblem]:
+    """Is every entry of every log there and whole, and does the log end where it was acknowledged to end?"""
+    for name in SPECS:
+        files = table_files(database.table_url(name), database.storage_options)
+        for problem in log_problems(files):
+            what = f"{problem.what}; `featuredb repair` says what can be done"
+            yield DatabaseProblem(where=f"{name}/{LOG}/{problem.name}", what=what)
+
+
+def _report_of_logs(problems: list[DatabaseProblem]) -> VerifyReport:
+    return VerifyReport(
+        version=-1,
+        maps=0,
+        scans=0,
+        candidates=0,
+        canaries=0,
+        files=0,
+        rows=0,
+        problems=tuple(problems),
+        orphans=(),
     )
 
 

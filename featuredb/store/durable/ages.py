@@ -2,13 +2,15 @@
 
 import uuid
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import datetime, timedelta
+from pathlib import Path
 from urllib.parse import unquote
 
 import pyarrow.fs as fs
 
 from featuredb.store.durable.log import list_entries, read_entry, utc
-from featuredb.store.durable.publish import SCRATCH
+from featuredb.store.durable.publish import SCRATCH, flush
 
 
 def store_time(files: fs.FileSystem) -> datetime:
@@ -61,3 +63,16 @@ def old_scratch_folders(files: fs.FileSystem, grace: timedelta) -> list[str]:
             newest[folder] = max(newest.get(folder, utc(info.mtime)), utc(info.mtime))
     now = store_time(files) if newest else None
     return sorted(folder for folder, time in newest.items() if now is not None and now - time >= grace)
+
+
+def remove_files(url: str, files: fs.FileSystem, paths: Iterable[str], folders: Iterable[str]) -> None:
+    """Remove files and folders of a table; those of a local one are gone for good."""
+    for path in paths:
+        with suppress(FileNotFoundError):  # another vacuum was faster
+            files.delete_file(path)
+    for folder in folders:
+        with suppress(FileNotFoundError):
+            files.delete_dir(folder)
+    if "://" not in url:
+        for parent in {Path(url, path).parent for path in paths}:
+            flush(parent)

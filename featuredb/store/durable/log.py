@@ -7,22 +7,37 @@ made, and those below one's own removed: concurrent writers need no lock, object
 """
 
 import json
+import logging
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.fs as fs
+import pyarrow.parquet as pq
 
 from featuredb.errors import StoreError
 
-LOG, ACKNOWLEDGED = "_delta_log", "_acknowledged"
+logger = logging.getLogger(__name__)
+
+LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
 _ENTRY = re.compile(r"(\d{20})\.json")
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
 _NAME = re.compile(r"\d{20}")
 _ADDED, _REMOVED = ("num_added_files", "numFilesAdded"), ("num_removed_files", "numFilesRemoved")
 
 Action = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LogProblem:
+    """What is wrong with a file of a log: its name, what, the version if it is an entry (no checkpoint)."""
+
+    name: str
+    what: str
+    version: int | None = None
 
 
 def entry_name(version: int) -> str:
@@ -94,37 +109,82 @@ def acknowledged(files: fs.FileSystem) -> int | None:
 
 
 def acknowledge(files: fs.FileSystem, version: int) -> None:
-    """Note that a version is committed. Without waiting for the disk: what a power cut takes of this is only
-    what `verify` would have compared with."""
-    files.create_dir(ACKNOWLEDGED)
-    files.open_output_stream(f"{ACKNOWLEDGED}/{version:020d}").close()
-    for older, _ in _numbered(files, ACKNOWLEDGED, _NAME):
-        if older < version:
-            try:
+    """Note that a version is committed, as well as the store allows.
+
+    It is not waited for: where this is lost, only what `verify` would have compared with is lost.
+    """
+    try:
+        files.create_dir(ACKNOWLEDGED)
+        files.open_output_stream(f"{ACKNOWLEDGED}/{version:020d}").close()
+        for older, _ in _numbered(files, ACKNOWLEDGED, _NAME):
+            if older < version:
                 files.delete_file(f"{ACKNOWLEDGED}/{older:020d}")
-            except FileNotFoundError:  # another writer was faster
-                continue
+    except FileNotFoundError:  # another writer was faster
+        return
+    except OSError as error:
+        logger.warning("cannot note version %d as committed: %s", version, error)
 
 
-def log_problems(files: fs.FileSystem) -> Iterator[tuple[str, str]]:
-    """What is wrong with a table's log: which file of it, and what. Reads every entry."""
+def forget_acknowledged(files: fs.FileSystem, version: int) -> None:
+    """Make a version the last acknowledged one, where later ones are lost."""
+    for later, _ in _numbered(files, ACKNOWLEDGED, _NAME):
+        if later > version:
+            files.delete_file(f"{ACKNOWLEDGED}/{later:020d}")
+    acknowledge(files, version)
+
+
+def check_end(url: str, files: fs.FileSystem, version: int) -> None:
+    """Is the log whole where a reader takes it for its end?
+
+    Raises:
+        StoreError: its last entry is empty or torn, or an acknowledged one is missing.
+    """
     head = acknowledged(files)
-    versions = list(list_entries(files))
+    if head is not None and head > version and (problem := entry_problem(files, head)) is not None:
+        raise damaged(url, LogProblem(entry_name(head), f"{problem}, though it was acknowledged", head))
+    # Object stores have no torn files; there `verify` reads what this would read each time.
+    if "://" not in url and (problem := entry_problem(files, version)) is not None:
+        raise damaged(url, LogProblem(entry_name(version), problem, version))
+
+
+def damaged(url: str, problem: LogProblem) -> StoreError:
+    """The error for a log that cannot be used, in words."""
+    return StoreError(
+        f"cannot open {url}: {LOG}/{problem.name}: {problem.what}; `featuredb repair` says what can be done"
+    )
+
+
+def log_problems(files: fs.FileSystem) -> Iterator[LogProblem]:
+    """What is wrong with a table's log; reads every entry."""
+    head, versions = acknowledged(files), list(list_entries(files))
     newest = max(versions, default=-1)
-    for version in sorted(set(range(newest)) - set(versions)):
-        yield entry_name(version), "it is missing, and newer ones are there"
-    for version in versions:
+    for version in range(max(newest, -1 if head is None else head) + 1):
         problem = entry_problem(files, version)
         if problem is not None:
-            yield entry_name(version), problem
-    if head is not None and head > newest:
-        yield (
-            entry_name(head),
-            f"it is missing: the log ends at {newest}, but version {head} was acknowledged",
-        )
-    for version, _ in _numbered(files, LOG, _CHECKPOINT):
-        if version > newest:
-            yield f"checkpoint of version {version}", f"the log ends before it, at {newest}"
+            late = (
+                f", though version {head} was acknowledged" if head is not None and version > newest else ""
+            )
+            yield LogProblem(entry_name(version), problem + late, version)
+    yield from _checkpoint_problems(files, newest)
+
+
+def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProblem]:
+    """Checkpoints repeat what the entries say; one that is broken hinders readers all the same."""
+    checkpoints = [version for version, _ in _numbered(files, LOG, _CHECKPOINT)]
+    for info in files.get_file_info(fs.FileSelector(LOG, allow_not_found=True)):
+        if info.base_name == LAST_CHECKPOINT:
+            try:
+                named = json.loads(_read(files, info.path))["version"]
+            except (ValueError, KeyError, TypeError):
+                yield LogProblem(info.base_name, "it is empty or torn")
+                continue
+            if named not in checkpoints or named > newest:
+                yield LogProblem(info.base_name, f"it names checkpoint {named}, which is not there")
+        elif _CHECKPOINT.fullmatch(info.base_name):
+            try:
+                pq.read_table(info.path, filesystem=files)
+            except (OSError, pa.ArrowException) as error:
+                yield LogProblem(info.base_name, f"it cannot be read: {' '.join(str(error).split())[:200]}")
 
 
 def _numbered(files: fs.FileSystem, folder: str, name: re.Pattern[str]) -> Iterator[tuple[int, datetime]]:

@@ -1,10 +1,12 @@
 """How tables are made, and what their Parquet files are written like."""
 
 import json
+from typing import Any
 
 from deltalake import ColumnProperties, DeltaTable, WriterProperties
 
-from featuredb.store.tables import FORMAT_VERSION, TableSpec
+from featuredb.errors import DatabaseNotFoundError, StoreError
+from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
 
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
@@ -41,3 +43,28 @@ def writer_properties(spec: TableSpec) -> WriterProperties:
         max_row_group_size=spec.row_group_rows,
         column_properties=dict.fromkeys(spec.plain_bytes, plain) or None,
     )
+
+
+def check_format(url: str, spec: TableSpec, metadata: Any) -> None:
+    """Is it a table of this system, of a format that can be read?
+
+    Raises:
+        DatabaseNotFoundError: another Delta table.
+        StoreError: another format.
+    """
+    if metadata.name != f"featuredb.{spec.name}":
+        raise DatabaseNotFoundError(f"{url} is a Delta table named {metadata.name!r}, not one of featuredb")
+    found = format_of(metadata)
+    if found not in READABLE_FORMATS:
+        raise StoreError(
+            f"{url} has featuredb format {found}, expected {READABLE_FORMATS[-1]} or older; "
+            "use a newer featuredb"
+        )
+
+
+def format_of(metadata: Any) -> Any:
+    """Format of a table of this system, None where it does not say."""
+    try:
+        return json.loads(metadata.description or "{}").get("featuredb_format")
+    except (ValueError, AttributeError):
+        return None
