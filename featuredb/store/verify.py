@@ -1,5 +1,6 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
+import hashlib
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+import pyarrow.fs as fs
 
 from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
@@ -21,7 +23,7 @@ from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
 from featuredb.store.durable.filesystem import table_files
-from featuredb.store.durable.log import LOG, log_problems
+from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
 from featuredb.store.scans import (
@@ -57,6 +59,7 @@ _LIGHT_COLUMNS = {
     POINTS: ["point_index", "easting", "northing", "height", "zone", "tile"],
     OBSERVATIONS: ["observation_index", "point_index", "image_id", "zone", "tile"],
 }
+_BLOCK_BYTES = 2**20
 _INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
 
 
@@ -163,8 +166,12 @@ def _report_of_logs(problems: list[DatabaseProblem]) -> VerifyReport:
 
 
 def check_files(table: Table) -> Iterator[DatabaseProblem]:
-    """Does every file open, and has it as many rows as the log says?"""
+    """Does every file open, has it as many rows as the log says, and the bytes that were written?"""
     expected = {file.path: file.rows for file in table.files()}
+    try:
+        digests = file_digests(table.storage)
+    except StoreError:  # said of the log
+        digests = {}
     for fragment in table.dataset().get_fragments():
         where = f"{table.spec.name}/{fragment.path}"
         try:
@@ -175,6 +182,11 @@ def check_files(table: Table) -> Iterator[DatabaseProblem]:
         if found != expected[fragment.path]:
             yield DatabaseProblem(
                 where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
+            )
+        digest = digests.get(fragment.path)
+        if digest is not None and digest != _sha256(table.storage, fragment.path):
+            yield DatabaseProblem(
+                where=where, what="its bytes are not those that were written: hashes differ"
             )
 
 
@@ -333,6 +345,14 @@ def _orphans(database: Database) -> list[str]:
     if has_candidates(database):
         orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
+
+
+def _sha256(files: fs.FileSystem, path: str) -> str:
+    digest = hashlib.sha256()
+    with files.open_input_file(path) as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _one_line(error: Exception) -> str:

@@ -49,7 +49,7 @@ def test_a_photo_that_is_not_the_one_that_was_given(database: Database) -> None:
     spoil_only_file(Path(database.url, CANDIDATE_IMAGES))
     with pytest.raises(StoreError, match="not the one that was contributed"):
         load_image(database, one)
-    (problem,) = verify(database).problems
+    *_, problem = verify(database).problems
     assert problem.where == f"candidate {one}"
     assert "hashes differ" in problem.what
 
@@ -59,7 +59,7 @@ def test_a_known_query_that_is_not_the_one_that_was_added(database: Database) ->
     spoil_only_file(Path(database.url, "canaries"))
     with pytest.raises(StoreError, match="not the one that was added"):
         load_canary_image(database, canary)
-    (problem,) = verify(database).problems
+    *_, problem = verify(database).problems
     assert problem.where == "canary gate"
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
+from urllib.parse import unquote
 
 import pyarrow as pa
 import pyarrow.fs as fs
@@ -23,6 +24,7 @@ from featuredb.errors import StoreError
 logger = logging.getLogger(__name__)
 
 LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
+DIGEST = "featuredb.sha256"  # tag of an added file
 _ENTRY = re.compile(r"(\d{20})\.json")
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
 _NAME = re.compile(r"\d{20}")
@@ -62,6 +64,8 @@ def read_actions(content: bytes) -> list[Action]:
     info = next((action["commitInfo"] for action in actions if "commitInfo" in action), None)
     if not isinstance(info, dict):
         raise ValueError("its line commitInfo is missing")
+    if not isinstance(info.get("timestamp"), int):
+        raise ValueError("its line commitInfo has no timestamp")
     if info.get("operation") == "CREATE TABLE" and not any("metaData" in action for action in actions):
         raise ValueError("it is torn: its line metaData is missing")
     metrics = info.get("operationMetrics")
@@ -101,6 +105,16 @@ def entry_problem(files: fs.FileSystem, version: int) -> str | None:
     except ValueError as error:
         return str(error)
     return None
+
+
+def file_digests(files: fs.FileSystem) -> dict[str, str]:
+    """The SHA-256 of each file that a log has ever named, by path; not of files of older releases.
+
+    Raises:
+        StoreError: an entry is missing, empty or torn.
+    """
+    adds = (a["add"] for v in list_entries(files) for a in read_entry(files, v) if "add" in a)
+    return {unquote(add["path"]): add["tags"][DIGEST] for add in adds if DIGEST in (add.get("tags") or {})}
 
 
 def acknowledged(files: fs.FileSystem) -> int | None:

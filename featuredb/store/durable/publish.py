@@ -17,7 +17,8 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from featuredb.errors import StoreError
-from featuredb.store.durable.log import LOG, Action, entry_name, read_actions
+from featuredb.file_digest import file_sha256
+from featuredb.store.durable.log import DIGEST, LOG, Action, entry_name, read_actions
 from featuredb.store.retry import StaleVersionError
 
 SCRATCH = "_scratch-"
@@ -58,6 +59,7 @@ def publish(entries: Iterable[Path], work: Path, table: Path, version: int, *, r
     for entry in entries:
         actions = read_actions(entry.read_bytes())
         paths = [path for path in _paths("add", actions) if not (work / path).is_symlink()]
+        _note_digests(work, entry, actions, paths)
         for path in paths:
             flush(work / path)
             make_folder((table / path).parent)
@@ -110,6 +112,14 @@ def flush(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _note_digests(work: Path, entry: Path, actions: list[Action], paths: list[str]) -> None:
+    """Let the entry say what bytes its files have: these have no checksums, and not all rows a digest."""
+    for action in actions:
+        if "add" in action and (path := unquote(action["add"]["path"])) in paths:
+            action["add"]["tags"] = {**(action["add"].get("tags") or {}), DIGEST: file_sha256(work / path)}
+    entry.write_text("".join(json.dumps(action, separators=(",", ":")) + "\n" for action in actions))
 
 
 def _paths(kind: str, actions: Iterable[Action]) -> list[str]:
