@@ -118,7 +118,7 @@ class Table:
             raise _why_not_opened(url, storage_options, version, error) from error
         if version is None:
             check_end(url, table_files(url, storage_options), int(delta.version()))
-        check_format(url, spec, delta.metadata())
+        check_format(url, spec, delta)
         return cls(url, delta, spec, storage_options)
 
     @property
@@ -195,7 +195,7 @@ class Table:
             DataFile(
                 path=unquote(row["path"]),
                 size_bytes=row["size_bytes"],
-                rows=row["num_records"],
+                rows=row.get("num_records") or 0,  # a damaged entry may not say
                 partition={name: row.get(f"partition.{name}") for name in self.spec.partition_by},
                 min_write_id=row.get("min.write_id"),
                 max_write_id=row.get("max.write_id"),

@@ -177,3 +177,26 @@ def test_a_broken_checkpoint_is_set_aside(
     repair(database, apply=True)  # the name of a checkpoint that is gone
     report = verify(database)
     assert (report.ok, report.maps) == (True, 5)
+
+
+def test_a_torn_name_of_the_checkpoint_hinders_no_commit(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    for seed in (3, 4):
+        Path(database.url, MAPS, "_delta_log", "_last_checkpoint").write_bytes(b"{")
+        database.commit_map(random_map(seed, extent_m=10.0))
+    assert verify(database).ok
+
+
+def test_a_log_whose_columns_or_counts_are_damaged(database: Database) -> None:
+    """One bit of an entry that still reads: a column's name, and the name of a file's number of rows."""
+    for version, word, other in ((0, b"point_index", b"qoint_index"), (1, b"numRecords", b"oumRecords")):
+        copy = Database(str(shutil.copytree(database.url, f"{database.url}-{version}")))
+        path = entry(copy, "points", version)
+        path.write_bytes(path.read_bytes().replace(word, other))
+        if version:
+            assert "expected 0 rows by the log, found 60" in str(verify(copy).problems)
+        else:
+            with pytest.raises(StoreError, match=r"columns that no format has \(qoint_index\)"):
+                verify(copy)

@@ -79,6 +79,14 @@ def read_actions(content: bytes) -> list[Action]:
     return actions
 
 
+def named_checkpoint(content: bytes) -> int | None:
+    """The version that the file `_last_checkpoint` names; None where it is empty or torn."""
+    try:
+        return int(json.loads(content)["version"])
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
 def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
     """The versions of which there is a log entry, in order, and when the store got each, UTC."""
     return dict(sorted(_numbered(files, LOG, _ENTRY)))
@@ -187,12 +195,10 @@ def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProbl
     checkpoints = [version for version, _ in _numbered(files, LOG, _CHECKPOINT)]
     for info in files.get_file_info(fs.FileSelector(LOG, allow_not_found=True)):
         if info.base_name == LAST_CHECKPOINT:
-            try:
-                named = json.loads(_read(files, info.path))["version"]
-            except (ValueError, KeyError, TypeError):
+            named = named_checkpoint(_read(files, info.path))
+            if named is None:
                 yield LogProblem(info.base_name, "it is empty or torn")
-                continue
-            if named not in checkpoints or named > newest:
+            elif named not in checkpoints or named > newest:
                 yield LogProblem(info.base_name, f"it names checkpoint {named}, which is not there")
         elif _CHECKPOINT.fullmatch(info.base_name):
             try:

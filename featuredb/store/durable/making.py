@@ -48,13 +48,14 @@ def writer_properties(spec: TableSpec) -> WriterProperties:
     )
 
 
-def check_format(url: str, spec: TableSpec, metadata: Any) -> None:
-    """Is it a table of this system, of a format that can be read?
+def check_format(url: str, spec: TableSpec, delta: Any) -> None:
+    """Is it a table of this system, of a format that can be read, with its columns?
 
     Raises:
         DatabaseNotFoundError: another Delta table.
-        StoreError: another format.
+        StoreError: another format, or a log that names other columns.
     """
+    metadata = delta.metadata()
     if metadata.name != f"featuredb.{spec.name}":
         raise DatabaseNotFoundError(f"{url} is a Delta table named {metadata.name!r}, not one of featuredb")
     found = format_of(metadata)
@@ -62,6 +63,12 @@ def check_format(url: str, spec: TableSpec, metadata: Any) -> None:
         raise StoreError(
             f"{url} has featuredb format {found}, expected {READABLE_FORMATS[-1]} or older; "
             "use a newer featuredb"
+        )
+    unknown = {field.name for field in delta.schema().fields} - set(spec.schema.names)
+    if unknown:
+        raise StoreError(
+            f"{url}: its log is damaged: it names columns that no format has ({', '.join(sorted(unknown))}); "
+            "restore the database from a backup"
         )
 
 

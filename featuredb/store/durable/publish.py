@@ -18,7 +18,15 @@ from urllib.parse import unquote
 
 from featuredb.errors import StoreError
 from featuredb.file_digest import file_sha256
-from featuredb.store.durable.log import DIGEST, LOG, Action, entry_name, read_actions
+from featuredb.store.durable.log import (
+    DIGEST,
+    LAST_CHECKPOINT,
+    LOG,
+    Action,
+    entry_name,
+    named_checkpoint,
+    read_actions,
+)
 from featuredb.store.retry import StaleVersionError
 
 SCRATCH = "_scratch-"
@@ -80,8 +88,9 @@ def publish(entries: Iterable[Path], work: Path, table: Path, version: int, *, r
 def links_of_log(table: Path, version: int) -> list[str]:
     """The files of a table's log, relative to the table, from which deltalake reads a version."""
     start, names = -1, []
-    last = table / LOG / "_last_checkpoint"
-    if last.exists() and (found := int(json.loads(last.read_bytes())["version"])) <= version:
+    last = table / LOG / LAST_CHECKPOINT
+    found = named_checkpoint(last.read_bytes()) if last.exists() else None
+    if found is not None and found <= version:
         start = found
         names = [last.name, *(p.name for p in last.parent.glob(f"{start:020d}.checkpoint*.parquet"))]
     names += [entry_name(v) for v in range(start + 1, version + 1)]
@@ -91,7 +100,7 @@ def links_of_log(table: Path, version: int) -> list[str]:
 def publish_checkpoint(work: Path, table: Path) -> None:
     """Take over the checkpoint that was made in a scratch folder, and then the file that names it."""
     made = [p for p in (work / LOG).glob("*.checkpoint*.parquet") if not p.is_symlink()]
-    for path in (*made, work / LOG / "_last_checkpoint"):
+    for path in (*made, work / LOG / LAST_CHECKPOINT):
         flush(path)
         path.replace(table / LOG / path.name)
         flush(table / LOG)
