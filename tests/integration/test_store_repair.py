@@ -97,6 +97,8 @@ def test_the_commands_say_what_is_wrong_and_what_to_do(
     assert run(capsys, "repair", database.url, "--apply")[0] == 0
     assert run(capsys, "repair", database.url)[0] == 0
     assert run(capsys, "verify", database.url)[0] == 0
+    code, said = run(capsys, "repair", f"{database.url}-elsewhere")
+    assert (code, "no featuredb table" in said) == (2, True)
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty"])

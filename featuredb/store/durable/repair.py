@@ -17,7 +17,7 @@ from featuredb.store.durable.log import (
     list_entries,
     log_problems,
 )
-from featuredb.store.tables import SPECS
+from featuredb.store.tables import MAPS, SPECS
 
 SET_ASIDE = "_set_aside"
 
@@ -50,6 +50,7 @@ def repair(database: Database, *, apply: bool = False, give_up_lost: bool = Fals
             said is lost, and the database goes back to the state before them.
 
     Raises:
+        DatabaseNotFoundError: there is no database.
         StoreError: the store failed.
     """
     try:
@@ -65,6 +66,8 @@ def _repair(database: Database, apply: bool, give_up_lost: bool) -> list[RepairS
         problems = list(log_problems(files))
         if problems:
             steps += _repair_table(name, files, problems, apply, give_up_lost)
+    if not steps:
+        database.table(MAPS)
     return steps
 
 
