@@ -1,4 +1,4 @@
-"""The commands that keep a database: init, maps, history, sql, verify, retire, rollback, compact, vacuum.
+"""The commands that keep a database: from init and maps to verify, repair and vacuum.
 
 `lineage` and `candidates` are in modules of their own and are registered here.
 """
@@ -65,6 +65,7 @@ def register(subparsers: Any) -> None:
     add_command(subparsers, "compact", run_compact, "merge small files")
     add_command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
+    _register_repair(subparsers)
 
 
 def run_init(args: argparse.Namespace) -> int:
@@ -148,9 +149,10 @@ def run_sql(args: argparse.Namespace) -> int:
 
 
 def run_verify(args: argparse.Namespace) -> int:
+    from featuredb.store import Database
     from featuredb.store.verify import verify
 
-    report = verify(open_database(args))
+    report = verify(Database(args.db, storage_options(args)))  # not opened: a damaged log is a finding
     if args.json:
         write_json(
             {
@@ -217,6 +219,26 @@ def run_upgrade(args: argparse.Namespace) -> int:
     return 0
 
 
+def run_repair(args: argparse.Namespace) -> int:
+    from featuredb.store import Database
+    from featuredb.store.durable.repair import repair
+
+    database = Database(args.db, storage_options(args))
+    steps = repair(database, apply=args.apply, give_up_lost=args.give_up_lost)
+    for step in steps:
+        done = step.action and ("done" if args.apply else "would be done")
+        sys.stdout.write(f"{step.where}: {step.what}\n")
+        sys.stdout.write(f"  {done or 'NOT REPAIRED'}: {step.action or step.advice}\n")
+    open_ends = [step for step in steps if not (step.action and args.apply)]
+    if not steps:
+        sys.stdout.write("the logs are whole, nothing to repair; `featuredb verify` checks the rest\n")
+    elif not args.apply:
+        sys.stdout.write("nothing was changed; --apply does it\n")
+    elif not open_ends:
+        sys.stdout.write("now run `featuredb verify`\n")
+    return 1 if open_ends else 0
+
+
 def run_vacuum(args: argparse.Namespace) -> int:
     from featuredb.store.maintenance import vacuum
 
@@ -273,3 +295,15 @@ def _register_vacuum(subparsers: Any) -> None:
         help="unused files stay this long for running readers (default: %(default)s)",
     )
     parser.add_argument("--dry-run", action="store_true", help="only say what would be removed")
+
+
+def _register_repair(subparsers: Any) -> None:
+    parser = add_command(
+        subparsers, "repair", run_repair, "say what is damaged in the logs; with --apply, mend what can be"
+    )
+    parser.add_argument("--apply", action="store_true", help="do it; files are moved, none is deleted")
+    parser.add_argument(
+        "--give-up-lost",
+        action="store_true",
+        help="go back also behind commits that were done and whose log entry is lost",
+    )

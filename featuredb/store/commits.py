@@ -1,16 +1,16 @@
 """What every commit has in common: its name, its place as the very next version, result and history."""
 
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
 import pyarrow as pa
 
-from featuredb.errors import SnapshotNotFoundError, StoreError
+from featuredb.errors import ConflictError, SnapshotNotFoundError, StoreError
 from featuredb.store.changes import Change
 from featuredb.store.delta import Commit, Table
-from featuredb.store.encode import Row, map_rows_table
+from featuredb.store.encode import EncodedMap, Row, map_rows_table
 from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
 
 # A commit whose child rows are older than this is refused, because a vacuum may already have taken them for
@@ -146,6 +146,21 @@ def oldest_kept_version(commits: Sequence[Commit]) -> int:
 def upgrade_metadata() -> dict[str, str]:
     """What an upgrade's commit to `maps` says about itself."""
     return {OPERATION: "upgrade", CHANGED: "", REASON: f"to format {FORMAT_VERSION}"}
+
+
+def check_children(encoded: EncodedMap, table_of: Callable[[str], Table]) -> None:
+    """Refuse to name rows that have gone.
+
+    Raises:
+        ConflictError: a vacuum of less grace than this commit took has removed them.
+    """
+    for name, rows in encoded.children.items():
+        found = table_of(name).count("write_id", encoded.row["write_id"]) if len(rows) else 0
+        if found != len(rows):
+            raise ConflictError(
+                f"commit of {encoded.row['map_id']}: expected its {len(rows)} rows of {name}, found {found}; "
+                "a vacuum has removed them, and nothing was committed: commit again"
+            )
 
 
 def apply_change(

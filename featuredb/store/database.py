@@ -5,6 +5,7 @@ import threading
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from time import monotonic
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import MapStatus
@@ -16,6 +17,7 @@ from featuredb.store.commits import (
     HistoryEntry,
     StatusResult,
     apply_change,
+    check_children,
     commit_as_of,
     history_entry,
     new_write_id,
@@ -170,7 +172,7 @@ class Database:
             feature_map.status == RETIRED and not why.get(feature_map.map_id) for feature_map in feature_maps
         ):
             raise StoreError("commit_maps: expected active or quarantined maps, found a retired one")
-        started = datetime.now(UTC)
+        started = monotonic()
         encoded: dict[str, EncodedMap] = {}
         digests = {m.map_id: content_digest(m) for m in feature_maps if m.map_id in replaces}
 
@@ -185,8 +187,10 @@ class Database:
                 if feature_map.map_id not in encoded:
                     encoded[feature_map.map_id] = self._write_children(feature_map)
                     encoded[feature_map.map_id].row["status_reason"] = why.get(feature_map.map_id, "")
-            if datetime.now(UTC) - started > LONGEST_COMMIT:
+            if monotonic() - started > LONGEST_COMMIT.total_seconds():
                 raise ConflictError(f"commit of {', '.join(ids)} took over {LONGEST_COMMIT}; commit again")
+            for feature_map in pending:
+                check_children(encoded[feature_map.map_id], self.table)
             version = maps.version
             flagged: tuple[str, ...] = ()
             if pending:

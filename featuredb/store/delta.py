@@ -8,15 +8,11 @@ What deltalake 1.6 does, and tests/integration/test_delta_behaviour.py pins:
   the next log entry exists already, it raises. All commits to `maps` go this way.
 """
 
-import atexit
-import json
 import re
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cache
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 from urllib.parse import unquote
@@ -25,24 +21,31 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.fs as fs
 from deltalake import (
-    ColumnProperties,
     CommitProperties,
     DeltaTable,
     PostCommitHookProperties,
     Schema,
-    WriterProperties,
     write_deltalake,
 )
 from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
 
 from featuredb.errors import ConflictError, DatabaseNotFoundError, SnapshotNotFoundError, StoreError
+from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
+from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.local import Sight, commit_locally, create_locally
+from featuredb.store.durable.log import acknowledge, check_end, damaged, log_problems
+from featuredb.store.durable.making import (
+    check_format,
+    create_table,
+    description,
+    format_of,
+    writer_properties,
+)
 from featuredb.store.retry import ATTEMPTS, StaleVersionError, retry_stale
-from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
+from featuredb.store.tables import FORMAT_VERSION, TableSpec
 
 T = TypeVar("T")
 
-# The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
-LOG_RETENTION = "interval 36500 days"
 _HEX = re.compile(r"[0-9a-f]{1,64}")
 
 
@@ -85,25 +88,17 @@ class Table:
     @classmethod
     def create(cls, url: str, spec: TableSpec, storage_options: dict[str, str] | None) -> None:
         """Create the table where there is none; harmless where there is one."""
+        if cls.exists(url, storage_options):
+            return
         try:
-            if "://" not in url:
-                Path(url).mkdir(parents=True, exist_ok=True)
-            DeltaTable.create(
-                url,
-                spec.schema,
-                mode="ignore",
-                partition_by=list(spec.partition_by) or None,
-                name=f"featuredb.{spec.name}",
-                description=_description(),
-                configuration={
-                    "delta.logRetentionDuration": LOG_RETENTION,
-                    "delta.dataSkippingStatsColumns": ",".join(spec.statistics),
-                },
-                storage_options=storage_options,
-            )
-        except (DeltaError, OSError) as error:
+            if "://" in url:
+                create_table(url, spec, storage_options)
+            else:
+                create_locally(Path(url), lambda work: create_table(work, spec, None))
+            acknowledge(table_files(url, storage_options), 0)
+        except (DeltaError, OSError, StaleVersionError) as error:
             # Two creators at once: the loser finds the winner's table.
-            if not isinstance(error, DeltaError) or not cls.exists(url, storage_options):
+            if isinstance(error, OSError) or not cls.exists(url, storage_options):
                 raise StoreError(f"cannot create table {url}: {error}") from error
 
     @classmethod
@@ -119,15 +114,11 @@ class Table:
         """
         try:
             delta = DeltaTable(url, version=version, storage_options=storage_options)
-        except TableNotFoundError as error:
-            raise DatabaseNotFoundError(
-                f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
-            ) from error
         except (DeltaError, OSError) as error:
-            if version is not None:
-                raise SnapshotNotFoundError(f"{url} has no version {version}: {error}") from error
-            raise StoreError(f"cannot open {url}: {error}") from error
-        _check_format(url, spec, delta)
+            raise _why_not_opened(url, storage_options, version, error) from error
+        if version is None:
+            check_end(url, table_files(url, storage_options), int(delta.version()))
+        check_format(url, spec, delta)
         return cls(url, delta, spec, storage_options)
 
     @property
@@ -135,9 +126,14 @@ class Table:
         return int(self._delta.version())
 
     @property
+    def storage(self) -> fs.FileSystem:
+        """The table's files; paths are relative to it."""
+        return table_files(self._url, self._storage_options)
+
+    @property
     def format(self) -> int:
         """Format of the table, one of READABLE_FORMATS."""
-        return int(_format_of(self._delta.metadata()))
+        return int(format_of(self._delta.metadata()))
 
     def upgrade(self, rows: pa.Table | None = None, metadata: Mapping[str, str] | None = None) -> None:
         """Make a table of the newest format of one of an older one; harmless where it is of the newest.
@@ -158,11 +154,14 @@ class Table:
         new = [field for field in Schema.from_arrow(self.spec.schema).fields if field.name not in there]
         if rows is not None and new:
             self.swap(rows, mode="overwrite", metadata=dict(metadata or {}), schema_mode="overwrite")
-        with _as_store_error(f"cannot upgrade {self._delta.table_uri}"):
-            if rows is None and new:
-                self._delta.alter.add_columns(new)
-            self._delta.alter.set_table_description(_description())
             self.refresh()
+
+        def alter(delta: Any) -> None:
+            if rows is None and new:
+                delta.alter.add_columns(new)
+            delta.alter.set_table_description(description())
+
+        self._commit("upgrade", alter, "columns")
 
     def refresh(self) -> None:
         """Move to the newest version.
@@ -170,22 +169,24 @@ class Table:
         Raises:
             StoreError: the store cannot be reached.
         """
-        with _as_store_error(f"cannot read the log of {self._delta.table_uri}"):
+        with _as_store_error(f"cannot read the log of {self._url}"):
             self._delta.update_incremental()
+            check_end(self._url, self.storage, self.version)
 
     def dataset(self, pruning: Sequence[tuple[str, str, Any]] = ()) -> ds.Dataset:
         """An Arrow dataset over the files that the log does not exclude by (column, operator, value)."""
-        with _as_store_error(f"cannot read {self._delta.table_uri}"):
+        filesystem = self.storage
+        if "://" in self._url:
+            filesystem = None  # deltalake's, which knows the files' sizes
+        with _as_store_error(f"cannot read {self._url}"):
             return self._delta.to_pyarrow_dataset(
-                file_pruning_predicate=list(pruning) or None, filesystem=self._filesystem()
+                file_pruning_predicate=list(pruning) or None, filesystem=filesystem
             )
 
-    def _filesystem(self) -> fs.FileSystem | None:
-        """Arrow's own for a local table; None, meaning deltalake's, for an object store."""
-        if "://" not in self._url:
-            return fs.SubTreeFileSystem(str(Path(self._url).absolute()), fs.LocalFileSystem())
-        _let_arrow_finish_at_exit()
-        return None
+    def count(self, column: str, value: str) -> int:
+        """The rows with a value in a column of which the log has statistics."""
+        with _as_store_error(f"cannot read {self._url}"):
+            return int(self.dataset([(column, "=", value)]).count_rows(filter=ds.field(column) == value))
 
     def files(self) -> list[DataFile]:
         """The live files."""
@@ -194,7 +195,7 @@ class Table:
             DataFile(
                 path=unquote(row["path"]),
                 size_bytes=row["size_bytes"],
-                rows=row["num_records"],
+                rows=row.get("num_records") or 0,  # a damaged entry may not say
                 partition={name: row.get(f"partition.{name}") for name in self.spec.partition_by},
                 min_write_id=row.get("min.write_id"),
                 max_write_id=row.get("max.write_id"),
@@ -204,7 +205,7 @@ class Table:
 
     def commits(self, limit: int | None = None) -> list[Commit]:
         """The log, newest first; each entry is one small file to read."""
-        with _as_store_error(f"cannot read the log of {self._delta.table_uri}"):
+        with _as_store_error(f"cannot read the log of {self._url}"):
             entries = self._delta.history(limit)
         return [
             Commit(
@@ -222,7 +223,13 @@ class Table:
         Raises:
             ConflictError, StoreError
         """
-        self._write(rows, mode="append", properties=CommitProperties(max_commit_retries=ATTEMPTS))
+        properties = CommitProperties(max_commit_retries=ATTEMPTS)
+        try:
+            self._commit(
+                "write", lambda delta: self._write(delta, rows, "append", properties), "columns", rebase=True
+            )
+        except StaleVersionError as error:
+            raise ConflictError(f"{error}; run the command again") from error
 
     def swap(
         self,
@@ -239,12 +246,11 @@ class Table:
         """
         expected = self.version + 1
         properties = CommitProperties(max_commit_retries=0, custom_metadata=metadata)
-        try:
-            self._write(rows, mode=mode, properties=properties, schema_mode=schema_mode)
-        except ConflictError as error:
-            raise StaleVersionError(str(error)) from error
-        if self.version != expected:
-            raise StoreError(f"{self._delta.table_uri}: expected version {expected}, found {self.version}")
+        found, _ = self._commit(
+            "write", lambda delta: self._write(delta, rows, mode, properties, schema_mode), "files"
+        )
+        if found != expected:
+            raise StoreError(f"{self._url}: expected version {expected}, found {found}")
         return expected
 
     def delete_writes(self, write_ids: Iterable[str]) -> None:
@@ -263,9 +269,9 @@ class Table:
             raise StoreError(f"{self.spec.name}: expected ids in hexadecimal, found {wanted[:3]}")
         quoted = ", ".join(f"'{value}'" for value in wanted)
         metrics = self._maintain(
-            lambda: self._delta.delete(
+            lambda delta: delta.delete(
                 f"{column} IN ({quoted})",
-                writer_properties=_writer_properties(self.spec),
+                writer_properties=writer_properties(self.spec),
                 commit_properties=CommitProperties(custom_metadata=dict(metadata or {})),
             )
         )
@@ -274,56 +280,79 @@ class Table:
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""
         metrics = self._maintain(
-            lambda: self._delta.optimize.compact(writer_properties=_writer_properties(self.spec))
+            lambda delta: delta.optimize.compact(writer_properties=writer_properties(self.spec))
         )
         return int(metrics["numFilesRemoved"]) - int(metrics["numFilesAdded"])
 
     def vacuum(
         self,
-        retention: timedelta,
+        grace: timedelta,
         *,
         dry_run: bool,
         keep_versions: Sequence[int] = (),
         untracked: bool = True,
     ) -> list[str]:
-        """Delete files that no version within the retention uses; returns their paths.
+        """Delete files that no version uses any more; returns their paths.
 
         Args:
+            grace: files that were written or dropped within this time, by the store's clock, stay.
+            keep_versions: whose files stay, beside those of the newest.
             untracked: also files that the log does not know: those of crashed writers, but with a short
-                retention those of a writer at work, too.
+                grace those of a writer at work, too.
         """
-        with _as_store_error(f"cannot vacuum {self._delta.table_uri}"):
-            removed = self._delta.vacuum(
-                retention_hours=round(retention.total_seconds() / 3600),
-                dry_run=dry_run,
+        with _as_store_error(f"cannot vacuum {self._url}"):
+            unused = self._delta.vacuum(
+                retention_hours=0,
+                dry_run=True,
                 enforce_retention_duration=False,
                 full=untracked,
                 keep_versions=list(keep_versions) or None,
             )
-        return [str(path) for path in removed]
+            old = old_files(self.storage, [str(path) for path in unused], grace) if unused else []
+            folders = old_scratch_folders(self.storage, grace) if untracked else []
+            if not dry_run:
+                remove_files(self._url, self.storage, old, folders)
+        return [*old, *folders]
 
     def _write(
         self,
+        delta: Any,
         rows: pa.Table | pa.RecordBatchReader,
-        *,
         mode: Literal["append", "overwrite"],
         properties: CommitProperties,
         schema_mode: Literal["overwrite"] | None = None,
     ) -> None:
+        write_deltalake(
+            delta,
+            rows if schema_mode else self._in_its_format(rows),
+            mode=mode,
+            schema_mode=schema_mode,
+            writer_properties=writer_properties(self.spec),
+            commit_properties=properties,
+            post_commithook_properties=PostCommitHookProperties(cleanup_expired_logs=False),
+        )
+
+    def _commit(
+        self, what: str, operation: Callable[[Any], T], sight: Sight, *, rebase: bool = False
+    ) -> tuple[int, T]:
+        """Run what commits to a deltalake table; returns the new version and what it gave.
+
+        Raises:
+            StaleVersionError: others have committed; nothing of this can be seen.
+            StoreError: the store failed.
+        """
         try:
-            write_deltalake(
-                self._delta,
-                rows if schema_mode else self._in_its_format(rows),
-                mode=mode,
-                schema_mode=schema_mode,
-                writer_properties=_writer_properties(self.spec),
-                commit_properties=properties,
-                post_commithook_properties=PostCommitHookProperties(cleanup_expired_logs=False),
-            )
+            if "://" not in self._url:
+                done = commit_locally(Path(self._url), self._delta, operation, sight, rebase=rebase)
+            else:  # what an object store has taken is durable, and it gets data files before the entry
+                result = operation(self._delta)
+                done = self.version, result
+            acknowledge(self.storage, done[0])
+            return done
         except CommitFailedError as error:
-            raise ConflictError(f"commit to {self._delta.table_uri}: {error}") from error
+            raise StaleVersionError(f"{what} of {self._url}: {error}") from error
         except (DeltaError, OSError) as error:
-            raise StoreError(f"cannot write {self._delta.table_uri}: {error}") from error
+            raise StoreError(f"cannot {what} {self._url}: {error}") from error
 
     def _in_its_format(self, rows: pa.Table | pa.RecordBatchReader) -> pa.Table | pa.RecordBatchReader:
         """Rows without the columns that a table of an older format does not have."""
@@ -332,17 +361,12 @@ class Table:
         there = {field.name for field in self._delta.schema().fields}
         return rows.select([name for name in rows.column_names if name in there])
 
-    def _maintain(self, operation: Callable[[], T]) -> T:
+    def _maintain(self, operation: Callable[[Any], T]) -> T:
         """Run an operation that rewrites files, again if a concurrent writer got in between."""
 
         def attempt() -> T:
             self.refresh()
-            try:
-                return operation()
-            except CommitFailedError as error:
-                raise StaleVersionError(str(error)) from error
-            except (DeltaError, OSError) as error:
-                raise StoreError(f"cannot maintain {self._delta.table_uri}: {error}") from error
+            return self._commit("maintain", operation, "rows", rebase=True)[1]
 
         return retry_stale(f"maintenance of {self.spec.name}", attempt)
 
@@ -355,42 +379,19 @@ def _as_store_error(what: str) -> Iterator[None]:
         raise StoreError(f"{what}: {error}") from error
 
 
-def _check_format(url: str, spec: TableSpec, delta: Any) -> None:
-    metadata = delta.metadata()
-    if metadata.name != f"featuredb.{spec.name}":
-        raise DatabaseNotFoundError(f"{url} is a Delta table named {metadata.name!r}, not one of featuredb")
-    found = _format_of(metadata)
-    if found not in READABLE_FORMATS:
-        raise StoreError(
-            f"{url} has featuredb format {found}, expected {READABLE_FORMATS[-1]} or older; "
-            "use a newer featuredb"
+def _why_not_opened(
+    url: str, storage_options: dict[str, str] | None, version: int | None, error: Exception
+) -> StoreError:
+    try:
+        problem = next(log_problems(table_files(url, storage_options)), None)
+    except (OSError, pa.ArrowException):
+        problem = None
+    if problem is not None:
+        return damaged(url, problem)
+    if isinstance(error, TableNotFoundError):
+        return DatabaseNotFoundError(
+            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
         )
-
-
-def _format_of(metadata: Any) -> Any:
-    return json.loads(metadata.description or "{}").get("featuredb_format")
-
-
-def _description() -> str:
-    return json.dumps({"featuredb_format": FORMAT_VERSION})
-
-
-def _writer_properties(spec: TableSpec) -> WriterProperties:
-    # Lengths apart from bytes: 128-byte descriptors take 108 bytes a row instead of 111, and write faster.
-    plain = ColumnProperties(dictionary_enabled=False, encoding="DELTA_LENGTH_BYTE_ARRAY")
-    return WriterProperties(
-        compression="ZSTD",
-        max_row_group_size=spec.row_group_rows,
-        column_properties=dict.fromkeys(spec.plain_bytes, plain) or None,
-    )
-
-
-@cache
-def _let_arrow_finish_at_exit() -> None:
-    """Give Arrow's reading threads a moment at the interpreter's end.
-
-    deltalake's filesystem hands them Python's buffers, and one that is released after the interpreter has
-    ended aborts the process: 12 of 360 short programs on two busy cores, none of 720 with this pause. Local
-    tables are read by Arrow's own filesystem, which holds none (0 of 360).
-    """
-    atexit.register(time.sleep, 0.1)
+    if version is not None:
+        return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
+    return StoreError(f"cannot open {url}: {error}")

@@ -1,18 +1,19 @@
 """Compaction and vacuum: fewer files, and no rows that nothing can see any more."""
 
-from collections.abc import Iterable
+from collections import defaultdict
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 
 import pyarrow.compute as pc
-import pyarrow.dataset as ds
 
 from featuredb.store.candidates.events import has_candidates
 from featuredb.store.candidates.upkeep import growth_tables, named_writes, superfluous_images
 from featuredb.store.changes import RETIRED, Change
-from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows, write_time
+from featuredb.store.commits import KEPT_FROM, apply_change, oldest_kept_version, read_rows
 from featuredb.store.database import Database
-from featuredb.store.delta import Commit, Table
+from featuredb.store.delta import Table
+from featuredb.store.durable.ages import store_time, write_times
+from featuredb.store.durable.log import list_entries
 from featuredb.store.retry import retry_stale
 from featuredb.store.scans import has_scans, retired_since, scan_rows
 from featuredb.store.tables import CANDIDATE_IMAGES, CHILD_TABLES, LIDAR_POINTS, MAPS, TABLES
@@ -59,17 +60,13 @@ def vacuum(
         ConflictError, StoreError
     """
     options = options or VacuumOptions()
-    now = datetime.now(UTC)
+    now = store_time(database.table(MAPS).storage)
     kept_from = retry_stale("vacuum", lambda: _announce(database, options, now, dry_run))
     named = write_ids_of_history(database, kept_from)
     grace = timedelta(hours=options.orphan_grace_h)
     orphans: set[str] = set()
     for name in CHILD_TABLES:
-        table = database.table(name)
-        found = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
-        if found and not dry_run:
-            table.delete_writes(found)
-        orphans |= found
+        orphans |= _remove_orphans(database.table(name), named, now - grace, dry_run)
     orphans |= _vacuum_scans(database, options, now, dry_run)
     unnamed, refused = _vacuum_candidates(database, options, now, dry_run)
     orphans |= unnamed
@@ -96,19 +93,33 @@ def write_ids_of_history(database: Database, first_version: int) -> set[str]:
     return named
 
 
-def write_ids_in(table: Table) -> set[str]:
-    """All write ids that a child table holds: from the log where a file has one, else from the file."""
-    found: set[str] = set()
-    mixed = False
+def write_ids_in(table: Table) -> dict[str, set[str]]:
+    """All write ids that a child table holds, from the log where a file has one, else from the file.
+
+    Returns:
+        The paths of the files that hold each.
+    """
+    found: defaultdict[str, set[str]] = defaultdict(set)
+    mixed = set()
     for file in table.files():
         if file.min_write_id is not None and file.min_write_id == file.max_write_id:
-            found.add(file.min_write_id)
+            found[file.min_write_id].add(file.path)
         else:
-            mixed = True
-    if mixed:
-        unknown = ~ds.field("write_id").isin(sorted(found)) if found else None
-        for batch in table.dataset().to_batches(columns=["write_id"], filter=unknown, use_threads=False):
-            found.update(pc.unique(batch.column("write_id")).to_pylist())
+            mixed.add(file.path)
+    for fragment in table.dataset().get_fragments() if mixed else ():
+        if fragment.path in mixed:
+            for batch in fragment.to_batches(columns=["write_id"], use_threads=False):
+                for write_id in pc.unique(batch.column("write_id")).to_pylist():
+                    found[write_id].add(fragment.path)
+    return dict(found)
+
+
+def _remove_orphans(table: Table, named: set[str], before: datetime, dry_run: bool) -> set[str]:
+    """Remove rows that nothing names and that the store had before a time; returns their write ids."""
+    orphans = {write_id: paths for write_id, paths in write_ids_in(table).items() if write_id not in named}
+    found = {write_id for write_id, time in write_times(orphans, table.storage).items() if time <= before}
+    if found and not dry_run:
+        table.delete_writes(found)
     return found
 
 
@@ -126,8 +137,10 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     """Commit from which version on the past is kept; returns that version."""
     maps = database.table(MAPS)
     commits = maps.commits()
-    kept_from = _oldest_within(commits, now - timedelta(hours=options.history_h))
-    kept_from = max(kept_from, oldest_kept_version(commits))
+    # The version that was newest then, and all later ones; all if none is so old.
+    cutoff = now - timedelta(hours=options.history_h)
+    old = [version for version, time in list_entries(maps.storage).items() if time <= cutoff]
+    kept_from = max(*old, oldest_kept_version(commits), 0)
     if not dry_run and kept_from > oldest_kept_version(commits):
         change = Change(rows=read_rows(maps), added=[], only_adds=False)
         reason = f"versions before {kept_from} are gone"
@@ -142,11 +155,6 @@ def _announce(database: Database, options: VacuumOptions, now: datetime, dry_run
     return kept_from
 
 
-def _oldest_within(commits: Iterable[Commit], cutoff: datetime) -> int:
-    """The version that was newest at the cutoff (all later ones are kept, too); 0 if none is so old."""
-    return max((commit.version for commit in commits if commit.timestamp <= cutoff), default=0)
-
-
 def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry_run: bool) -> set[str]:
     """Remove points that no scan names, and those of scans that were retired before the kept history."""
     if not has_scans(database):
@@ -158,12 +166,8 @@ def _vacuum_scans(database: Database, options: VacuumOptions, now: datetime, dry
         for row in scan_rows(database)
         if row["status"] != RETIRED or now - since.get(row["scan_id"], now) < history
     }
-    table = database.table(LIDAR_POINTS)
     grace = timedelta(hours=options.orphan_grace_h)
-    found = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
-    if found and not dry_run:
-        table.delete_writes(found)
-    return found
+    return _remove_orphans(database.table(LIDAR_POINTS), named, now - grace, dry_run)
 
 
 def _vacuum_candidates(
@@ -175,10 +179,9 @@ def _vacuum_candidates(
     table = database.table(CANDIDATE_IMAGES)
     named = named_writes(database)
     grace = timedelta(hours=options.orphan_grace_h)
-    orphans = {w for w in write_ids_in(table) - named if now - write_time(w) >= grace}
-    refused = superfluous_images(database, now, timedelta(hours=options.history_h), grace)
-    if orphans and not dry_run:
-        table.delete_writes(orphans)
+    fresh = {w for w, time in write_times(write_ids_in(table), table.storage).items() if now - time < grace}
+    refused = superfluous_images(database, now, timedelta(hours=options.history_h), fresh)
+    orphans = _remove_orphans(table, named, now - grace, dry_run)
     if refused and not dry_run:
         table.delete_rows("candidate_id", refused)
     return orphans, refused

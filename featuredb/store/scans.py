@@ -9,6 +9,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from featuredb.store.changes import RETIRED
 from featuredb.store.commits import CHANGED, LONGEST_COMMIT, OPERATION, REASON, new_write_id, read_rows
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
+from featuredb.store.durable.log import list_entries
 from featuredb.store.encode import Row
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import UtmBox
@@ -147,8 +149,8 @@ def commit_scan(
     visible = _live(scan_rows(database), row["scan_id"])
     if visible is not None:
         return False, visible["write_id"]
-    started = datetime.now(UTC)
-    write_id = new_write_id(started)
+    started = monotonic()
+    write_id = new_write_id(datetime.now(UTC))
     checksum = PointsChecksum()
     written = 0
 
@@ -161,13 +163,15 @@ def commit_scan(
             on_progress(written)
             yield from table.to_batches()
 
-    points_table = database.table(LIDAR_POINTS)
     for group in groups:
-        points_table.append(pa.RecordBatchReader.from_batches(SPECS[LIDAR_POINTS].schema, batches(group)))
-    if datetime.now(UTC) - started > LONGEST_COMMIT:
+        stream = pa.RecordBatchReader.from_batches(SPECS[LIDAR_POINTS].schema, batches(group))
+        database.table(LIDAR_POINTS).append(stream)
+    if monotonic() - started > LONGEST_COMMIT.total_seconds():
         raise ConflictError(f"commit of scan {row['scan_id']} took over {LONGEST_COMMIT}; add it again")
     if written != row["points"]:
         raise StoreError(f"scan {row['scan_id']}: expected {row['points']} points, {written} were written")
+    if (left := database.table(LIDAR_POINTS).count("write_id", write_id)) != written:
+        raise ConflictError(f"scan {row['scan_id']}: a vacuum left {left} of {written} points; add it again")
     full = {
         **row, "write_id": write_id, "points_checksum": checksum.text(), "status": "active", "status_reason":
         "", "created_at": datetime.now(UTC),
@@ -238,12 +242,14 @@ def scan_batches(database: Database, scan: ScanSummary, columns: Sequence[str]) 
 
 
 def retired_since(database: Database) -> dict[str, datetime]:
-    """When each scan was retired last, by scan id."""
-    commits = database.table(LIDAR).commits() if has_scans(database) else []
-    times: dict[str, datetime] = {}
-    for commit in commits:  # newest first
+    """When each scan was retired last, by scan id and the store's time."""
+    if not has_scans(database):
+        return {}
+    table = database.table(LIDAR)
+    times, entries = {}, list_entries(table.storage)
+    for commit in reversed(table.commits()):  # oldest first
         if commit.metadata.get(OPERATION) == "retire":
-            times.setdefault(commit.metadata.get(CHANGED, ""), commit.timestamp)
+            times[commit.metadata.get(CHANGED, "")] = entries[commit.version]
     return times
 
 

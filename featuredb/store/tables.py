@@ -45,7 +45,7 @@ class TableSpec:
         schema: Arrow schema of the rows, in Delta's types (signed integers, no fixed-size lists).
         partition_by: partition columns, () for none.
         statistics: columns whose minimum and maximum go into the log; the others would only bloat it.
-        plain_bytes: columns of bytes without repetition, for which a dictionary is a waste.
+        plain_bytes: columns of bytes without repetition, for which a dictionary and statistics are a waste.
         row_group_rows: rows that are read together.
     """
 

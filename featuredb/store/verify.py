@@ -1,5 +1,7 @@
 """Does the database hold what it says? Every file, every row and every cross-reference of one snapshot."""
 
+import hashlib
+import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -7,8 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+import pyarrow.fs as fs
 
-from featuredb.errors import FeatureDbError
+from featuredb.errors import FeatureDbError, StoreError
 from featuredb.geo.tiles import tile_of
 from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
@@ -19,6 +22,8 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
+from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
 from featuredb.store.maintenance import write_ids_in, write_ids_of_history
 from featuredb.store.scans import (
@@ -43,14 +48,18 @@ from featuredb.store.tables import (
     OBSERVATIONS,
     OWN_COORDINATES,
     POINTS,
+    SPECS,
     TABLES,
 )
+
+logger = logging.getLogger(__name__)
 
 _LIGHT_COLUMNS = {
     IMAGES: ["image_index", "image_id", "camera_id", "easting", "northing", "height", "zone", "tile"],
     POINTS: ["point_index", "easting", "northing", "height", "zone", "tile"],
     OBSERVATIONS: ["observation_index", "point_index", "image_id", "zone", "tile"],
 }
+_BLOCK_BYTES = 2**20
 _INDEX = {IMAGES: "image_index", POINTS: "point_index", OBSERVATIONS: "observation_index"}
 
 
@@ -67,7 +76,7 @@ class VerifyReport:
     """What was looked at and what is wrong.
 
     Attributes:
-        version: of the snapshot that was checked.
+        version: of the snapshot that was checked; -1 where a log is so damaged that none can be read.
         maps, scans, candidates, canaries, files, rows: how many of each were checked.
         problems: damage; empty in a sound database.
         orphans: write ids of child rows that no version names, left by a crash or written just now by a
@@ -93,12 +102,19 @@ def verify(database: Database) -> VerifyReport:
     """Check the newest snapshot, scans, contributed photos and known queries; reads all of them once.
 
     Raises:
-        StoreError: the table `maps` itself, without which nothing can be said, is not readable.
+        StoreError: the store cannot be reached, or there is no database.
     """
-    snapshot = database.snapshot()
-    problems: list[DatabaseProblem] = []
+    problems = list(check_logs(database))
+    try:
+        snapshot = database.snapshot()
+        scans = list_scans(database)
+        growth_tables(database)
+    except StoreError as error:
+        if not problems:
+            raise
+        logger.debug("nothing but the logs can be checked: %s", error)
+        return _report_of_logs(problems)
     files = rows = 0
-    scans = list_scans(database)
     lidar = LIDAR_TABLES if has_scans(database) else ()
     for name in (*TABLES, *lidar, *growth_tables(database)):
         table = database.table(name)
@@ -126,9 +142,36 @@ def verify(database: Database) -> VerifyReport:
     )
 
 
+def check_logs(database: Database) -> Iterator[DatabaseProblem]:
+    """Is every entry of every log there and whole, and does the log end where it was acknowledged to end?"""
+    for name in SPECS:
+        files = table_files(database.table_url(name), database.storage_options)
+        for problem in log_problems(files):
+            what = f"{problem.what}; `featuredb repair` says what can be done"
+            yield DatabaseProblem(where=f"{name}/{LOG}/{problem.name}", what=what)
+
+
+def _report_of_logs(problems: list[DatabaseProblem]) -> VerifyReport:
+    return VerifyReport(
+        version=-1,
+        maps=0,
+        scans=0,
+        candidates=0,
+        canaries=0,
+        files=0,
+        rows=0,
+        problems=tuple(problems),
+        orphans=(),
+    )
+
+
 def check_files(table: Table) -> Iterator[DatabaseProblem]:
-    """Does every file open, and has it as many rows as the log says?"""
+    """Does every file open, has it as many rows as the log says, and the bytes that were written?"""
     expected = {file.path: file.rows for file in table.files()}
+    try:
+        digests = file_digests(table.storage)
+    except StoreError:  # said of the log
+        digests = {}
     for fragment in table.dataset().get_fragments():
         where = f"{table.spec.name}/{fragment.path}"
         try:
@@ -139,6 +182,11 @@ def check_files(table: Table) -> Iterator[DatabaseProblem]:
         if found != expected[fragment.path]:
             yield DatabaseProblem(
                 where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
+            )
+        digest = digests.get(fragment.path)
+        if digest is not None and digest != _sha256(table.storage, fragment.path):
+            yield DatabaseProblem(
+                where=where, what="its bytes are not those that were written: hashes differ"
             )
 
 
@@ -288,13 +336,23 @@ def _utm(table: pa.Table | pa.RecordBatch) -> FloatArray:
 
 def _orphans(database: Database) -> list[str]:
     first = oldest_kept_version(database.table(MAPS).commits())
-    present = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
+    present: set[str] = set().union(*(write_ids_in(database.table(name)) for name in CHILD_TABLES))
     orphans = present - write_ids_of_history(database, first)
     if has_scans(database):
-        orphans |= write_ids_in(database.table(LIDAR_POINTS)) - {r["write_id"] for r in scan_rows(database)}
+        orphans |= set(write_ids_in(database.table(LIDAR_POINTS))) - {
+            r["write_id"] for r in scan_rows(database)
+        }
     if has_candidates(database):
-        orphans |= write_ids_in(database.table(CANDIDATE_IMAGES)) - named_writes(database)
+        orphans |= set(write_ids_in(database.table(CANDIDATE_IMAGES))) - named_writes(database)
     return sorted(orphans)
+
+
+def _sha256(files: fs.FileSystem, path: str) -> str:
+    digest = hashlib.sha256()
+    with files.open_input_file(path) as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def _one_line(error: Exception) -> str:

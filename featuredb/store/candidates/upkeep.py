@@ -1,7 +1,7 @@
 """Upkeep of contributed photos and known queries: what `vacuum` may remove and what `verify` looks at."""
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
 
 import pyarrow as pa
@@ -10,7 +10,6 @@ from featuredb.errors import FeatureDbError
 from featuredb.store.canaries import has_canaries, list_canaries, load_canary_image
 from featuredb.store.candidates.events import by_candidate, has_candidates, live_maps, read_events
 from featuredb.store.candidates.states import CONTRIBUTED, REFUSED, REOPENED, USED, WITHDRAWN, standing_of
-from featuredb.store.commits import write_time
 from featuredb.store.database import Database
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
 
@@ -35,10 +34,12 @@ def named_writes(database: Database) -> set[str]:
     return {event["write_id"] for event in events}
 
 
-def superfluous_images(database: Database, now: datetime, history: timedelta, grace: timedelta) -> set[str]:
+def superfluous_images(
+    database: Database, now: datetime, history: timedelta, fresh_writes: Collection[str]
+) -> set[str]:
     """Candidates whose bytes may go: withdrawn ones (left by a crash), and those refused `history` ago.
 
-    Bytes that were written within `grace` stay: somebody may be giving the photo again just now.
+    Bytes of `fresh_writes` stay: somebody may be giving the photo again just now.
     """
     if not has_candidates(database):
         return set()
@@ -50,7 +51,7 @@ def superfluous_images(database: Database, now: datetime, history: timedelta, gr
             found.add(candidate_id)
     columns = ["candidate_id", "write_id"]
     stored = database.table(CANDIDATE_IMAGES).dataset().to_table(columns, use_threads=False).to_pylist()
-    fresh = {row["candidate_id"] for row in stored if now - write_time(row["write_id"]) < grace}
+    fresh = {row["candidate_id"] for row in stored if row["write_id"] in fresh_writes}
     return (found & {row["candidate_id"] for row in stored}) - fresh
 
 

@@ -1,0 +1,28 @@
+"""A table's folder as Arrow sees it, on a local disk or in an object store."""
+
+import atexit
+import time
+from functools import cache
+from pathlib import Path
+
+import pyarrow.fs as fs
+from deltalake.fs import DeltaStorageHandler
+
+
+def table_files(url: str, storage_options: dict[str, str] | None) -> fs.FileSystem:
+    """The files of the table at a URL; paths are relative to it."""
+    if "://" not in url:
+        return fs.SubTreeFileSystem(str(Path(url).absolute()), fs.LocalFileSystem())
+    _let_arrow_finish_at_exit()
+    return fs.PyFileSystem(DeltaStorageHandler(url, storage_options))
+
+
+@cache
+def _let_arrow_finish_at_exit() -> None:
+    """Give Arrow's reading threads a moment at the interpreter's end.
+
+    deltalake's filesystem hands them Python's buffers, and one that is released after the interpreter has
+    ended aborts the process: 12 of 360 short programs on two busy cores, none of 720 with this pause. Local
+    tables are read by Arrow's own filesystem, which holds none (0 of 360).
+    """
+    atexit.register(time.sleep, 0.1)

@@ -1,0 +1,227 @@
+"""A table's log as files: which entries there are, whether each is whole, which one was acknowledged last.
+
+An entry says in its first line how many files it adds and removes, so that one that was cut off between two
+lines is found, too. A commit that is done leaves its version as the name of an empty file in `_acknowledged`
+and removes the names below it; the highest name there is the last acknowledged version. Names are only ever
+made, and those below one's own removed: concurrent writers need no lock, object stores no conditional write.
+"""
+
+import json
+import logging
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any
+from urllib.parse import unquote
+
+import pyarrow as pa
+import pyarrow.fs as fs
+import pyarrow.parquet as pq
+
+from featuredb.errors import StoreError
+
+logger = logging.getLogger(__name__)
+
+LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
+DIGEST = "featuredb.sha256"  # tag of an added file
+_ENTRY = re.compile(r"(\d{20})\.json")
+_CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
+_NAME = re.compile(r"\d{20}")
+_ADDED, _REMOVED = ("num_added_files", "numFilesAdded"), ("num_removed_files", "numFilesRemoved")
+
+Action = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class LogProblem:
+    """What is wrong with a file of a log: its name, what, the version if it is an entry (no checkpoint)."""
+
+    name: str
+    what: str
+    version: int | None = None
+
+
+def entry_name(version: int) -> str:
+    """File name of a log entry."""
+    return f"{version:020d}.json"
+
+
+def read_actions(content: bytes) -> list[Action]:
+    """The actions of a log entry.
+
+    Raises:
+        ValueError: it is empty or torn; the message says how.
+    """
+    if not content.strip():
+        raise ValueError(f"it is empty ({len(content)} bytes)")
+    try:
+        actions = [json.loads(line) for line in content.splitlines() if line.strip()]
+    except ValueError as error:
+        raise ValueError(f"it is torn or broken ({len(content)} bytes: {error})") from error
+    if not all(isinstance(action, dict) for action in actions):
+        raise ValueError("it has lines that are no actions")
+    info = next((action["commitInfo"] for action in actions if "commitInfo" in action), None)
+    if not isinstance(info, dict):
+        raise ValueError("its line commitInfo is missing")
+    if not isinstance(info.get("timestamp"), int):
+        raise ValueError("its line commitInfo has no timestamp")
+    if info.get("operation") == "CREATE TABLE" and not any("metaData" in action for action in actions):
+        raise ValueError("it is torn: its line metaData is missing")
+    metrics = info.get("operationMetrics")
+    for kind, names in (("add", _ADDED), ("remove", _REMOVED)):
+        expected = (
+            next((metrics[n] for n in names if n in metrics), None) if isinstance(metrics, dict) else None
+        )
+        found = sum(kind in action for action in actions)
+        if expected is not None and found != expected:
+            raise ValueError(f"it is torn: expected {expected} lines {kind!r}, found {found}")
+    return actions
+
+
+def named_checkpoint(content: bytes) -> int | None:
+    """The version that the file `_last_checkpoint` names; None where it is empty or torn."""
+    try:
+        return int(json.loads(content)["version"])
+    except (ValueError, KeyError, TypeError):
+        return None
+
+
+def list_entries(files: fs.FileSystem) -> dict[int, datetime]:
+    """The versions of which there is a log entry, in order, and when the store got each, UTC."""
+    return dict(sorted(_numbered(files, LOG, _ENTRY)))
+
+
+def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
+    """The actions of a table's log entry.
+
+    Raises:
+        StoreError: it is missing, empty or torn.
+    """
+    problem = entry_problem(files, version)
+    if problem is not None:
+        raise StoreError(f"log entry {entry_name(version)}: {problem}; run `featuredb verify`")
+    return read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+
+
+def entry_problem(files: fs.FileSystem, version: int) -> str | None:
+    """What is wrong with a log entry, or None."""
+    try:
+        read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+    except FileNotFoundError:
+        return "it is missing"
+    except ValueError as error:
+        return str(error)
+    return None
+
+
+def file_digests(files: fs.FileSystem) -> dict[str, str]:
+    """The SHA-256 of each file that a log has ever named, by path; not of files of older releases.
+
+    Raises:
+        StoreError: an entry is missing, empty or torn.
+    """
+    adds = (a["add"] for v in list_entries(files) for a in read_entry(files, v) if "add" in a)
+    return {unquote(add["path"]): add["tags"][DIGEST] for add in adds if DIGEST in (add.get("tags") or {})}
+
+
+def acknowledged(files: fs.FileSystem) -> int | None:
+    """The last version of which a writer was told that it is done; None in tables of older releases."""
+    return max((version for version, _ in _numbered(files, ACKNOWLEDGED, _NAME)), default=None)
+
+
+def acknowledge(files: fs.FileSystem, version: int) -> None:
+    """Note that a version is committed, as well as the store allows.
+
+    It is not waited for: where this is lost, only what `verify` would have compared with is lost.
+    """
+    try:
+        files.create_dir(ACKNOWLEDGED)
+        files.open_output_stream(f"{ACKNOWLEDGED}/{version:020d}").close()
+        for older, _ in _numbered(files, ACKNOWLEDGED, _NAME):
+            if older < version:
+                files.delete_file(f"{ACKNOWLEDGED}/{older:020d}")
+    except FileNotFoundError:  # another writer was faster
+        return
+    except OSError as error:
+        logger.warning("cannot note version %d as committed: %s", version, error)
+
+
+def forget_acknowledged(files: fs.FileSystem, version: int) -> None:
+    """Make a version the last acknowledged one, where later ones are lost."""
+    for later, _ in _numbered(files, ACKNOWLEDGED, _NAME):
+        if later > version:
+            files.delete_file(f"{ACKNOWLEDGED}/{later:020d}")
+    acknowledge(files, version)
+
+
+def check_end(url: str, files: fs.FileSystem, version: int) -> None:
+    """Is the log whole where a reader takes it for its end?
+
+    Raises:
+        StoreError: its last entry is empty or torn, or an acknowledged one is missing.
+    """
+    head = acknowledged(files)
+    if head is not None and head > version and (problem := entry_problem(files, head)) is not None:
+        raise damaged(url, LogProblem(entry_name(head), f"{problem}, though it was acknowledged", head))
+    # Object stores have no torn files; there `verify` reads what this would read each time.
+    if "://" not in url and (problem := entry_problem(files, version)) is not None:
+        raise damaged(url, LogProblem(entry_name(version), problem, version))
+
+
+def damaged(url: str, problem: LogProblem) -> StoreError:
+    """The error for a log that cannot be used, in words."""
+    return StoreError(
+        f"cannot open {url}: {LOG}/{problem.name}: {problem.what}; `featuredb repair` says what can be done"
+    )
+
+
+def log_problems(files: fs.FileSystem) -> Iterator[LogProblem]:
+    """What is wrong with a table's log; reads every entry."""
+    head, versions = acknowledged(files), list(list_entries(files))
+    newest = max(versions, default=-1)
+    for version in range(max(newest, -1 if head is None else head) + 1):
+        problem = entry_problem(files, version)
+        if problem is not None:
+            late = (
+                f", though version {head} was acknowledged" if head is not None and version > newest else ""
+            )
+            yield LogProblem(entry_name(version), problem + late, version)
+    yield from _checkpoint_problems(files, newest)
+
+
+def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProblem]:
+    """Checkpoints repeat what the entries say; one that is broken hinders readers all the same."""
+    checkpoints = [version for version, _ in _numbered(files, LOG, _CHECKPOINT)]
+    for info in files.get_file_info(fs.FileSelector(LOG, allow_not_found=True)):
+        if info.base_name == LAST_CHECKPOINT:
+            named = named_checkpoint(_read(files, info.path))
+            if named is None:
+                yield LogProblem(info.base_name, "it is empty or torn")
+            elif named not in checkpoints or named > newest:
+                yield LogProblem(info.base_name, f"it names checkpoint {named}, which is not there")
+        elif _CHECKPOINT.fullmatch(info.base_name):
+            try:
+                pq.read_table(info.path, filesystem=files)
+            except (OSError, pa.ArrowException) as error:
+                yield LogProblem(info.base_name, f"it cannot be read: {' '.join(str(error).split())[:200]}")
+
+
+def _numbered(files: fs.FileSystem, folder: str, name: re.Pattern[str]) -> Iterator[tuple[int, datetime]]:
+    """Numbers in the names of a folder's files, and the time of each."""
+    for info in files.get_file_info(fs.FileSelector(folder, allow_not_found=True)):
+        if match := name.fullmatch(info.base_name):
+            number = re.match(r"\d{20}", match[0])
+            assert number is not None
+            yield int(number[0]), utc(info.mtime)
+
+
+def utc(time: datetime) -> datetime:
+    """A file's time with its zone."""
+    return time.replace(tzinfo=UTC) if time.tzinfo is None else time.astimezone(UTC)
+
+
+def _read(files: fs.FileSystem, path: str) -> bytes:
+    with files.open_input_file(path) as stream:
+        content: bytes = stream.read()
+    return content
