@@ -30,6 +30,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from ingest.growth import run
 from ingest.growth.gates import Gate
+from ingest.growth.graph import budget
 from ingest.growth.place import component
 from ingest.growth.values import Refused
 from ingest.photos.photo import Photo
@@ -75,8 +76,8 @@ def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[N
         for module, name, wrapped in (
             (component, "place_by_maps", note.placing),
             (component, "refine_placed", note.refining),
-            (run, "drift_gate", note.budget),
-            (run, "with_drift", note.drifting),
+            (budget, "drift_gate", note.budget),
+            (budget, "with_drift", note.drifting),
             (run, "promote_confirmed", note.promoting),
         ):
             stack.enter_context(patch.object(module, name, wrapped(getattr(module, name))))

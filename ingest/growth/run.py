@@ -18,7 +18,7 @@ from featuredb.store.candidates.photos import mark_used
 from ingest.colmap.bridge import Model
 from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest
-from ingest.growth.graph.budget import drift_gate, rows_within, with_drift
+from ingest.growth.graph.budget import grow_within_budget
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import ReplaceOptions, replace_descendants
 from ingest.growth.growth_report import GrowthReport
@@ -41,6 +41,7 @@ from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.cameras import shared_key
+from ingest.photos.photo import Photo
 from reloc.localise.candidates import IndexedArea
 from reloc.localiser import Localiser
 
@@ -155,11 +156,7 @@ def _round(
     lone = with_shared_lenses(left, keys, options.grow.localise)
     groups, waiting = lone_groups(lone, new.features_of, options.groups)
     for group in groups:
-        outcome = _grown(group, new, lone, localiser.areas, options)
-        if isinstance(outcome, Refused):
-            note_refusal(outcome, new, run)
-        else:
-            _take(database, outcome, new, run, options)
+        _try_model(database, group, new, lone, localiser.areas, run, options, links=())
     run.why.update({row: split_reason(reason) for row, reason in waiting.items()})
     return localised
 
@@ -232,55 +229,32 @@ def _try_model(
     Args:
         links: at which it may be split, weakest first.
     """
+    outcome = _grown(database, model, new, localised, areas, options)
+    if not isinstance(outcome, Refused):
+        _take(database, outcome, new, run, options)
+        return
     links = options.split_links if links is None else links
-    part: Model | None = model
-    for _ in range(3):  # the part that is left may lie otherwise, and be cut again
-        assert part is not None
-        rows = tuple(int(r) for r in part.rows)
-        outcome = _grown(part, new, localised, areas, options)
-        if isinstance(outcome, Refused):
-            pieces = split(part, links) if outcome.reason in AT_SEVERAL_PLACES else None
-            if pieces is None:
-                note_refusal(outcome, new, run)
-                return
-            level, parts = pieces
-            _LOG.info(
-                "%d photos are at several places: %s; apart at links of %g", len(rows), outcome.message, level
-            )
-            for piece in parts:
-                if any(int(r) in localised for r in piece.rows):
-                    rest = [link for link in links if link > level]
-                    _try_model(database, piece, new, localised, areas, run, options, rest)
-                else:
-                    note_refusal(replace(outcome, rows=tuple(int(r) for r in piece.rows)), new, run)
-            return
-        within = _take(database, outcome, new, run, options)
-        if within is None:
-            return
-        part = keep_photos(part, within, least=3) if len(within) < len(rows) else None
-        if part is None:
-            return
+    part = keep_photos(model, list(outcome.rows)) if outcome.reason in AT_SEVERAL_PLACES else None
+    pieces = None if part is None else split(part, links)
+    if pieces is None:
+        note_refusal(outcome, new, run)
+        return
+    level, parts = pieces
+    count, message = len(outcome.rows), outcome.message
+    _LOG.info("%d photos are at several places: %s; apart at links of %g", count, message, level)
+    for piece in parts:
+        if any(int(r) in localised for r in piece.rows):
+            rest = [link for link in links if link > level]
+            _try_model(database, piece, new, localised, areas, run, options, rest)
+        else:
+            note_refusal(replace(outcome, rows=tuple(int(r) for r in piece.rows)), new, run)
 
 
-def _take(
-    database: Database, grown: GrownMap, new: GrowthPhotos, run: Run, options: GrowthOptions
-) -> list[int] | None:
-    """Commit a grown map in quarantine if it is within the drift budget.
-
-    Returns:
-        None if it was, or was refused for good; else the rows of its photos that are within the budget.
-    """
-    snapshot = database.snapshot()
-    rows = [int(r) for r in grown.model.rows if int(r) < len(new.photos)]
-    feature_map, drift, relative = with_drift(
-        grown, placed_maps(snapshot), options.promotion.confirmation, options.drift_budget_m
-    )
-    gate = drift_gate(drift, options.drift_budget_m)
+def _take(database: Database, grown: GrownMap, new: GrowthPhotos, run: Run, options: GrowthOptions) -> None:
+    """Commit a grown map in quarantine, unless a scan or a person who retired it are against it."""
+    snapshot, feature_map = database.snapshot(), grown.feature_map
+    rows = [int(r) for r in grown.model.rows]
     names = tuple(new.photos[r].name for r in rows)
-    if not gate.passes:
-        run.refused.append(grown_entry(feature_map, grown, names, "refused", gate.reason, gate.message))
-        run.why.update(dict.fromkeys(rows, (gate.reason, gate.message)))
-        return rows_within(feature_map, rows, relative, options.drift_budget_m)
     scan, unasked = scan_gate(database, feature_map, options.scan)
     run.notes += [unasked] if unasked and unasked not in run.notes else []
     if scan is not None:
@@ -288,13 +262,13 @@ def _take(
         if not scan.passes:
             run.refused.append(grown_entry(feature_map, grown, names, "refused", scan.reason, scan.message))
             run.why.update(dict.fromkeys(rows, (scan.reason, scan.message)))
-            return None
+            return
     known = {m.map_id: m for m in snapshot.maps(include_retired=True)}.get(feature_map.map_id)
     if known is not None and known.status == "retired":
         reason = f"map {known.map_id} of these photos was retired: {known.status_reason}"
         run.refused.append(grown_entry(feature_map, grown, names, "refused", "RETIRED_MAP", reason))
         run.why.update(dict.fromkeys(rows, ("RETIRED_MAP", reason)))
-        return None
+        return
     used = [new.candidate_ids[r] for r in rows if r in new.candidate_ids]
     if used:
         mark_used(database, used, feature_map.map_id)
@@ -305,7 +279,6 @@ def _take(
     run.why.update({row: why for row, why in grown.left_out.items() if row not in run.map_of})
     run.entries[feature_map.map_id] = grown_entry(feature_map, grown, names, "quarantined", "", "")
     _LOG.info("map %s: %d photos in quarantine", feature_map.map_id, len(rows))
-    return None
 
 
 def _promote(
@@ -344,20 +317,30 @@ def _promote(
 
 
 def _grown(
+    database: Database,
     model: Model,
     new: GrowthPhotos,
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     options: GrowthOptions,
 ) -> GrownMap | Refused:
-    """The map of a reconstruction; it is named by its photos: the same photos give the same map."""
-    photos = [new.photos[int(r)] for r in model.rows]
+    """The map of a reconstruction within the drift budget."""
+
+    def grown(part: Model) -> GrownMap | Refused:
+        identity = _identity([new.photos[int(r)] for r in part.rows])
+        return grow_component(part, new.photos, new.features_of, localised, areas, identity, options.grow)
+
+    maps, confirmation = placed_maps(database.snapshot()), options.promotion.confirmation
+    return grow_within_budget(model, grown, maps, confirmation, options.drift_budget_m)
+
+
+def _identity(photos: Sequence[Photo]) -> MapIdentity:
+    """A map is named by its photos: the same photos give the same map."""
     key = digest(_VERSION, *sorted(p.sha256 for p in photos))[:20]
-    identity = MapIdentity(
+    return MapIdentity(
         map_id=f"g{key}",
         name=f"grown {key[:6]}",
         source="growth",
         licence=", ".join(sorted({p.licence for p in photos if p.licence})),
         provenance={"version": _VERSION, "photos": len(photos)},
     )
-    return grow_component(model, new.photos, new.features_of, localised, areas, identity, options.grow)

@@ -20,9 +20,8 @@ from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from featuredb.store import Database, Snapshot
 from featuredb.store.snapshot import UnplacedSummary
 from ingest.colmap.bridge import Model
-from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.graph.budget import drift_gate, rows_within, with_drift
+from ingest.growth.graph.budget import grow_within_budget
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.growth_report import GrownEntry
 from ingest.growth.map_images import observed_features
@@ -40,7 +39,6 @@ from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
 _LEAST_PHOTOS = 3  # of a map without a place, as of any reconstruction
-_TRIES = 3  # the part within the drift budget may lie otherwise, and be cut again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,10 +114,10 @@ def _place(
 ) -> GrownEntry | Refused:
     """Place and commit one map; `notes` gets what a person should know besides."""
     unplaced = snapshot.load_unplaced(summary.map_id)
-    found = _within_budget(snapshot, unplaced, areas, options)
-    if isinstance(found, Refused):
-        return found
-    feature_map, grown = found
+    grown = _within_budget(snapshot, unplaced, areas, options)
+    if isinstance(grown, Refused):
+        return grown
+    feature_map = grown.feature_map
     scan, unasked = scan_gate(database, feature_map, options.scan)
     notes += [unasked] if unasked else []
     if scan is not None:
@@ -142,7 +140,7 @@ def _place(
 
 def _within_budget(
     snapshot: Snapshot, unplaced: UnplacedMap, areas: Sequence[IndexedArea], options: PlaceUnplacedOptions
-) -> tuple[FeatureMap, GrownMap] | Refused:
+) -> GrownMap | Refused:
     """The map where the others put it; where it reaches beyond the drift budget, the part that does not."""
     stored = stored_photos(unplaced)
     # A lens that nobody lends is about what the reconstruction made of it.
@@ -151,29 +149,17 @@ def _within_budget(
         for photo, image in zip(stored.photos, unplaced.images, strict=True)
     ]
     localised, _ = localise_photos(hinted, range(len(hinted)), stored.described_of, areas, options.localise)
-    part: Model | None = stored.model
-    refused = Refused(reason="", message="", rows=())
-    for _ in range(_TRIES):
-        if part is None:
-            break
-        grown = grow_component(
+
+    def grown(part: Model) -> GrownMap | Refused:
+        found = grow_component(
             part, stored.photos, stored.features_of, localised, areas, _identity(unplaced), options.grow
         )
-        if isinstance(grown, Refused):
-            return grown
-        grown = replace(grown, feature_map=_matchable(grown.feature_map))
-        feature_map, drift, relative = with_drift(
-            grown, placed_maps(snapshot), options.confirmation, options.drift_budget_m
-        )
-        gate = drift_gate(drift, options.drift_budget_m)
-        if gate.passes:
-            return feature_map, grown
-        gates = (*grown.placement.gates, gate)
-        refused = Refused(reason=gate.reason, message=gate.message, rows=(), gates=gates)
-        rows = [int(r) for r in grown.model.rows]
-        within = rows_within(feature_map, rows, relative, options.drift_budget_m)
-        part = keep_photos(part, within, least=_LEAST_PHOTOS) if len(within) < len(rows) else None
-    return refused
+        if isinstance(found, Refused):
+            return found
+        return replace(found, feature_map=_matchable(found.feature_map))
+
+    maps = placed_maps(snapshot)
+    return grow_within_budget(stored.model, grown, maps, options.confirmation, options.drift_budget_m)
 
 
 def _identity(unplaced: UnplacedMap) -> MapIdentity:

@@ -1,6 +1,6 @@
 """How far a grown map may have drifted from its anchors, by the graph of all maps, and what is enough."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,11 +9,16 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
+from ingest.colmap.bridge import Model
+from ingest.colmap.submodel import keep_photos
 from ingest.growth.gates import Gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, solve_with_new
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
 from ingest.growth.trust.confirmation import ConfirmationOptions, confirm, sources_json
-from ingest.growth.values import GrownMap
+from ingest.growth.values import GrownMap, Refused
+
+_LEAST_PHOTOS = 3  # of a reconstruction
+_TRIES = 3  # the part within the budget may lie otherwise, and be cut again
 
 
 def drift_gate(drift: float, budget_m: float) -> Gate:
@@ -27,6 +32,42 @@ def drift_gate(drift: float, budget_m: float) -> Gate:
         message=f"it may have drifted {drift:.2f} m from its anchors, {budget_m:.2f} m are allowed; it "
         "waits for an anchor",
     )
+
+
+def grow_within_budget(
+    model: Model,
+    grow: Callable[[Model], GrownMap | Refused],
+    maps: Mapping[str, PlacedMap],
+    confirmation: ConfirmationOptions,
+    budget_m: float,
+) -> GrownMap | Refused:
+    """The map of a reconstruction with its drift, of the part of it that is within the budget.
+
+    Args:
+        grow: from a reconstruction to a map.
+        maps: of the snapshot.
+    """
+    part, everything = model, tuple(model.rows.tolist())
+    beyond: dict[int, tuple[str, str]] = {}
+    refused = Refused(reason="", message="", rows=())
+    for _ in range(_TRIES):
+        grown = grow(part)
+        if isinstance(grown, Refused):
+            return replace(grown, rows=everything)
+        feature_map, drift, relative = with_drift(grown, maps, confirmation, budget_m)
+        gate = drift_gate(drift, budget_m)
+        if gate.passes:
+            return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
+        gates = (*grown.placement.gates, gate)
+        refused = Refused(reason=gate.reason, message=gate.message, rows=everything, gates=gates)
+        rows = [int(r) for r in grown.model.rows]
+        within = rows_within(feature_map, rows, relative, budget_m)
+        left = keep_photos(part, within, least=_LEAST_PHOTOS) if len(within) < len(rows) else None
+        if left is None:
+            break
+        beyond |= {int(r): (gate.reason, gate.message) for r in set(part.rows.tolist()) - set(within)}
+        part = left
+    return refused
 
 
 def with_drift(
