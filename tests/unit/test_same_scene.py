@@ -9,7 +9,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.vocabulary import shipped_vocabulary
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
-from ingest.growth.place.same_scene import Elsewhere, chance_of_offset, same_scene_elsewhere
+from ingest.growth.place.same_scene import SceneElsewhere, chance_of_offset, same_scene_elsewhere
 from tests.support.scene_strip import strip_map
 
 _GPS = np.diag([1e-3, 1e-3, 1e-3, 1e-3, 3.0, 3.0, 5.0]) ** 2
@@ -20,7 +20,7 @@ def _shifted(map_id: str, east_m: float, by_m: tuple[float, float], seed: int) -
     return strip_map(map_id, east_m, move=move, seed=seed, covariance=_GPS)
 
 
-def _found(tmp_path: Path, new: FeatureMap, *existing: FeatureMap) -> Elsewhere | None:
+def _found(tmp_path: Path, new: FeatureMap, *existing: FeatureMap) -> SceneElsewhere | None:
     database = Database.create(tmp_path / "db")
     database.commit_maps(existing)
     return same_scene_elsewhere(new, database.snapshot(), tmp_path / "work", shipped_vocabulary())

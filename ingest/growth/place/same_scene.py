@@ -30,7 +30,7 @@ _FAR_M = 10_000.0  # the Earth's curvature, not the height, is what is vertical 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Elsewhere:
+class SceneElsewhere:
     """An existing map that has the same scene at another place.
 
     Attributes:
@@ -58,7 +58,7 @@ class Elsewhere:
 
 def same_scene_elsewhere(
     feature_map: FeatureMap, snapshot: Snapshot, work: Path, vocabulary: Vocabulary
-) -> Elsewhere | None:
+) -> SceneElsewhere | None:
     """The active map that most contradicts the place of a new one; None where none does, or one agrees.
 
     Args:
@@ -73,7 +73,7 @@ def same_scene_elsewhere(
         alike = (own @ _vectors_of(summary, snapshot, work, vocabulary).T).max(axis=1, initial=-1.0)
         ranked.append((float(np.sort(alike)[-least:].sum()), summary, alike))
     ranked.sort(key=lambda entry: (-entry[0], entry[1].map_id))
-    found: list[tuple[float, Elsewhere]] = []
+    found: list[tuple[float, SceneElsewhere]] = []
     for _, summary, alike in ranked[:_MAPS]:
         images = [feature_map.images[k] for k in np.argsort(-alike, kind="stable")[:_IMAGES]]
         other = snapshot.load_map(summary.map_id)
@@ -85,7 +85,7 @@ def same_scene_elsewhere(
         if chance >= _RATE:
             return None
         east_m, north_m = offset_m.tolist()
-        told = Elsewhere(
+        told = SceneElsewhere(
             summary=summary,
             east_m=east_m,
             north_m=north_m,
