@@ -15,9 +15,10 @@ from featuredb.geo.datum import HEIGHT_DATUMS
 from featuredb.index.vocabulary import Vocabulary, shipped_vocabulary
 from featuredb.plain_json import plain
 from featuredb.stage_clock import StageClock
-from featuredb.store import Database
+from featuredb.store import Database, Snapshot
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
+from ingest.growth.place.same_scene import same_scene_elsewhere
 from ingest.map_builder import MapIdentity
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photos.photo import Photo
@@ -33,7 +34,7 @@ from ingest.workspace import Workspace, default_root, remove_leftovers
 logger = logging.getLogger(__name__)
 
 # Part of every map id; raised when the same photos and options would give another map.
-_MAP_VERSION = "photos-4"
+_MAP_VERSION = "photos-5"
 # Some hundred megabytes as rows of the tables; what a folder of a few hundred photos makes is one commit.
 _OBSERVATIONS_PER_COMMIT = 1_000_000
 _MOST_NOTES = 20
@@ -132,7 +133,12 @@ def ingest_photos(
             )
     with clock.stage("build"):
         outcomes, registered, quarantined = _place_and_commit(
-            database, result, options, lambda number: _identity(folder, options, job_id, number), progress
+            database,
+            result,
+            options,
+            lambda number: _identity(folder, options, job_id, number),
+            root,
+            progress,
         )
     return IngestReport(
         job_id=job_id,
@@ -233,9 +239,13 @@ def _place_and_commit(
     result: Reconstructed,
     options: IngestOptions,
     identity: Callable[[int], MapIdentity],
+    work: Path,
     progress: Progress,
 ) -> tuple[tuple[MapOutcome, ...], dict[str, PhotoOutcome], dict[str, str]]:
     """Place the models and make the maps visible.
+
+    Args:
+        work: work folder.
 
     Returns:
         What became of each component and of its photos, and why maps are in quarantine, by id.
@@ -249,10 +259,16 @@ def _place_and_commit(
     if options.stop_after not in (None, "build", "commit"):
         return (), {}, {}
     batch: list[Component] = []
-    for component in place_models(result, options.making, identity=identity, survey=options.survey):
+    there = database.snapshot()
+    known = {m.map_id: m for m in there.maps()}
+    for placed in place_models(result, options.making, identity=identity, survey=options.survey):
+        made = placed.feature_map
+        kept = None if made is None else known.get(made.map_id)
+        component = placed if kept is not None else _beside_others(placed, there, work, options)
         batch.append(component)
-        if component.feature_map is not None and component.feature_map.status == "quarantined":
-            quarantined[component.feature_map.map_id] = component.reason
+        now = kept or component.feature_map
+        if now is not None and now.status == "quarantined":
+            quarantined[now.map_id] = (kept.status_reason if kept is not None else "") or component.reason
         if sum(len(c.model.point_of) for c in batch) > _OBSERVATIONS_PER_COMMIT:
             outcomes += _commit(database, batch, options)
             registered |= _registered_all(batch, result)
@@ -261,6 +277,17 @@ def _place_and_commit(
     registered |= _registered_all(batch, result)
     progress("build", len(outcomes), len(outcomes))
     return tuple(outcomes), registered, quarantined
+
+
+def _beside_others(component: Component, there: Snapshot, work: Path, options: IngestOptions) -> Component:
+    """The component; in quarantine where positions placed it and an active map has its scene elsewhere."""
+    feature_map = component.feature_map
+    if feature_map is None or feature_map.placement.method != "gps":
+        return component
+    found = same_scene_elsewhere(feature_map, there, work, options.vocabulary or shipped_vocabulary())
+    if found is None:
+        return component
+    return replace(component, feature_map=replace(feature_map, status="quarantined"), reason=found.message)
 
 
 def _registered_all(batch: Sequence[Component], result: Reconstructed) -> dict[str, PhotoOutcome]:
@@ -274,7 +301,8 @@ def _commit(database: Database, batch: Sequence[Component], options: IngestOptio
     if options.stop_after == "build":
         return []
     if maps:
-        created = {r.map_id: r.created for r in database.commit_maps(maps)}
+        reasons = {c.feature_map.map_id: c.reason for c in batch if c.feature_map is not None}
+        created = {r.map_id: r.created for r in database.commit_maps(maps, reasons=reasons)}
     return [map_outcome(c, created, options.making) for c in batch]
 
 

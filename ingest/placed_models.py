@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap.bridge import Model
-from ingest.colmap.picture_shear import IMPOSSIBLE, shear_words
+from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
 from ingest.colmap.submodel import keep_photos, select_photos
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
@@ -23,6 +22,7 @@ from ingest.register.control.model import ControlledPlacement, Survey, place_by_
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
+from ingest.sfm.held_lens import impossible
 from ingest.sfm.links import tied_parts
 
 _WEAKLY_TIED = (
@@ -33,8 +33,6 @@ _ELSEWHERE = (
     "their GPS agrees on a place {offset_m:.0f} m from where their matches put them: they show another place "
     "that looks like it, or their positions have one error"
 )
-_EXIF_SPREAD = 0.3  # of the logarithm of a focal length over EXIF's: pictures are cut, scaled, zoomed
-_WRONG_LENS = 0.001  # of such focal lengths are further off
 HINTS = "placed by geotags that nobody answers for"
 
 
@@ -201,7 +199,7 @@ def _component(
         )
     held_back = (
         placed.provisional
-        or impossible_lens(model, chosen)
+        or impossible_lens(model, chosen, float(feature_map.provenance.get("picture_shear", 0.0)))
         or impossible_shear(feature_map)
         or (HINTS if any(hints) else "")
     )
@@ -210,21 +208,21 @@ def _component(
     return replace(component, feature_map=feature_map, reason_code="", reason=held_back)
 
 
-def impossible_lens(model: Model, chosen: Sequence[Photo]) -> str:
-    """Why most of the photos have a focal length that theirs cannot be; "" where they have not."""
-    ratio = np.array(
-        [
-            np.log(model.cameras[int(c)].focal_px / photo.focal_px) if photo.focal_px else 0.0
-            for photo, c in zip(chosen, model.camera_of, strict=True)
-        ]
-    )
-    wrong = np.flatnonzero(np.abs(ratio) > norm.isf(_WRONG_LENS / 2.0) * _EXIF_SPREAD)
+def impossible_lens(model: Model, chosen: Sequence[Photo], shear: float) -> str:
+    """Why most of the photos have a focal length that theirs cannot be; "" where they have not.
+
+    Args:
+        shear: of the pictures, which a rolling shutter leaves (`ingest.colmap.picture_shear`).
+    """
+    found = [model.cameras[int(c)].focal_px for c in model.camera_of]
+    wrong = np.flatnonzero(impossible(found, [photo.focal_px or np.nan for photo in chosen]))
     if 2 * len(wrong) <= len(chosen):
         return ""
-    photo, camera = chosen[int(wrong[0])], model.cameras[int(model.camera_of[wrong[0]])]
+    photo = chosen[int(wrong[0])]
+    cause = shear_words(shear) if shear > UNUSUAL else "a zoom, cut pictures, wrong EXIF or a rolling shutter"
     return (
-        f"the focal length of {photo.name} became {camera.focal_px:.0f} px where EXIF says "
-        f"{photo.focal_px:.0f}: a rolling shutter, a zoom or wrong EXIF bends the map"
+        f"the focal length of {photo.name} became {found[int(wrong[0])]:.0f} px where EXIF says "
+        f"{photo.focal_px:.0f}, which fits the photos no better: the map is bent. Likely cause: {cause}"
     )
 
 

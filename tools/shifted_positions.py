@@ -3,12 +3,11 @@
     python -m tools.shifted_positions --photos FOLDER --scan FILE --work FOLDER
 
 1. Every second photo becomes a map by its own positions; the others become one by a table of theirs that are
-   50 km too far east.
-2. `featuredb anchor` of the second map on the scan of the place, which has to say how far away that is.
-3. `featuredb adjust` of both maps, and `featuredb grow` with the second half contributed to a database of the
-   first: both have to say by how far the positions and the other map differ.
+   50 km too far east. This ingest has to say so, and to keep that map in quarantine.
+2. `featuredb anchor` of the second map on the scan of the place, and `featuredb grow` with the second half
+   contributed to a database of the first: both have to say the distance, too.
 
-Exit code 0 if the shifted map has a place and all three say the distance.
+Exit code 0 if the shifted map has a place in quarantine and all three say the distance.
 """
 
 import argparse
@@ -47,22 +46,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     for one in (database, grown):
         featuredb("ingest", "photos", str(one), str(right), "--quiet")
     table = write_table(shifted, names[1::2])
-    featuredb("ingest", "photos", str(database), str(table), "--trust-geotags", "--quiet")
-    first, second = sorted(Database.open(database).snapshot().maps(), key=lambda m: m.created_at)
+    ingest_km = told_km("ingest", "photos", str(database), str(table), "--trust-geotags", "--quiet")
+    _, second = sorted(Database.open(database).snapshot().maps(), key=lambda m: m.created_at)
     featuredb("lidar", "add", str(database), str(args.scan))
     away = args.work / "anchor"
     words = ("anchor", str(database), second.map_id, "--photos", str(shifted), "--out", str(away), "--auto")
     figures: dict[str, float | None] = {
-        "active": int(second.status == "active"),
+        "quarantined": int(second.status == "quarantined"),
         "photos": second.images,
+        "ingest_km": ingest_km,
         "anchor_km": told_km(*words, "--quiet"),
-        "adjust_km": told_km("adjust", str(database), first.map_id, second.map_id),
     }
     contribute(Database.open(grown), [contribution(shifted / name) for name in names[1::2]])
     figures["grow_km"] = told_km("grow", str(grown))
     write_figures(args.json, figures)
-    told = [figures[f"{who}_km"] for who in ("anchor", "adjust", "grow")]
-    return 0 if all(km is not None and abs(km - _SHIFT_M / 1000.0) < 1.0 for km in told) else 1
+    told = [figures[f"{who}_km"] for who in ("ingest", "anchor", "grow")]
+    held = second.status == "quarantined"
+    return 0 if held and all(km is not None and abs(km - _SHIFT_M / 1000.0) < 1.0 for km in told) else 1
 
 
 def shifted_position(photo: Path) -> tuple[ExifInfo, float, float]:

@@ -98,6 +98,9 @@ def run_maps(args: argparse.Namespace) -> int:
         for m in maps
     ]  # fmt: skip
     sys.stdout.write(format_table(header, rows_))
+    sys.stdout.writelines(
+        f"{m.map_id}: {m.status_reason}\n" for m in maps if m.status == "quarantined" and m.status_reason
+    )
     _write_unplaced(unplaced)
     return 0
 

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 from featuredb.geometry.arrays import FloatArray
 
 NOISE_SHARE, _DRIFT_SHARE = 0.5, 0.4  # of the stated sigma: the middle of what they may be
-_NOISE_SPREAD, _DRIFT_SPREAD = 1.0, 1.5  # of their logarithms
+NOISE_SPREAD, _DRIFT_SPREAD = 1.0, 1.5  # of their logarithms
 _SAMPLES = 128
 _DELTA = 0.1  # of a logarithm
 _PROPOSAL = 5.0  # degrees of freedom of the t from which components are drawn
@@ -122,7 +122,7 @@ class MixedModel:
             slope[axis.group] += white * float(by_variance.sum())
             slope[2 + axis.group] += float((drift * by_variance).sum())
         if stated is not None:
-            spread = np.array([_NOISE_SPREAD] * 2 + [_DRIFT_SPREAD] * 2)
+            spread = np.array([NOISE_SPREAD] * 2 + [_DRIFT_SPREAD] * 2)
             off = (theta - prior_mean(stated)) / spread
             cost += float((off**2).sum())
             slope += 2.0 * off / spread

@@ -13,16 +13,18 @@ import numpy as np
 
 from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
-from ingest.colmap.bridge import Model, SfmPhoto, run_incremental, write_database
+from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, write_database
 from ingest.colmap.submodel import keep_photos
 from ingest.sfm.extract import read_keypoints
 from ingest.sfm.global_start import map_globally, registered_with_usual_lens
+from ingest.sfm.held_lens import better_supported, mostly_impossible
 from ingest.sfm.matching import read_two_view
 from ingest.sfm.view_graph_focals import calibrate_focals, start_from
 from ingest.workspace import atomic_folder
 
 logger = logging.getLogger(__name__)
 
+_VERSION = 2  # raised when the same task would give other models
 PriorUse = Literal["none", "bundle"]
 _MANY_PHOTOS = 8  # of one lens: a film's keyframes, not a visitor's photos
 _MOSTLY = 0.5  # of the photos; fewer with a lens that people have, and the start is to blame
@@ -128,9 +130,14 @@ class SfmTask:
         photos = sum(view.camera_row in unknown for view in self.views)
         return bool(unknown) and photos >= _MANY_PHOTOS * len(unknown)
 
+    def exif_px(self) -> list[float | None]:
+        """Focal length of EXIF by row of the photo."""
+        told = [camera.focal_px if known else None for camera, known in self.cameras]
+        return [told[view.camera_row] for view in self.views]
+
     def key(self) -> str:
         """Digest (24 characters) of the content: equal keys give equal models."""
-        content = hashlib.sha256(repr((self.cameras, self.options)).encode())
+        content = hashlib.sha256(repr((_VERSION, self.cameras, self.options)).encode())
         for view in self.views:
             made_of = (view.features.parent.name, view.features.name)
             content.update(repr((view.name, view.camera_row, made_of)).encode())
@@ -163,7 +170,28 @@ def reconstruct(task: SfmTask, folder: Path) -> None:
         database = Path(scratch) / "colmap.db"
         photos = task.write_database(database)
         _map(task, database, Path(scratch), output)
+        astray = options.refine_focal and mostly_impossible(read_models(output), task.exif_px())
         adjust_models(output, database, task.known(photos), loss_scale_px(task), adjust_options(options))
+        if astray:
+            _hold_lens(task, Path(scratch) / "held", output)
+
+
+def _hold_lens(task: SfmTask, scratch: Path, output: Path) -> None:
+    """Map again with the lens held at EXIF's; in place of what is in `output` if it counts."""
+    again = scratch / "models"
+    again.mkdir(parents=True)
+    database = scratch / "colmap.db"  # the first one has got the first attempt's lenses
+    photos = task.write_database(database)
+    _map(replace(task, options=replace(task.options, refine_focal=False)), database, scratch, again)
+    adjust_models(again, database, task.known(photos), loss_scale_px(task), adjust_options(task.options))
+    held, free = (disjoint(read_models(f), task.options.min_model_photos) for f in (again, output))
+    if not held or mostly_impossible(held, task.exif_px()):
+        return
+    limit_px = mapping_settings(task.options, task.side_px)["mapper.filter_max_reproj_error"]
+    keypoints = [photo.keypoints for photo in photos]
+    if better_supported(held, free, keypoints, limit_px, task.options.adjust.dilution):
+        logger.info("%s: with the lens held", task)
+        _take(again, output)
 
 
 def _map(task: SfmTask, database: Path, scratch: Path, output: Path) -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from featuredb.cli.main import main
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database
 from ingest.map_builder import MapOptions
@@ -185,3 +186,24 @@ def test_a_map_without_a_good_point_is_refused(
     report = ingest_photos(database, hills[0], replace(_TRUTH, making=making, work=work))
     assert [(m.status, m.reason_code) for m in report.maps] == [("refused", "NO_POINTS")]
     assert not database.snapshot().maps()
+
+
+def test_positions_that_are_shifted_together_are_told_beside_a_map_of_the_scene(
+    hills: tuple[Path, list[HillPhoto]],
+    work: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """The same hills 50 km away: the map is placed, does not answer, and it is said everywhere why."""
+    database = Database.create(tmp_path / "db")
+    (right,) = ingest_photos(database, hills[0], replace(_TRUTH, work=work)).maps
+    write_hill_photos(tmp_path / "shifted", rows=2, east_m=50_000.0)
+    for _ in range(2):  # the second run finds the map there, and says the same
+        report = ingest_photos(database, tmp_path / "shifted", replace(_TRUTH, work=work))
+        (note,) = [w for w in report.warnings if "50.0 km to the west" in w]
+        assert right.map_id in note
+    shifted = database.snapshot().get(report.maps[0].map_id)
+    assert (shifted.status, shifted.method) == ("quarantined", "gps")
+    assert main(["maps", database.url]) == 0
+    assert f"{shifted.map_id}: map {right.map_id}" in capsys.readouterr().out
+    assert database.snapshot().get(right.map_id).status == "active"

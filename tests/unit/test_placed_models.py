@@ -76,15 +76,20 @@ def test_photos_that_are_too_few_for_a_map_are_named_together() -> None:
     assert _said(_placed(model)) == [("TOO_FEW", ["0", "1", "2"]), ("WEAKLY_TIED", ["3", "4", "5"])]
 
 
-@pytest.mark.parametrize(("focal_px", "word"), [(1265.0, "EXIF says 1265"), (None, ""), (420.0, "")])
-def test_a_focal_length_that_cannot_be_holds_a_map_back(focal_px: float | None, word: str) -> None:
+@pytest.mark.parametrize(
+    ("focal_px", "shear", "word"),
+    [(1265.0, 0.0, "wrong EXIF"), (1265.0, 3e-4, "sheared"), (None, 0.0, ""), (420.0, 0.0, "")],
+)
+def test_a_focal_length_that_cannot_be_holds_a_map_back(
+    focal_px: float | None, shear: float, word: str
+) -> None:
     """A rolling shutter bent a map until its lens was a fifth of EXIF's; a picture may be cut by a third."""
     model = model_of(range(200), range(200), range(200))
     model = replace(model, cameras=tuple(Camera.from_focal(640, 480, 262.0) for _ in model.cameras))
     photos = [Photo(name=f"{k}.jpg", path=Path(f"{k}.jpg"), focal_px=focal_px) for k in range(3)]
-    reason = impossible_lens(model, photos)
+    reason = impossible_lens(model, photos, shear)
     assert word in reason
-    assert bool(reason) == bool(word)
+    assert ("EXIF says 1265" in reason) == bool(reason) == bool(word)
 
 
 @pytest.mark.parametrize(("size", "held"), [(9e-4, True), (1e-4, False), (None, False)])

@@ -303,19 +303,20 @@ REAL: tuple[Row, ...] = (
         group="real",
         form="full",
         claim="`brighton`, the positions of every second photo shifted by 50 km together: they become a map "
-        "there; `anchor` on the scan, `adjust` with the map of the others, and `grow` say by how far",
+        "there, in quarantine; `ingest` beside the map of the others, `anchor` on the scan and `grow` say by "
+        "how far",
         commands=(
             (
                 *("tools.shifted_positions", "--photos", BRIGHTON, "--scan", SCAN),
                 *("--work", "{work}/maps", *OUT),
             ),
         ),
-        figures=same("active", "photos", "anchor_km", "adjust_km", "grow_km"),
-        text="{photos} photos placed; said: {anchor_km:.1f} km from the scan, {adjust_km:.1f} km from the "
-        "other map, {grow_km:.1f} km where the photos are contributed",
+        figures=same("quarantined", "photos", "ingest_km", "anchor_km", "grow_km"),
+        text="{photos} photos placed; said: {ingest_km:.1f} km from the other map by the ingest, "
+        "{anchor_km:.1f} km from the scan, {grow_km:.1f} km where the photos are contributed",
         limits=(
-            Limit(figure="active", least=1),
-            *(Limit(figure=f"{who}_km", least=49.0, most=51.0) for who in ("anchor", "adjust", "grow")),
+            Limit(figure="quarantined", least=1),
+            *(Limit(figure=f"{who}_km", least=49.0, most=51.0) for who in ("ingest", "anchor", "grow")),
         ),
         needs=("brighton/images", "brighton/model.laz"),
         minutes=4,

@@ -71,15 +71,23 @@ class Overlap:
 
 
 def measure_overlap(
-    feature_map: FeatureMap, other: FeatureMap, options: OverlapOptions | None = None
+    feature_map: FeatureMap,
+    other: FeatureMap,
+    options: OverlapOptions | None = None,
+    *,
+    images: Sequence[MapImage] | None = None,
 ) -> Overlap:
-    """Images of `feature_map` localised in `other`, and the similarity that they agree upon."""
+    """Images of `feature_map` localised in `other`, and the similarity that they agree upon.
+
+    Args:
+        images: those that are asked; None: the ones that should see the other map by both placements.
+    """
     options = options or OverlapOptions()
     if feature_map.extractor_fingerprint != other.extractor_fingerprint:
         return Overlap(reason="NO_OVERLAP", message="descriptors of different extractors")
     if feature_map.height_datum != other.height_datum:
         return Overlap(reason="NO_OVERLAP", message="heights of different datums")
-    images = _images_near(feature_map, other, options)
+    images = _images_near(feature_map, other, options) if images is None else images
     area = build_area([other])
     indexed = IndexedArea(area=area, index=build_index(area.descriptors))
     localised: dict[int, LocalisedPhoto] = {}
