@@ -18,7 +18,7 @@ from featuredb.stage_clock import StageClock
 from featuredb.store import Database, Snapshot
 from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.place.same_scene import same_scene_elsewhere
+from ingest.growth.place.scene_elsewhere import same_scene_elsewhere
 from ingest.map_builder import MapIdentity
 from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photos.photo import Photo
