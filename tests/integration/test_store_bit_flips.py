@@ -9,7 +9,7 @@ from featuredb.store import Database
 from featuredb.store.durable import local
 from tests.support.bit_flips import flip_bits, outcome, rich_database, seen
 
-FLIPS = 100
+FLIPS = 40
 
 
 @pytest.fixture
