@@ -287,7 +287,8 @@ def _beside_others(component: Component, there: Snapshot, work: Path, options: I
     found = same_scene_elsewhere(feature_map, there, work, options.vocabulary or shipped_vocabulary())
     if found is None:
         return component
-    return replace(component, feature_map=replace(feature_map, status="quarantined"), reason=found.message)
+    reason = "; ".join(filter(None, (component.reason, found.message)))
+    return replace(component, feature_map=replace(feature_map, status="quarantined"), reason=reason)
 
 
 def _registered_all(batch: Sequence[Component], result: Reconstructed) -> dict[str, PhotoOutcome]:

@@ -179,7 +179,9 @@ def _vacuum_candidates(
     table = database.table(CANDIDATE_IMAGES)
     named = named_writes(database)
     grace = timedelta(hours=options.orphan_grace_h)
-    fresh = {w for w, time in write_times(write_ids_in(table), table.storage).items() if now - time < grace}
+    writes = write_ids_in(table)
+    times = write_times(writes, table.storage)
+    fresh = {write_id for write_id in writes if write_id not in times or now - times[write_id] < grace}
     refused = superfluous_images(database, now, timedelta(hours=options.history_h), fresh)
     orphans = _remove_orphans(table, named, now - grace, dry_run)
     if refused and not dry_run:

@@ -8,9 +8,12 @@ revoked/NAME.pem        those of clients that they do not name any more
 """
 
 import base64
+import fcntl
 import json
 import os
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -81,12 +84,14 @@ class Authority:
             raise AuthorityError(
                 f"{folder}: expected no such folder, or an empty one; nothing is overwritten"
             )
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         identity = Identity.authority()
         server = identity.server(_SERVER, tuple(dict.fromkeys((*hosts, _LOCALHOST))))
-        _write_new(folder / "server.json5", _SERVER_HEAD + _text(_server(identity, server, hosts, port)))
-        _write_new(folder / "ca.pem", identity.certificate.decode())
-        _write_new(folder / "ca.key", identity.key.decode())
+        with _as_authority_error(folder):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            folder.chmod(0o700)  # it was there already
+            _write_new(folder / "server.json5", _SERVER_HEAD + _text(_server(identity, server, hosts, port)))
+            _write_new(folder / "ca.pem", identity.certificate.decode())
+            _write_new(folder / "ca.key", identity.key.decode())
         return cls(folder)
 
     def clients(self) -> list[str]:
@@ -105,36 +110,47 @@ class Authority:
                 "client: expected 1..64 letters, digits, '_', '.', '-', beginning with a letter or digit, "
                 f"not {_SERVER!r} nor {ANONYMOUS!r}, found {name!r}"
             )
-        if self._revoked(name).exists():
-            # The certificate that was revoked has this name for ever, and would be let in again.
-            raise AuthorityError(f"client {name!r} was revoked; choose another name")
         path = self.folder / "clients" / f"{name}.json5"
-        for made in (self._issued(name), path):
-            if made.exists():
-                raise AuthorityError(f"client {name!r}: {made} is there already; nothing is overwritten")
-        config = self._server()
-        client = self._identity.client(name)
-        endpoints = config.get("metadata", {}).get(_ENDPOINTS, [])
-        self._write_rules(config, [*self.clients(), name])
-        _write_new(self._issued(name), client.certificate.decode())
-        _write_new(path, _HEAD + _text(_client(name, self._identity, client, endpoints)))
+        with self._alone():
+            if self._revoked(name).exists():
+                # The certificate that was revoked has this name for ever, and would be let in again.
+                raise AuthorityError(f"client {name!r} was revoked; choose another name")
+            for made in (self._issued(name), path):
+                if made.exists():
+                    raise AuthorityError(f"client {name!r}: {made} is there already; nothing is overwritten")
+            config = self._server()
+            client = self._identity.client(name)
+            endpoints = config.get("metadata", {}).get(_ENDPOINTS, [])
+            self._write_rules(config, [*self.clients(), name])
+            _write_new(self._issued(name), client.certificate.decode())
+            _write_new(path, _HEAD + _text(_client(name, self._identity, client, endpoints)))
         return path
 
     def revoke(self, name: str) -> None:
         """Let a client do nothing any more, and give its name to nobody. The server knows after a restart.
 
+        What was cut off is finished by the same call again.
+
         Raises:
             AuthorityError: no such client, or the server's configuration cannot be read.
         """
-        config, clients = self._server(), self.clients()
-        if name not in clients:
-            raise AuthorityError(
-                f"client: expected one that is known ({', '.join(clients) or 'none is'}), found {name!r}"
-            )
-        self._write_rules(config, [client for client in clients if client != name])
-        (self.folder / "revoked").mkdir(mode=0o700, exist_ok=True)
-        self._issued(name).rename(self._revoked(name))
-        (self.folder / "clients" / f"{name}.json5").unlink(missing_ok=True)
+        with self._alone():
+            config = self._server()
+            if name in self.clients():
+                (self.folder / "revoked").mkdir(mode=0o700, exist_ok=True)
+                self._issued(name).rename(self._revoked(name))  # first: no later rules name the client
+            elif not re.fullmatch(NAME_PATTERN, name) or not self._revoked(name).exists():
+                known = ", ".join(self.clients()) or "none is"
+                raise AuthorityError(f"client: expected one that is known ({known}), found {name!r}")
+            self._write_rules(config, self.clients())
+            (self.folder / "clients" / f"{name}.json5").unlink(missing_ok=True)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """One program at a time changes the folder."""
+        with _as_authority_error(self.folder), (self.folder / "ca.pem").open() as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            yield
 
     def _issued(self, name: str) -> Path:
         return self.folder / "issued" / f"{name}.pem"
@@ -146,6 +162,8 @@ class Authority:
         try:
             lines = self.server_config.read_text(encoding="utf-8").splitlines()
             config: _Config = json.loads("\n".join(x for x in lines if not x.lstrip().startswith("//")))
+            if not isinstance(config, dict):
+                raise ValueError("something else than an object")
         except (OSError, ValueError) as error:
             raise AuthorityError(
                 f"{self.server_config}: expected JSON, and lines of comment that begin with //, found {error}"
@@ -205,6 +223,14 @@ def _base64(pem: bytes) -> str:
 
 def _text(config: _Config) -> str:
     return json.dumps(config, indent=2) + "\n"
+
+
+@contextmanager
+def _as_authority_error(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise AuthorityError(f"{folder}: expected a folder to write to, found {error}") from error
 
 
 def _write_new(path: Path, text: str) -> None:

@@ -24,7 +24,7 @@ def check_exposure(config: zenoh.Config) -> None:
     ]
     # Where the server only connects, the rules are those of the router there.
     exposed += [e for e in _endpoints(config, "connect", mode) if not _is_tls(e) and not _is_local(e)]
-    if mode != "router" and not guarded and _get(config, "scouting/multicast/enabled") is not False:
+    if not guarded and _get(config, "scouting/multicast/enabled") is not False and _connects(config, mode):
         exposed.append("scouting/multicast, which is on where it is not set to false,")
     if exposed:
         raise ServiceStartError(
@@ -32,6 +32,14 @@ def check_exposure(config: zenoh.Config) -> None:
             "place and see its clients' pictures; make certificates and rules by `featuredb keys init DIR` "
             "and start with --config DIR/server.json5, or say --insecure"
         )
+
+
+def _connects(config: zenoh.Config, mode: str) -> bool:
+    """Whether it connects to whom it finds by multicast: routers only where they are told to."""
+    found = _get(config, "scouting/multicast/autoconnect")
+    if isinstance(found, dict):
+        found = found.get(mode)
+    return mode != "router" if found is None else bool(found)
 
 
 def authenticates(config: zenoh.Config) -> bool:

@@ -2,11 +2,13 @@
 
 import stat
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from cryptography import x509
 
 from featuredb.cli.main import main
+from reloc.authority.folder import Authority
 from tests.support.strangers import config_of
 
 
@@ -86,6 +88,24 @@ def test_a_folder_that_is_no_authority_says_how_to_make_one(
 ) -> None:
     assert main(["keys", "client", str(tmp_path), "phone"]) == 2
     assert f"featuredb keys init {tmp_path}" in capsys.readouterr().err
+
+
+def test_a_revoke_that_was_cut_off_is_finished(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The client is in no rules that are written afterwards, and the same call again takes it out at once."""
+    with monkeypatch.context() as cut:
+        cut.setattr(Authority, "_write_rules", Mock(side_effect=KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            Authority(folder).revoke("phone")
+    assert main(["keys", "client", str(folder), "tablet"]) == 0
+    assert subjects(folder) == ["server", "tablet"]
+    assert main(["keys", "revoke", str(folder), "phone"]) == 0
+    assert not (folder / "clients" / "phone.json5").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert main(["keys", "init", str(tmp_path / "file" / "keys")]) == 2
+    assert "expected a folder to write to" in capsys.readouterr().err
 
 
 def test_rules_come_and_go_and_the_rest_of_the_configuration_stays(

@@ -2,16 +2,20 @@
 
 import os
 import time
-from datetime import datetime, timedelta
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
+import pyarrow.fs as fs
 import pytest
 
 from featuredb.errors import ConflictError
 from featuredb.store import Database
 from featuredb.store.commits import new_write_id
+from featuredb.store.durable.ages import store_time
 from featuredb.store.maintenance import VacuumOptions, vacuum
+from featuredb.store.tables import MAPS
 from featuredb.store.verify import verify
 from tests.support.maps import assert_same_map, random_map
 
@@ -107,3 +111,29 @@ def test_files_just_dropped_stay_for_readers(database: Database) -> None:
 
 def _die(*args: Any, **kwargs: Any) -> None:
     raise KeyboardInterrupt
+
+
+def test_a_file_that_is_lost_stops_no_vacuum(database: Database) -> None:
+    database.commit_map(random_map(1, extent_m=10.0))
+    replaced = list(Path(database.url, "points").glob("**/*.parquet"))
+    database.commit_map(replace(random_map(2, extent_m=10.0), map_id="map-1"), replaces="map-1")
+    for path in replaced:
+        path.unlink()
+    vacuum(database, NOTHING_KEPT)
+    assert_same_map(
+        database.snapshot().load_map("map-1"), replace(random_map(2, extent_m=10.0), map_id="map-1")
+    )
+
+
+def test_the_time_of_a_store_that_can_only_be_read_is_that_of_its_newest_file(database: Database) -> None:
+    class ReadOnly:
+        def open_output_stream(self, path: str) -> None:
+            raise OSError(f"{path}: read-only file system")
+
+        def get_file_info(self, what: fs.FileSelector) -> Any:
+            return files.get_file_info(what)
+
+    make_older(database, hours=2.0)
+    files = database.table(MAPS).storage
+    age = datetime.now(UTC) - store_time(ReadOnly())
+    assert timedelta(hours=1.9) < age < timedelta(hours=2.1)

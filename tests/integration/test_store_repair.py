@@ -181,6 +181,19 @@ def test_a_broken_checkpoint_is_set_aside(
     assert (report.ok, report.maps) == (True, 5)
 
 
+def test_a_torn_entry_goes_with_its_checkpoint(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    for seed in (3, 4):
+        database.commit_map(random_map(seed, extent_m=10.0))
+    torn = entry(database, MAPS, 4)
+    assert torn.with_name(f"{4:020d}.checkpoint.parquet").exists()
+    torn.write_bytes(torn.read_bytes()[:100])
+    repair(database, apply=True, give_up_lost=True)
+    report = verify(database)
+    assert (report.ok, report.maps) == (True, 3)
+    assert database.commit_map(random_map(4, extent_m=10.0)).created
+
+
 def test_a_torn_name_of_the_checkpoint_hinders_no_commit(
     database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -90,6 +90,10 @@ def test_a_peer_that_looks_for_others_finds_strangers() -> None:
     check_exposure(config(here, mode="peer", **_TLS, **_RULES))
     with pytest.raises(ServiceStartError, match="multicast"):
         check_exposure(config(here, mode="peer"))
+    check_exposure(config(here, mode="router"))
+    told = {"scouting": {"multicast": {"autoconnect": {"router": ["router", "peer"]}}}}
+    with pytest.raises(ServiceStartError, match="multicast"):
+        check_exposure(config(here, mode="router", **told))
 
 
 def test_a_router_elsewhere_is_asked_over_tls() -> None:

@@ -1,6 +1,8 @@
 """Which photos of a map that has drifted too far are within the budget by themselves."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,7 +10,10 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
+from ingest.growth.graph import budget
 from ingest.growth.graph.budget import drift_gate, rows_within
+from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.values import GrownMap, MapsPlacement
 from tests.support.scenes import box_points, random_descriptors, ring, scene_map
 
 RNG = np.random.default_rng(4)
@@ -52,3 +57,27 @@ def test_the_gate_of_drift(drift_m: float, passes: bool) -> None:
     gate = drift_gate(drift_m, BUDGET_M)
     assert gate.passes == passes
     assert f"{drift_m:.2f} m" in gate.message
+
+
+def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is beyond the budget, one hangs on it alone, one was left out before for a reason of its own."""
+
+    placement = MapsPlacement(reason=None, message="", frame=bent([None]).frame)
+
+    def grown(part: Any) -> GrownMap:
+        left_out = {3: ("WEAK_LINK", "little")} if 3 in part.rows else {}
+        return GrownMap(feature_map=part, placement=placement, model=part, left_out=left_out)
+
+    def cut(part: Any, rows: list[int], least: int) -> Any:
+        return SimpleNamespace(rows=np.array([0, 1, 2]))  # 4 hangs on nothing that is left
+
+    whole = SimpleNamespace(rows=np.arange(6))
+    monkeypatch.setattr(
+        budget, "with_drift", lambda found, *_: (found.model, 0.1 * len(found.model.rows), None)
+    )
+    monkeypatch.setattr(budget, "rows_within", lambda *_: [0, 1, 2, 4])
+    monkeypatch.setattr(budget, "keep_photos", cut)
+    found = budget.grow_within_budget(whole, grown, {}, ConfirmationOptions(), BUDGET_M)  # type: ignore[arg-type]
+    assert isinstance(found, GrownMap)
+    codes = {row: code for row, (code, _) in found.left_out.items()}
+    assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}

@@ -14,9 +14,15 @@ from featuredb.store.durable.publish import SCRATCH, flush
 
 
 def store_time(files: fs.FileSystem) -> datetime:
-    """What time it is where the files lie, UTC: that of a file which is made for this, and removed."""
+    """What time it is where the files lie, UTC: that of a file which is made for this, and removed.
+
+    Of a store that can only be read, as in a dry run, the time of its newest file: nothing seems older.
+    """
     probe = f"_time-{uuid.uuid4().hex}"
-    files.open_output_stream(probe).close()
+    try:
+        files.open_output_stream(probe).close()
+    except OSError:
+        return max(file_times(files).values())
     try:
         (info,) = files.get_file_info([probe])
         return utc(info.mtime)
@@ -31,13 +37,18 @@ def file_times(files: fs.FileSystem) -> dict[str, datetime]:
 
 
 def write_times(writes: Mapping[str, set[str]], files: fs.FileSystem) -> dict[str, datetime]:
-    """When the store got the rows of each write id: the newest of the files that hold them.
+    """When the store got the rows of each write id: the newest of the files that hold them, if all are there.
 
     Args:
         writes: the paths of those files, by write id.
     """
     times = file_times(files) if writes else {}
-    return {write_id: max(times[path] for path in paths) for write_id, paths in writes.items()}
+    # A file that is lost (`verify` says so) is no reason to take the rows of a write away.
+    return {
+        write_id: max(times[path] for path in paths)
+        for write_id, paths in writes.items()
+        if all(path in times for path in paths)
+    }
 
 
 def old_files(files: fs.FileSystem, unused: Iterable[str], grace: timedelta) -> list[str]:

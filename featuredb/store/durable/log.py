@@ -208,7 +208,10 @@ def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProbl
                 yield LogProblem(info.base_name, "it is empty or torn")
             elif named not in checkpoints or named > newest:
                 yield LogProblem(info.base_name, f"it names checkpoint {named}, which is not there")
-        elif _CHECKPOINT.fullmatch(info.base_name):
+        elif (match := _CHECKPOINT.fullmatch(info.base_name)) is not None:
+            if int(match[1]) > newest:
+                yield LogProblem(info.base_name, f"it is of version {int(match[1])}, which has no entry")
+                continue
             try:
                 pq.read_table(info.path, filesystem=files)
             except (OSError, pa.ArrowException) as error:

@@ -77,16 +77,9 @@ def _repair_table(
     broken = {p.version: p for p in problems if p.version is not None}
     there, head = list_entries(files), acknowledged(files)
     whole = max((v for v in there if v not in broken), default=-1)  # the state to go back to
-    for problem in problems:
+    for version, problem in broken.items():
         where = f"{name}/{LOG}/{problem.name}"
-        version = problem.version
-        if version is None:
-            if broken:
-                advice = "first repair the entries, and then again"
-                yield RepairStep(where=where, what=problem.what, action="", advice=advice)
-            else:
-                yield _step(files, where, problem, "set aside: the entries say the same", apply)
-        elif version < whole or whole < 0:
+        if version < whole or whole < 0:
             advice = "restore the database from a backup: newer states build on this one"
             yield RepairStep(where=where, what=problem.what, action="", advice=advice)
         elif head is not None and version <= head and not give_up_lost:
@@ -100,6 +93,17 @@ def _repair_table(
             yield _step(files, where, problem, action, apply and version in there)
             if apply and head is not None and head > whole:
                 forget_acknowledged(files, whole)
+    if apply and broken:  # a checkpoint of what was set aside must go, too
+        problems = list(log_problems(files))
+    entries_left = any(p.version is not None for p in problems)
+    for problem in problems:
+        if problem.version is None:
+            where = f"{name}/{LOG}/{problem.name}"
+            if entries_left:
+                advice = "first repair the entries, and then again"
+                yield RepairStep(where=where, what=problem.what, action="", advice=advice)
+            else:
+                yield _step(files, where, problem, "set aside: the entries say the same", apply)
 
 
 def _step(files: fs.FileSystem, where: str, problem: LogProblem, action: str, move: bool) -> RepairStep:

@@ -65,7 +65,8 @@ def grow_within_budget(
         left = keep_photos(part, within, least=_LEAST_PHOTOS) if len(within) < len(rows) else None
         if left is None:
             break
-        beyond |= {int(r): (gate.reason, gate.message) for r in set(part.rows.tolist()) - set(within)}
+        gone = set(part.rows.tolist()) - set(left.rows.tolist())
+        beyond |= {r: grown.left_out.get(r, (gate.reason, gate.message)) for r in gone}
         part = left
     return refused
 

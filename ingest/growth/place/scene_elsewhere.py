@@ -5,6 +5,7 @@ same scene: images of the new map look like images of that one, are localised in
 the maps then lie to each other is compared with what both placements allow.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from featuredb.errors import FeatureDbError
 from featuredb.geo.words import way_words
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
@@ -23,6 +25,8 @@ from ingest.growth.map_images import features_of_image
 from ingest.growth.place.overlaps import Overlap, OverlapOptions, measure_overlap
 from ingest.register.variance_components import NOISE_SPREAD
 from ingest.workspace import read_array, write_arrays
+
+logger = logging.getLogger(__name__)
 
 _RATE = 0.001  # of right maps of one scene, that are said to contradict each other
 _MAPS, _IMAGES = 3, 8  # that look most alike are asked; a scene's own map and images are nearly always first
@@ -70,7 +74,12 @@ def same_scene_elsewhere(
     for summary in snapshot.maps():
         if not _comparable(summary, feature_map):
             continue
-        alike = (own @ _vectors_of(summary, snapshot, work, vocabulary).T).max(axis=1, initial=-1.0)
+        try:
+            theirs = _vectors_of(summary, snapshot, work, vocabulary)
+        except FeatureDbError as error:  # a damaged map is no reason to refuse a new one
+            logger.warning("map %s is not compared with the new one: %s", summary.map_id, error)
+            continue
+        alike = (own @ theirs.T).max(axis=1, initial=-1.0)
         ranked.append((float(np.sort(alike)[-least:].sum()), summary, alike))
     ranked.sort(key=lambda entry: (-entry[0], entry[1].map_id))
     found: list[tuple[float, SceneElsewhere]] = []
