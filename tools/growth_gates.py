@@ -76,7 +76,6 @@ def recorded(path: Path, frame: LocalFrame, true_place: TruePlace) -> Iterator[N
         for module, name, wrapped in (
             (component, "place_by_maps", note.placing),
             (component, "refine_placed", note.refining),
-            (budget, "drift_gate", note.budget),
             (budget, "with_drift", note.drifting),
             (run, "promote_confirmed", note.promoting),
         ):
@@ -90,7 +89,6 @@ class _Note:
     def __init__(self, *, file: Any, frame: LocalFrame, true_place: TruePlace) -> None:
         self._file, self._frame, self._true_place = file, frame, true_place
         self._photos: Sequence[Photo] = ()
-        self._last: FeatureMap | None = None
 
     def placing(self, step: Any) -> Any:
         def place_by_maps(model: Any, localised: Any, correspondences: Any, photos: Any, *more: Any) -> Any:
@@ -115,21 +113,12 @@ class _Note:
         return refine_placed
 
     def drifting(self, step: Any) -> Any:
-        def with_drift(*args: Any) -> Any:
-            found = step(*args)
-            self._last = found[0]
+        def with_drift(grown: Any, maps: Any, confirmation: Any, budget_m: float) -> Any:
+            found = step(grown, maps, confirmation, budget_m)
+            self._map("budget", found[0], [budget.drift_gate(found[1], budget_m)])
             return found
 
         return with_drift
-
-    def budget(self, step: Any) -> Any:
-        def drift_gate(*args: Any) -> Gate:
-            gate: Gate = step(*args)
-            assert self._last is not None
-            self._map("budget", self._last, [gate])
-            return gate
-
-        return drift_gate
 
     def promoting(self, step: Any) -> Any:
         def promote_confirmed(database: Any, *args: Any, **more: Any) -> Any:
