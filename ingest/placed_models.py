@@ -187,7 +187,7 @@ def _component(
         local_from_sfm=placed.local_from_sfm,
         covariance=placed.covariance,
         residual_rms_m=placed.residual_rms_m,
-        evidence=_evidence(placed, [chosen[i] for i in with_gps]),
+        evidence=placement_evidence(placed, [chosen[i] for i in with_gps]),
     )
     hints = [chosen[i].gps_is_hint for i, inner in zip(with_gps, placed.inliers, strict=True) if inner]
     feature_map = build_map(model, placement, frame, chosen, features, identity, options.maps)
@@ -278,9 +278,10 @@ def _by_control(
     return replace(component, model=control.model, feature_map=feature_map, reason_code="", reason="")
 
 
-def _evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
+def placement_evidence(placed: GpsPlacement, photos: Sequence[Photo]) -> dict[str, Any]:
+    """What a map keeps of its placement by positions; values that JSON can hold."""
     residuals = {
-        photo.name: [round(float(v), 4) for v in row]
+        photo.name: [round(float(v), 4) if np.isfinite(v) else None for v in row]  # no height: nothing
         for photo, row in zip(photos, placed.residuals_m, strict=True)
     }
     outliers = [photo.name for photo, inner in zip(photos, placed.inliers, strict=True) if not inner]

@@ -1,7 +1,9 @@
 """Placement by GPS: known similarities, honest covariance, and every gate."""
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from featuredb.geometry.rotation import nearest_rotation, so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.own_frame import held_of
+from ingest.placed_models import placement_evidence
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.register.position_noise import Held
 
@@ -381,6 +384,9 @@ def test_positions_without_heights_place_a_map() -> None:
     error = (_TRUE @ placed.local_from_sfm.inverse()).log()
     assert abs(error[0]) < 0.1
     assert np.sqrt(placed.covariance[6, 6]) > 1000.0  # nobody knows the height
+    evidence = placement_evidence(placed, [SimpleNamespace(name=f"{k}.jpg") for k in range(20)])
+    json.dumps(evidence, allow_nan=False)  # a map keeps it
+    assert evidence["residuals_enu_m"]["0.jpg"][2] is None
 
 
 def test_a_refusal_without_heights_names_none() -> None:
