@@ -117,7 +117,7 @@ class Table:
         except (DeltaError, OSError) as error:
             raise _why_not_opened(url, storage_options, version, error) from error
         if version is None:
-            check_end(url, table_files(url, storage_options), int(delta.version()))
+            check_end(url, table_files(url, storage_options, delta), int(delta.version()))
         check_format(url, spec, delta)
         return cls(url, delta, spec, storage_options)
 
@@ -128,7 +128,7 @@ class Table:
     @property
     def storage(self) -> fs.FileSystem:
         """The table's files; paths are relative to it."""
-        return table_files(self._url, self._storage_options)
+        return table_files(self._url, self._storage_options, self._delta)
 
     @property
     def format(self) -> int:

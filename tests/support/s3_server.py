@@ -104,9 +104,9 @@ def moto_server() -> Iterator[dict[str, str]]:
     """
     port = free_port()
     code = (
-        "from moto.server import DomainDispatcherApplication, create_backend_app\n"
+        "from moto.server import create_backend_app\n"
         "from werkzeug.serving import run_simple\n"
-        f"run_simple('127.0.0.1', {port}, DomainDispatcherApplication(create_backend_app), threaded=False)\n"
+        f"run_simple('127.0.0.1', {port}, create_backend_app('s3'), threaded=False)\n"
     )
     with _daemon(sys.executable, "-c", code):
         yield _options_with_bucket(port)

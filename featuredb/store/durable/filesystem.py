@@ -5,15 +5,23 @@ import time
 from functools import cache
 from pathlib import Path
 
+from typing import Any
+
 import pyarrow.fs as fs
 from deltalake.fs import DeltaStorageHandler
 
 
-def table_files(url: str, storage_options: dict[str, str] | None) -> fs.FileSystem:
-    """The files of the table at a URL; paths are relative to it."""
+def table_files(url: str, storage_options: dict[str, str] | None, opened: Any = None) -> fs.FileSystem:
+    """The files of the table at a URL; paths are relative to it.
+
+    Args:
+        opened: the `DeltaTable`, if it is open: without it deltalake reads the log of an object store again.
+    """
     if "://" not in url:
         return fs.SubTreeFileSystem(str(Path(url).absolute()), fs.LocalFileSystem())
     _let_arrow_finish_at_exit()
+    if opened is not None:  # as deltalake's own `to_pyarrow_dataset` does
+        return fs.PyFileSystem(DeltaStorageHandler.from_table(opened._table, storage_options))
     return fs.PyFileSystem(DeltaStorageHandler(url, storage_options))
 
 
