@@ -130,7 +130,7 @@ def cluster() -> Iterator[Any]:
         yield cluster
 
 
-@pytest.mark.slow
+@pytest.mark.evaluation  # tests of the executors do the same with small tasks
 def test_dask_gives_the_same_map_although_a_worker_is_killed(
     cluster: Any,
     hills: tuple[Path, list[HillPhoto]],

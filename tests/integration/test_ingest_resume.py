@@ -137,7 +137,8 @@ def test_killed_at_a_stage(
     assert verify(Database.open(database)).ok
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.evaluation)])
+@pytest.mark.evaluation
+@pytest.mark.parametrize("seed", [1, 2])
 def test_killed_again_and_again_at_random(
     seed: int, photos: Path, undisturbed: FeatureMap, tmp_path: Path
 ) -> None:

@@ -23,10 +23,18 @@ FILES = {
     "brighton/model.laz": ("EPSG:32615", 1.0, 32615, (46.842, -91.994)),
     "lidar/lone-star.copc.laz": ("EPSG:32612", 1.0, 32612, (44.4176, -110.8069)),  # a geyser of Yellowstone
 }
+OFTEN = (
+    "lidar/autzen_trim.laz",
+    "brighton/model.laz",
+    "lidar/lone-star.copc.laz",
+)  # feet; metres; COPC, no CRS
 
 
 @pytest.mark.real_data
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=() if name in OFTEN else pytest.mark.evaluation) for name in FILES],
+)
 def test_real_scans(shared_data: Path, tmp_path: Path, name: str) -> None:
     code, height_unit_m, epsg, (latitude, longitude) = FILES[name]
     path = shared_data / name

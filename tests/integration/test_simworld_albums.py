@@ -38,6 +38,9 @@ TINY = CommunityOptions(
 )
 
 
+pytestmark = pytest.mark.evaluation  # worlds of studies
+
+
 @pytest.fixture(scope="module")
 def album(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_community(tmp_path_factory.mktemp("album"), TINY, workers=1)

@@ -46,7 +46,7 @@ def test_killed_before_a_write(place: Place, writes: int) -> None:
         assert_same_map(database.snapshot().load_map(f"map-{seed}"), random_map(seed))
 
 
-@pytest.mark.slow
+@pytest.mark.evaluation
 def test_killed_at_random_moments(place: Place) -> None:
     """Whatever was visible at the kill is whole, and the same command again ends with the same maps."""
     database = place.create()

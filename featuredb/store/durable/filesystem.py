@@ -4,7 +4,6 @@ import atexit
 import time
 from functools import cache
 from pathlib import Path
-
 from typing import Any
 
 import pyarrow.fs as fs
