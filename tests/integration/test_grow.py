@@ -17,6 +17,7 @@ from featuredb.errors import StoreError
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.features import Features
 from featuredb.store import Database
+from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import contribute, list_candidates
 from featuredb.store.candidates.states import Contribution
 from ingest.growing import grow_candidates, watch_and_grow
@@ -138,7 +139,11 @@ def test_two_owners_at_once_are_promoted_in_one_run(given: Path, tmp_path: Path,
     assert {"agreement", "residuals", "visibility", "drift", "confirmation", "canaries"} <= set(entry.gates)
     evidence = database.snapshot().load_map(entry.map_id).placement.evidence["growth"]
     assert evidence["drift_m"] == pytest.approx(entry.drift_m, abs=1e-6)
-    assert {s["owner"] for s in evidence["sources"]} == {"anna", "ben"}
+    images = database.snapshot().load_map(entry.map_id).images
+    assert {image.owner for image in images} == {"name of anna", "name of ben"}  # whom to name, no owner
+    owners = read_owners(database, database.snapshot())
+    assert set(owners.made_of) == {entry.map_id}
+    assert owners.on_record == {"anna", "ben"}
     assert json.loads(json.dumps(report.as_json()))["version"] == database.poll_version()
     text = report.as_text()
     assert "6 in active maps" in text
@@ -310,7 +315,7 @@ def test_trusted_owners_and_commands(given: Path, tmp_path: Path, capsys: pytest
 
 def test_a_trusted_owner_alone(database: Database, shots: list[Shot]) -> None:
     give(database, shots[:3])
-    options = growing(confirmation=ConfirmationOptions(trusted_owners=("anna",)))
+    options = growing(confirmation=ConfirmationOptions(trusted=("anna",)))
     assert grow_candidates(database, options).count("promoted") == 3
 
 
@@ -321,7 +326,7 @@ def test_an_empty_inbox_is_no_error(database: Database) -> None:
     assert database.poll_version() == version
     contribute(
         database,
-        [Contribution(image=b"no image", width=1, height=1, owner="x", licence="y", received_at=NOW)],
+        [Contribution(image=b"no image", width=1, height=1, credit="x", licence="y", received_at=NOW)],
     )
     assert [p.outcome for p in grow_candidates(database, growing()).photos] == ["refused"]
 
