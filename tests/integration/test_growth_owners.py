@@ -17,7 +17,7 @@ from featuredb.store.verify import verify
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
 from reloc.localiser import Localiser
-from tests.support.scene_strip import note_contributed, put_on_record, strip_map
+from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
 
 _OLD = Path(__file__).parent.parent / "data" / "claimed_owners.db"
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
@@ -74,12 +74,28 @@ def test_an_anchored_map_makes_a_record_and_two_on_record_confirm_each_other(dat
     _add(database, _grown("far", 85.0, "anna", "ben"))
     assert _promoted(database)["far"].reason_code == "ONE_SOURCE"
     _add(database, _grown("near", 45.0, "anna", seed=2))
-    _add(database, _grown("near too", 44.0, "ben", seed=3))
     found = _promoted(database)
-    assert {m: p.promoted for m, p in found.items()} == {"near": True, "near too": True, "far": False}
+    assert (found["near"].promoted, found["far"].promoted) == (True, False)
+    assert _on_record(database) == {"anna"}
+    _add(database, _grown("near too", 44.0, "ben", seed=3))
+    assert all(p.promoted for p in _promoted(database).values())
     assert _on_record(database) == {"anna", "ben"}
-    assert _promoted(database)["far"].promoted
+    assert database.snapshot().get("far").status == "active"
     assert verify(database).ok
+
+
+def test_newcomers_beside_an_anchor_add_what_both_show(database: Database) -> None:
+    """What the anchor shows of them counts at once for what they show beyond it; one alone adds nothing."""
+    _add(database, _grown("near", 45.0, "anna", "ben"))
+    _add(database, _grown("west", -5.0, "eve", seed=2))
+    assert all(p.promoted for p in _promoted(database).values())
+    snapshot, east = database.snapshot(), {}
+    for map_id in ("near", "west"):
+        found = snapshot.load_map(map_id)
+        seen = found.observations
+        east[map_id] = found.points_local(FRAME)[seen.point_index[seen.has_descriptor], 0]
+    assert east["near"].max() > 70.0
+    assert -10.1 < east["west"].min() < -9.0  # the anchor begins at -10 m, her map at -20 m
 
 
 def test_a_record_ends_with_the_maps_that_made_it(database: Database) -> None:

@@ -6,7 +6,7 @@ the wire has authenticated, and its word counts once more than identities has co
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from scipy.sparse.csgraph import maximum_bipartite_matching
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store.candidates.owners import Owners
-from featuredb.store.candidates.states import OPERATOR
+from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
 
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
@@ -73,6 +73,11 @@ class Sources:
 
     owners: Owners = field(default_factory=Owners)
     trusted: tuple[str, ...] = ()
+
+    def with_records(self, owners: Iterable[str]) -> "Sources":
+        """The same with these owners on record, too, as far as they may be."""
+        more = frozenset(owners) - {ANONYMOUS, OPERATOR}
+        return replace(self, owners=replace(self.owners, on_record=self.owners.on_record | more))
 
     def of_owner(self, owner: str, *, anchor: bool = False) -> Source:
         """Of a photo of this owner; `anchor`: of a map that measured its own place."""

@@ -113,6 +113,7 @@ def promote_confirmed(
     waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
     ready: list[_Ready] = []
     outcomes: list[Promotion] = []
+    open_maps: list[MapSummary] = []
     for summary in waiting:
         held_back = _held_back(summary, snapshot, budget_m)
         if held_back is not None:
@@ -122,7 +123,8 @@ def promote_confirmed(
         if known is not None:
             outcomes.append(_stays(summary.map_id, *known))
             continue
-        found = examine(snapshot.load_map(summary.map_id), snapshot, sources, options, new)
+        open_maps.append(summary)
+    for summary, found in zip(open_maps, _examined(open_maps, snapshot, sources, options, new), strict=True):
         gate = found.confirmation.gate
         if not gate.passes:
             outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
@@ -139,6 +141,30 @@ def promote_confirmed(
                 remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
         outcomes += decided
     return outcomes
+
+
+def _examined(
+    waiting: Sequence[MapSummary],
+    snapshot: Snapshot,
+    sources: Sources,
+    options: PromotionOptions,
+    new: NewPhotos | None,
+) -> list[ExaminedMap]:
+    """All of them, with the records that they make for each other: else what two newcomers show beside what
+    an anchor shows would lose its descriptors, which do not come back.
+    """
+    while True:
+        found = [examine(snapshot.load_map(m.map_id), snapshot, sources, options, new) for m in waiting]
+        more = sources.with_records(
+            sources.owners.of_image(one.feature_map, image)
+            for one in found
+            if one.confirmation.gate.passes
+            for image in one.feature_map.images
+            if image.image_id in one.confirmation.earned
+        )
+        if more == sources:
+            return found
+        sources = more
 
 
 def _question(
