@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from featuredb.maps.feature_map import FeatureMap, MapMethod
+from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store import Database
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import list_candidates
@@ -120,15 +120,22 @@ def test_nobody_in_particular_has_no_record(database: Database) -> None:
     assert _promoted(database, ANONYMOUS)["far too"].promoted  # where the wire is the operator's alone
 
 
-def _measures_its_place(method: MapMethod) -> Callable[[Database, FeatureMap], None]:
-    """As `featuredb anchor` and `featuredb register` do."""
+def _by_scan(database: Database, feature_map: FeatureMap) -> None:
+    """As `featuredb anchor` does."""
+    _measured(database, feature_map, "lidar", "active")
 
-    def place(database: Database, feature_map: FeatureMap) -> None:
-        placement = replace(feature_map.placement, method=method)
-        anchored = replace(feature_map, placement=placement, parents=(), generation=0, status="active")
-        database.commit_map(anchored, replaces=feature_map.map_id)
 
-    return place
+def _by_control_points(database: Database, feature_map: FeatureMap) -> None:
+    """As `featuredb register` does, which leaves a map in quarantine where it was."""
+    _measured(database, feature_map, "gcp", "quarantined")
+    assert _on_record(database) == set()
+    _by_hand(database, feature_map)
+
+
+def _measured(database: Database, feature_map: FeatureMap, method: MapMethod, status: MapStatus) -> None:
+    placement = replace(feature_map.placement, method=method)
+    anchor = replace(feature_map, placement=placement, parents=(), generation=0, status=status)
+    database.commit_map(anchor, replaces=feature_map.map_id)
 
 
 def _by_hand(database: Database, feature_map: FeatureMap) -> None:
@@ -139,9 +146,7 @@ def _by_trust(database: Database, feature_map: FeatureMap) -> None:
     assert _promoted(database, "anna")[feature_map.map_id].promoted
 
 
-@pytest.mark.parametrize(
-    "begins", [_measures_its_place("lidar"), _measures_its_place("gcp"), _by_hand, _by_trust]
-)
+@pytest.mark.parametrize("begins", [_by_scan, _by_control_points, _by_hand, _by_trust])
 def test_a_community_begins(database: Database, begins: Callable[[Database, FeatureMap], None]) -> None:
     """Nobody has a record, and no anchor shows anything of it: a scan, control points or the operator do."""
     first = _grown("first", 85.0, "anna", "ben")
