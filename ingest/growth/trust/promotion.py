@@ -41,7 +41,7 @@ class PromotionOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """What others say of a map; `feature_map` has descriptors where they confirm it."""
+    """A map that others confirm; `feature_map` has descriptors where they do."""
 
     feature_map: FeatureMap
     confirmation: Confirmation
@@ -125,8 +125,8 @@ def promote_confirmed(
             continue
         open_maps.append(summary)
     for summary, found in zip(open_maps, _examined(open_maps, snapshot, sources, options, new), strict=True):
-        gate = found.confirmation.gate
-        if not gate.passes:
+        if isinstance(found, Confirmation):
+            gate = found.gate
             outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
             remember(work, summary.map_id, asked, gate.reason, gate.message, (gate,))
         else:
@@ -149,7 +149,7 @@ def _examined(
     sources: Sources,
     options: PromotionOptions,
     new: NewPhotos | None,
-) -> list[ExaminedMap]:
+) -> list[ExaminedMap | Confirmation]:
     """All of them, with the records that they make for each other: else what two newcomers show beside what
     an anchor shows would lose its descriptors, which do not come back.
     """
@@ -158,7 +158,7 @@ def _examined(
         more = sources.with_records(
             sources.owners.of_image(one.feature_map, image)
             for one in found
-            if one.confirmation.gate.passes
+            if isinstance(one, ExaminedMap)
             for image in one.feature_map.images
             if image.image_id in one.confirmation.earned
         )
@@ -204,8 +204,8 @@ def examine(
     sources: Sources,
     options: PromotionOptions,
     new: NewPhotos | None,
-) -> ExaminedMap:
-    """How far others confirm a map: photos of its own, and from outside."""
+) -> ExaminedMap | Confirmation:
+    """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     heard = corroborate(
         feature_map,
         _others(feature_map.map_id, snapshot),
@@ -217,6 +217,8 @@ def examine(
     confirmation = confirm(
         feature_map, sources, options.confirmation, heard.corroborating, heard.contradictions
     )
+    if not confirmation.gate.passes:
+        return confirmation
     part = feature_map
     if options.answer_with == "confirmed":
         points = confirmed_points(feature_map, sources, options.confirmation, heard.corroborating)
