@@ -170,7 +170,11 @@ def anchored(path: Path, album: Album, survey: str, *, max_features: int, worker
 
 
 def give(database: Database, album: Album, facts: Iterable[AlbumFact]) -> None:
-    """Contribute photos as clients do: the bytes, owner, licence, and the table's position as the prior."""
+    """Contribute photos as clients do: the bytes, licence, and the table's position as the prior.
+
+    Each person of the album has a certificate of their own. None has a record: the survey's map, which is an
+    anchor, makes one for whoever photographs what it shows.
+    """
     contributions = []
     for fact in facts:
         image = album.truth.images.get(fact.name)
@@ -186,6 +190,7 @@ def give(database: Database, album: Album, facts: Iterable[AlbumFact]) -> None:
                 width=size[0],
                 height=size[1],
                 owner=fact.owner,
+                credit=fact.owner,
                 licence=fact.licence,
                 received_at=datetime.now(UTC),
                 request=request,

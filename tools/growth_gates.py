@@ -113,8 +113,8 @@ class _Note:
         return refine_placed
 
     def drifting(self, step: Any) -> Any:
-        def with_drift(grown: Any, maps: Any, confirmation: Any, budget_m: float) -> Any:
-            found = step(grown, maps, confirmation, budget_m)
+        def with_drift(grown: Any, maps: Any, budget_m: float) -> Any:
+            found = step(grown, maps, budget_m)
             self._map("budget", found[0], [budget.drift_gate(found[1], budget_m)])
             return found
 

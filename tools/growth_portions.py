@@ -6,8 +6,8 @@
 2. Portions: the photos, sorted by name, are cut into three, by turns (interleaved) or one after the other
    (consecutive) or in a shuffled order. The first reconstruction of at least five photos is placed by GPS,
    or without GPS at a made-up place with a median viewing distance of 50 m. Photos of later portions are
-   reconstructed among themselves and go through `ingest.growth.run.grow`, as photos that their owner
-   contributed and who is trusted. What cannot be placed waits, is tried with the next portion, and once
+   reconstructed among themselves and go through `ingest.growth.run.grow`, as photos of whoever keeps the
+   database. What cannot be placed waits, is tried with the next portion, and once
    more at the end. With --adjust all maps are then adjusted together, as `featuredb adjust` does.
 3. Camera centres of both are compared after a similarity, in metres for photos with GPS. Without GPS a
    metre is a hundredth of the extent of the camera centres (diagonal of their box), and the drift budget,
@@ -41,8 +41,6 @@ from ingest.growing import reconstructed_photos
 from ingest.growth.graph.joint.in_database import adjust_maps
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.run import GrowthOptions, grow
-from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.growth.trust.promotion import PromotionOptions
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, require_usable, scan_folder
@@ -60,9 +58,6 @@ _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
 _OWNER = "portions"
-_GROWTH = GrowthOptions(
-    promotion=PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=(_OWNER,)))
-)
 _NO_BUDGET_M = 1e6
 
 
@@ -87,7 +82,7 @@ class State:
     waiting: list[int] = field(default_factory=list)
     centers: dict[str, FloatArray] = field(default_factory=dict)
     frame: LocalFrame | None = None
-    growth: GrowthOptions = field(default_factory=lambda: _GROWTH)
+    growth: GrowthOptions = field(default_factory=GrowthOptions)
     joint: dict[str, FloatArray] = field(default_factory=dict)
     gates: Path | None = None
 
@@ -156,7 +151,7 @@ def _first_map(state: State, what: str) -> None:
         first = component.feature_map or _made_up(state, component)
         if first is not None:
             if component.feature_map is None:
-                state.growth = replace(_GROWTH, drift_budget_m=_NO_BUDGET_M)
+                state.growth = GrowthOptions(drift_budget_m=_NO_BUDGET_M)
             state.database.commit_maps([first])
             _find_centers(state)
             print(f"  {what}: first map of {len(first.images)} photos, placed by {first.placement.method}")

@@ -96,7 +96,7 @@ def contribution(photo: Path) -> Contribution:
         image=photo.read_bytes(),
         width=said.width,
         height=said.height,
-        owner="somebody",
+        credit="somebody",
         licence="CC-BY-4.0",
         client_id="shifted",
         received_at=datetime.now(UTC),

@@ -8,7 +8,7 @@ from typing import Any
 
 from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
 from featuredb.errors import CandidateNotFoundError, InvalidValueError
-from featuredb.store.candidates.states import CANDIDATE_STATES, Candidate
+from featuredb.store.candidates.states import ANONYMOUS, CANDIDATE_STATES, Candidate
 
 _SHOWN_ID = 12  # hex digits of an id in a table: enough to tell some millions of photos apart
 _SHORTEST_ID = 8
@@ -20,11 +20,17 @@ def register(subparsers: Any) -> None:
         "candidates",
         help="list contributed photos, or withdraw some",
         description="List the photos that clients contributed: waiting for growth, used by a map, refused "
-        "or withdrawn. With --withdraw or --withdraw-owner their images are deleted, at once and for good.",
+        "or withdrawn. With --withdraw, --withdraw-owner or --withdraw-credit their images are deleted, at "
+        "once and for good.",
     )
     add_database_argument(parser)
     parser.add_argument("--state", choices=CANDIDATE_STATES, help="only those in this state")
-    parser.add_argument("--owner", metavar="NAME", help="only those of this owner")
+    parser.add_argument(
+        "--owner",
+        metavar="IDENTITY",
+        help=f"only those of this client; {ANONYMOUS}: of all without a certificate",
+    )
+    parser.add_argument("--credit", metavar="NAME", help="only those with which this name was given")
     parser.add_argument("--json", action="store_true", help="everything that is known, as JSON")
     parser.add_argument(
         "--withdraw",
@@ -33,7 +39,12 @@ def register(subparsers: Any) -> None:
         default=[],
         help="delete the image of this photo, by its id or the beginning of it; may be repeated",
     )
-    parser.add_argument("--withdraw-owner", metavar="NAME", help="delete all images that this owner gave")
+    parser.add_argument(
+        "--withdraw-owner", metavar="IDENTITY", help="delete all images that this client gave"
+    )
+    parser.add_argument(
+        "--withdraw-credit", metavar="NAME", help="delete all images with which this name was given"
+    )
     parser.add_argument("--reason", default="", help="kept with a withdrawal, which needs one")
     parser.set_defaults(run=run_candidates)
 
@@ -44,8 +55,8 @@ def run_candidates(args: argparse.Namespace) -> int:
 
     database = open_database(args)
     candidates = list_candidates(database)
-    if args.withdraw or args.withdraw_owner:
-        wanted = _to_withdraw(candidates, args.withdraw, args.withdraw_owner)
+    if args.withdraw or args.withdraw_owner or args.withdraw_credit:
+        wanted = _to_withdraw(candidates, args.withdraw, args.withdraw_owner, args.withdraw_credit)
         if not args.reason.strip():
             raise InvalidValueError("expected --reason with a withdrawal, for those who will ask later")
         report = withdraw(database, wanted, args.reason)
@@ -59,8 +70,7 @@ def run_candidates(args: argparse.Namespace) -> int:
     shown = [
         c
         for c in candidates
-        if (args.state is None or c.state == args.state)
-        and (args.owner is None or args.owner in {giver.owner for giver in c.contributors})
+        if (args.state is None or c.state == args.state) and _given_by(c, args.owner, args.credit)
     ]
     if args.json:
         write_json({"candidates": [_as_json(c) for c in shown]})
@@ -68,13 +78,20 @@ def run_candidates(args: argparse.Namespace) -> int:
     counts = Counter(c.state for c in candidates)
     sys.stdout.write(", ".join(f"{counts[state]} {state}" for state in CANDIDATE_STATES) + "\n")
     if shown:
-        header = ("candidate", "state", "owner", "licence", "received", "answer", "kB", "about")
+        header = ("candidate", "state", "owner", "credit", "licence", "received", "answer", "kB", "about")
         shown.sort(key=lambda c: CANDIDATE_STATES.index(c.state))  # stable: oldest first within a state
         sys.stdout.write("\n" + format_table(header, map(_row, shown)))
     return 0
 
 
-def _to_withdraw(candidates: Sequence[Candidate], beginnings: Sequence[str], owner: str | None) -> list[str]:
+def _given_by(candidate: Candidate, owner: str | None, credit: str | None) -> bool:
+    """Whether one of those who gave the photo is that owner, and goes by that name; None: anybody."""
+    return any(owner in (None, c.owner) and credit in (None, c.credit) for c in candidate.contributors)
+
+
+def _to_withdraw(
+    candidates: Sequence[Candidate], beginnings: Sequence[str], owner: str | None, credit: str | None
+) -> list[str]:
     wanted = []
     for beginning in beginnings:
         found = [c.candidate_id for c in candidates if c.candidate_id.startswith(beginning)]
@@ -84,10 +101,15 @@ def _to_withdraw(candidates: Sequence[Candidate], beginnings: Sequence[str], own
                 f"{len(found)} photos begin with; `featuredb candidates` lists them"
             )
         wanted += found
-    if owner is not None:
-        theirs = [c.candidate_id for c in candidates if owner in {giver.owner for giver in c.contributors}]
+    if owner is not None or credit is not None:
+        theirs = [c.candidate_id for c in candidates if _given_by(c, owner, credit)]
         if not theirs:
-            raise CandidateNotFoundError(f"no photo of owner {owner!r}; `featuredb candidates` lists them")
+            who = " and ".join(
+                f"{what} {name!r}"
+                for what, name in (("owner", owner), ("credit", credit))
+                if name is not None
+            )
+            raise CandidateNotFoundError(f"no photo of {who}; `featuredb candidates` lists them")
         wanted += theirs
     return wanted
 
@@ -103,6 +125,7 @@ def _row(candidate: Candidate) -> tuple[object, ...]:
         candidate.candidate_id[:_SHOWN_ID],
         candidate.state,
         candidate.owner,
+        candidate.credit,
         candidate.licence,
         candidate.received_at,
         str(candidate.answer.get("status", "")),
@@ -123,7 +146,13 @@ def _as_json(candidate: Candidate) -> dict[str, Any]:
         "width": candidate.width,
         "height": candidate.height,
         "contributors": [
-            {"owner": c.owner, "licence": c.licence, "client_id": c.client_id, "at": c.at}
+            {
+                "owner": c.owner,
+                "credit": c.credit,
+                "licence": c.licence,
+                "client_id": c.client_id,
+                "at": c.at,
+            }
             for c in candidate.contributors
         ],
         "snapshot": candidate.snapshot,

@@ -16,6 +16,11 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "folder", metavar="FOLDER", type=Path, help="a dataset, as `featuredb export` makes it"
     )
+    parser.add_argument(
+        "--trusted",
+        action="store_true",
+        help="vouch for the dataset: its maps keep their status; default: what was active is quarantined",
+    )
     parser.add_argument("--dry-run", action="store_true", help="check everything and say what would be done")
     parser.set_defaults(run=run_import)
 
@@ -24,10 +29,23 @@ def run_import(args: argparse.Namespace) -> int:
     """Import, and say what became of the maps."""
     from featuredb.export.dataset import import_dataset
 
-    done = import_dataset(open_database(args), args.folder, dry_run=args.dry_run, told=progress_of_maps())
+    done = import_dataset(
+        open_database(args),
+        args.folder,
+        trusted=args.trusted,
+        dry_run=args.dry_run,
+        told=progress_of_maps(),
+    )
     would = "would import" if done.dry_run else "imported"
     lines = [f"{would} {len(done.created)} maps; {len(done.present)} were there already"]
+    if done.quarantined and not args.trusted:
+        lines.append(
+            f"{len(done.quarantined)} of them in quarantine, because nobody here has vouched for them: "
+            "`featuredb promote` takes one into service, `--trusted` the whole of a dataset"
+        )
     for map_id, missing in done.quarantined.items():
+        if not missing:
+            continue
         needs = f"what placed it is neither in the dataset nor in the database: {', '.join(missing)}"
         lines.append(f"{map_id}: in quarantine, {needs}")
     if not done.dry_run:

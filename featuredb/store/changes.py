@@ -10,6 +10,8 @@ ACTIVE = "active"
 QUARANTINED = "quarantined"
 RETIRED = "retired"
 UNPLACED = "unplaced"
+# The reason of a map's status that came with a dataset.
+IMPORTED = "imported, and nobody here has vouched for it"
 # Columns that say where a map lies; equal ones mean that it was not placed anew.
 _PLACE = (
     "epsg",
@@ -71,6 +73,7 @@ def add_maps(
     if not moves:
         _check_same_place(rows, new_rows)
     new_ids = [row["map_id"] for row in new_rows]
+    new_rows = [_still_imported(row, live_row(rows, row["map_id"])) for row in new_rows]
     for map_id in replaces:
         if not any(row["map_id"] == map_id for row in rows):
             raise MapNotFoundError(f"no map {map_id} to be replaced; `featuredb maps` lists what there is")
@@ -191,6 +194,19 @@ def descendants(rows: Iterable[Row], ancestors: Iterable[str]) -> dict[str, str]
         if not more:
             return {map_id: top for map_id, top in root.items() if map_id not in tops}
         root |= more
+
+
+def is_imported(status: str, reason: str) -> bool:
+    """Whether a map came with a dataset, and nobody here has vouched for it by a promotion."""
+    return status in (QUARANTINED, UNPLACED) and reason == IMPORTED
+
+
+def _still_imported(row: Row, before: Row | None) -> Row:
+    """The row of a map that was imported says so until it is promoted, whatever else is done to the map."""
+    if before is None or not is_imported(before["status"], before["status_reason"]):
+        return row
+    keeps = not row["status_reason"] and is_imported(row["status"], before["status_reason"])
+    return {**row, "status_reason": before["status_reason"]} if keeps else row
 
 
 def _check_same_place(rows: Sequence[Row], new_rows: Sequence[Row]) -> None:

@@ -41,14 +41,9 @@ def _register_grow(subparsers: Any) -> None:
         "--trust",
         action="append",
         default=[],
-        metavar="OWNER",
-        help="photos of this owner need nobody else's confirmation; may be repeated",
-    )
-    grow.add_argument(
-        "--confirm-by",
-        choices=("owner", "any"),
-        default="owner",
-        help="what makes photos independent: another owner (default), or any of owner, camera and day",
+        metavar="IDENTITY",
+        help="vouch for this client: its photos need nobody else's confirmation; may be repeated. anonymous: "
+        "all that comes without a certificate",
     )
     grow.add_argument("--max-features", type=int, default=None, help="per photo; default: 12000")
     grow.add_argument("--workers", type=int, default=1, help="processes; default: 1")
@@ -141,7 +136,7 @@ def _options(args: argparse.Namespace) -> "GrowingOptions":
     from ingest.growth.trust.promotion import PromotionOptions
     from ingest.reconstruction import MapMakingOptions
 
-    confirmation = ConfirmationOptions(independent_by=args.confirm_by, trusted_owners=tuple(args.trust))
+    confirmation = ConfirmationOptions(trusted=tuple(args.trust))
     budget = {} if args.budget is None else {"drift_budget_m": args.budget}
     extractor = {} if args.max_features is None else {"max_features": args.max_features}
     return GrowingOptions(

@@ -94,7 +94,7 @@ def _remove_withdrawn(folder: Path, candidates: Sequence[Candidate]) -> None:
 
 
 def _with_query(photo: Photo, candidate: Candidate) -> Photo:
-    """The photo with what its query said: position, owner, licence."""
+    """The photo with what its query said: position, whom to name, licence; and who gave it."""
     prior = _prior(candidate.request.get("prior"))
     return replace(
         photo,
@@ -102,8 +102,9 @@ def _with_query(photo: Photo, candidate: Candidate) -> Photo:
         reason_code="",
         reason="",
         gps=prior or photo.gps,
-        owner=candidate.owner,
+        owner=candidate.credit,
         licence=candidate.licence,
+        contributor=candidate.owner,
     )
 
 

@@ -24,7 +24,7 @@ class PhotoFate:
 
     Attributes:
         name: of the photo; a contributed one's candidate id.
-        owner: who gave it.
+        owner: who gave it, by identity.
         outcome: in an active map, in a quarantined one, still waiting, or refused for good.
         map_id: of its map, "" where it has none.
         reason_code, reason: why it waits or is refused.

@@ -170,7 +170,6 @@ def _place_unplaced(
         localise=options.localise,
         grow=options.grow,
         scan=options.scan,
-        confirmation=options.promotion.confirmation,
     )
     done = place_unplaced_maps(database, areas, work, steps)
     run.entries.update({entry.map_id: entry for entry in done.placed})
@@ -330,8 +329,7 @@ def _grown(
         identity = _identity([new.photos[int(r)] for r in part.rows])
         return grow_component(part, new.photos, new.features_of, localised, areas, identity, options.grow)
 
-    maps, confirmation = placed_maps(database.snapshot()), options.promotion.confirmation
-    return grow_within_budget(model, grown, maps, confirmation, options.drift_budget_m)
+    return grow_within_budget(model, grown, placed_maps(database.snapshot()), options.drift_budget_m)
 
 
 def _identity(photos: Sequence[Photo]) -> MapIdentity:

@@ -6,6 +6,7 @@ from typing import Any
 
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Snapshot
+from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
 from ingest.growth.graph.replacing import Replacement
 from ingest.growth.growth_report import GrownEntry, PhotoFate
@@ -110,7 +111,7 @@ def fates_of(new: GrowthPhotos, run: Run, snapshot: Snapshot) -> tuple[PhotoFate
         fates.append(
             PhotoFate(
                 name=new.candidate_ids.get(row, photo.name),
-                owner=photo.owner,
+                owner=photo.contributor or OPERATOR,
                 outcome="waiting" if not map_id else "promoted" if map_id in active else "quarantined",
                 map_id=map_id,
                 reason_code=code,

@@ -28,7 +28,6 @@ from ingest.growth.map_images import observed_features
 from ingest.growth.place.component import GrowOptions, grow_component
 from ingest.growth.place.localised import LocaliseEachOptions, localise_photos
 from ingest.growth.run_record import grown_entry
-from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.examined import recall, remember
 from ingest.growth.trust.scan_check import ScanCheckOptions, scan_gate, with_gate
 from ingest.growth.values import GrownMap, Refused
@@ -49,7 +48,6 @@ class PlaceUnplacedOptions:
     localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
     grow: GrowOptions = field(default_factory=GrowOptions)
     scan: ScanCheckOptions = field(default_factory=ScanCheckOptions)
-    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,11 +123,13 @@ def _place(
         if not scan.passes:
             gates = (*grown.placement.gates, scan)
             return Refused(reason=scan.reason, message=scan.message, rows=(), gates=gates)
+    rest = left_over(unplaced, feature_map, grown.left_out)
     try:
         database.commit_maps(
-            [feature_map, *left_over(unplaced, feature_map, grown.left_out)],
+            [feature_map, *rest],
             replaces=(summary.map_id,),
             based_on={summary.map_id: summary.write_id},
+            reasons={part.map_id: summary.status_reason for part in rest},
         )
     except ConflictError as error:
         return Refused(reason="CONFLICT", message=str(error), rows=())
@@ -158,8 +158,7 @@ def _within_budget(
             return found
         return replace(found, feature_map=_matchable(found.feature_map))
 
-    maps = placed_maps(snapshot)
-    return grow_within_budget(stored.model, grown, maps, options.confirmation, options.drift_budget_m)
+    return grow_within_budget(stored.model, grown, placed_maps(snapshot), options.drift_budget_m)
 
 
 def _identity(unplaced: UnplacedMap) -> MapIdentity:

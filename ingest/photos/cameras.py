@@ -35,9 +35,9 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
     """Photos with equal keys share intrinsics.
 
     Those of one make, model, size and focal length do. A photo that names no camera shares with those of the
-    same owner, day and size: left alone, a view straight down finds a focal length a quarter off and a height
-    to go with it. Where no day is known, which is so for most contributions without EXIF, owner and size
-    must do; without an owner it is alone.
+    same owner (by the same contributor), day and size: left alone, a view straight down finds a focal length
+    a quarter off and a height to go with it. Where no day is known, which is so for most contributions
+    without EXIF, owner and size must do; without an owner it is alone.
     """
     if sharing == "per-image":
         return photo.name
@@ -47,5 +47,6 @@ def shared_key(photo: Photo, sharing: CameraSharing) -> str:
         return photo.name
     time = photo.capture_time
     day = "some day" if time is None else str((time.astimezone(UTC) if time.tzinfo else time).date())
+    whose = f"{photo.owner} by {photo.contributor}" if photo.contributor else photo.owner
     focal = "" if photo.focal_px is None else f", {photo.focal_px:.1f} px"
-    return f"unnamed camera of {photo.owner}, {day}, {photo.width} x {photo.height}{focal}"
+    return f"unnamed camera of {whose}, {day}, {photo.width} x {photo.height}{focal}"

@@ -154,7 +154,7 @@ def copies_of(photos: Sequence[Photo], matched: "Matched") -> dict[int, int]:
     """
     group_of: dict[int, set[int]] = {}
     for i, j in matched.copies:
-        if photos[i].owner != photos[j].owner:
+        if (photos[i].contributor, photos[i].owner) != (photos[j].contributor, photos[j].owner):
             group = group_of.get(i, {i}) | group_of.get(j, {j})
             group_of |= dict.fromkeys(group, group)
     kept = {i: min(group, key=lambda k: _preference(photos[k])) for i, group in group_of.items()}

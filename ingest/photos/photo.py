@@ -37,6 +37,8 @@ class Photo:
         altitude_reference: what gps.height_m is counted from: sea_level, ellipsoid or unknown.
         relative_altitude_m: height above take-off by a drone's barometer, or None.
         owner, licence: attribution from a table, EXIF (Artist, Copyright) or the ingest's options.
+        contributor: who gave it to the database, as the wire has authenticated (`Candidate.owner`); "" for
+            photos that come from this machine.
         title: from a table.
         film: name of the film that this is a keyframe of, "" for other photos.
         duplicate_of: name of the photo that was kept instead, "" where this is no duplicate.
@@ -64,6 +66,7 @@ class Photo:
     relative_altitude_m: float | None = None
     owner: str = ""
     licence: str = ""
+    contributor: str = ""
     title: str = ""
     film: str = ""
     duplicate_of: str = ""

@@ -182,7 +182,7 @@ def _time_pairs(photos: Sequence[Photo], options: PairOptions) -> Iterator[_Rank
     """Each photo with those that its owner's camera took next; keyframes are named in their order."""
     # Times with and without offset do not compare; the camera's own clock is what orders photos.
     timed = sorted(
-        (p.owner, p.film or p.camera_key, time.replace(tzinfo=None), p.name, i)
+        ((p.contributor, p.owner), p.film or p.camera_key, time.replace(tzinfo=None), p.name, i)
         for i, p in enumerate(photos)
         if (time := datetime.min if p.film else p.capture_time) is not None
     )

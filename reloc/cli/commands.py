@@ -53,7 +53,7 @@ def register(subparsers: Any) -> None:
         "--contributions",
         choices=("on", "off"),
         default="on",
-        help="take photos that clients contribute, with owner and licence, into a bounded inbox; default on",
+        help="take photos that clients contribute, with credit and licence, into a bounded inbox; default on",
     )
     serve.add_argument(
         "--live-sessions", type=int, default=2, metavar="N", help="streams followed at a time; default 2"
@@ -78,9 +78,9 @@ def register(subparsers: Any) -> None:
     query.add_argument(
         "--contribute",
         action="store_true",
-        help="give the photos to the database, so that its maps can grow; needs --owner and --licence",
+        help="give the photos to the database, so that its maps can grow; needs --credit and --licence",
     )
-    query.add_argument("--owner", metavar="NAME", help="whose photos they are")
+    query.add_argument("--credit", metavar="NAME", help="whom to name with them")
     query.add_argument("--licence", metavar="TERMS", help="under what terms they are given, e.g. CC-BY-4.0")
     query.add_argument(
         "--client-id", metavar="NAME", help="what this client calls itself; kept with the photos"
@@ -181,9 +181,9 @@ def _query(args: argparse.Namespace) -> int:
     from reloc.client import Client
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
-    if args.contribute and not (args.owner and args.licence):
+    if args.contribute and not (args.credit and args.licence):
         raise InvalidValueError(
-            "--contribute: expected --owner and --licence, too: whose photos they are, and under what terms"
+            "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
         )
     with Client(args.connect, args.database, config_path=args.config) as client:
 
@@ -197,7 +197,7 @@ def _query(args: argparse.Namespace) -> int:
                 exif_prior=args.exif_prior,
                 maps=tuple(args.map) if args.map else None,
                 contribute=args.contribute and not first,
-                owner=args.owner,
+                credit=args.credit,
                 licence=args.licence,
                 client_id=args.client_id,
             )

@@ -115,7 +115,7 @@ class Client:
         exif_prior: bool = False,
         maps: tuple[str, ...] | None = None,
         contribute: bool = False,
-        owner: str | None = None,
+        credit: str | None = None,
         licence: str | None = None,
         client_id: str | None = None,
     ) -> LocaliseReply:
@@ -130,9 +130,9 @@ class Client:
             inliers: the reply carries pixels and UTM points of the matches that agree.
             exif_prior: the photo's own GPS serves as prior where `prior` is None.
             maps: ask only these maps.
-            contribute: give the photo to the database, so that its maps can grow; needs `owner` and
+            contribute: give the photo to the database, so that its maps can grow; needs `credit` and
                 `licence`. The reply's `contribution` says whether it was taken.
-            owner: whose photo it is. licence: the terms under which it is given, such as CC-BY-4.0.
+            credit: whom to name with it. licence: the terms under which it is given, such as CC-BY-4.0.
             client_id: what this client calls itself, kept with the photo.
 
         Raises:
@@ -147,7 +147,7 @@ class Client:
                 prior=prior,
                 camera=camera,
                 contribute=contribute,
-                owner=owner,
+                credit=credit,
                 licence=licence,
                 client_id=client_id,
                 options=RequestOptions(

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from datetime import UTC, datetime
 
 from featuredb.stage_clock import StageClock
-from featuredb.store.candidates.states import candidate_id_of
+from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
 from reloc.service.contributions.database_inbox import contribution_of
 from reloc.service.contributions.inbox import Inbox, InboxRefusal
 from reloc.service.handler import answer_query
@@ -152,7 +152,8 @@ def _answer_and_keep(
 ) -> None:
     """Answer, and hand the photo to the inbox if it has a place; what is said in the answer is then done."""
     received_at = datetime.now(UTC)
-    place = inbox.reserve(request.owner or "", len(data))
+    owner = item.identity or ANONYMOUS  # never what the request claims
+    place = inbox.reserve(owner, len(data))
     if isinstance(place, InboxRefusal):
         said = ContributionReply(accepted=False, candidate_id=None, reason=place.reason, detail=place.detail)
         item.answer(_with_contribution(reply, said, clock))
@@ -167,7 +168,7 @@ def _answer_and_keep(
         if not answered:
             place.cancel()
     if answered:
-        place.submit(lambda: contribution_of(data, request, reply, received_at, item.identity))
+        place.submit(lambda: contribution_of(data, request, reply, received_at, owner))
 
 
 def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:

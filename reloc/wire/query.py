@@ -120,18 +120,18 @@ class LocaliseWireRequest(Request):
     camera: CameraRequest | None = None
     prior: PriorRequest | None = None
     contribute: bool = False
-    owner: Name | None = None
+    credit: Name | None = None
     licence: Name | None = None
     client_id: Name | None = None
     options: RequestOptions = RequestOptions()
 
     @model_validator(mode="after")
     def _terms_of_a_gift(self) -> "LocaliseWireRequest":
-        missing = [name for name in ("owner", "licence") if getattr(self, name) is None]
+        missing = [name for name in ("credit", "licence") if getattr(self, name) is None]
         if self.contribute and missing:
             raise ValueError(
-                f"contribute: expected {' and '.join(missing)}, too: whose photo it is, and under what terms "
-                "it is given"
+                f"contribute: expected {' and '.join(missing)}, too: whom to name with the photo, and "
+                "under what terms it is given"
             )
         return self
 

@@ -109,7 +109,7 @@ def inbox(db: str) -> list[str]:
             contribution(1),
             contribution(2, "Bob", minute=1),
             contribution(3, minute=2),
-            contribution(1, "Bob"),
+            contribution(1, "Bob", credit="Bob"),
         ],
     )[:3]
     mark_used(database, [ids[1]], "b")
@@ -134,8 +134,10 @@ def test_the_inbox(db: str, inbox: list[str], capsys: pytest.CaptureFixture[str]
     assert [c["candidate_id"] for c in told] == [inbox[1]]
     assert told[0]["contributors"][0]["owner"] == "Bob"
     assert told[0]["request"]["prior"]["sigma_m"] == 20.0
-    theirs = json.loads(run(capsys, "candidates", db, "--json", "--owner", "Bob")[1])["candidates"]
-    assert [c["candidate_id"] for c in theirs] == inbox[:2]
+    assert told[0]["contributors"][0]["credit"] == "A. Person"
+    for who in ("--owner", "--credit"):
+        theirs = json.loads(run(capsys, "candidates", db, "--json", who, "Bob")[1])["candidates"]
+        assert [c["candidate_id"] for c in theirs] == (inbox[:2] if who == "--owner" else inbox[:1])
 
 
 def test_an_empty_inbox(db: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -160,6 +162,8 @@ def test_withdrawal(db: str, inbox: list[str], capsys: pytest.CaptureFixture[str
         (["--withdraw", "0123456789", "--reason", "x"], "0 photos begin with"),
         (["--withdraw", "0", "--reason", "x"], "at least 8 digits"),
         (["--withdraw-owner", "Nobody", "--reason", "x"], "no photo of owner 'Nobody'"),
+        (["--withdraw-credit", "Nobody", "--reason", "x"], "no photo of credit 'Nobody'"),
+        (["--withdraw-owner", "Bob", "--withdraw-credit", "B.", "--reason", "x"], "'Bob' and credit 'B.'"),
         (["--withdraw-owner", "Bob"], "expected --reason"),
     ],
 )

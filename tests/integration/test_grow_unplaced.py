@@ -62,7 +62,6 @@ def test_a_map_without_a_place_is_placed_by_one_that_shows_the_same(
     assert (placed.status, placed.generation, placed.parents) == ("quarantined", 1, ("old",))
     assert (placed.placement.method, placed.name) == ("map", "loose")
     growth = placed.placement.evidence["growth"]
-    assert not growth["gates"]["confirmation"]["passes"]  # one owner: nobody else has seen it yet
     assert growth["gates"]["drift"]["passes"]
     centers = np.array([image.cam_from_local.center for image in placed.images])
     off = np.linalg.norm(FRAME.enu_from(placed.frame).act(centers) - [p.center for p in _PHOTOS], axis=1)

@@ -18,7 +18,7 @@ from ingest.growth.place.localised import (
     share_shown,
     with_lens,
 )
-from ingest.growth.trust.confirmation import ConfirmationOptions
+from ingest.growth.trust.confirmation import Sources
 from ingest.growth.trust.corroboration import NewPhotos as CorroboratingPhotos
 from ingest.growth.trust.corroboration import corroborate
 from ingest.growth.values import LocalisedPhoto
@@ -78,26 +78,25 @@ def test_two_threads_localise_as_one_does(
 
 
 def test_what_a_photo_sees_of_a_map_is_asked_once(new: NewPhotos) -> None:
-    """Photos of an owner of their own see the map; the second time the answers are those of the first."""
-    photos = [replace(photo, owner="somebody") for photo in new.photos]
+    """Photos of another owner, whose word counts, see the map; the second time the answers are the same."""
+    photos = [replace(photo, contributor="somebody") for photo in new.photos]
     asked = CorroboratingPhotos(
         photos=photos, rows=range(len(photos)), features_of=new.features_of, localised={}
     )
-    here = existing()
-    here = replace(here, images=tuple(replace(image, owner="keeper") for image in here.images))
-    first = corroborate(here, [], asked, ConfirmationOptions(), write_id="w1")
+    here, sources = existing(), Sources(trusted=("somebody",))
+    first = corroborate(here, [], asked, sources, write_id="w1")
     assert {w.name for w in first.corroborating} == {photo.name for photo in photos}
     assert set(asked.heard) == {("w1", row) for row in range(len(photos))}
     asked.heard.update(dict.fromkeys(asked.heard, None))
-    assert not corroborate(here, [], asked, ConfirmationOptions(), write_id="w1").corroborating
+    assert not corroborate(here, [], asked, sources, write_id="w1").corroborating
     # Written anew, the map may show something else.
-    assert corroborate(here, [], asked, ConfirmationOptions(), write_id="w2").corroborating
+    assert corroborate(here, [], asked, sources, write_id="w2").corroborating
 
 
 def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> None:
     """Where the map's own photos were matched with the new ones, what matched nothing need not be asked."""
-    photos = [replace(photo, owner="somebody") for photo in new.photos]
-    made_of = [replace(image, owner="keeper", sha256=photos[0].sha256) for image in existing().images[:1]]
+    photos = [replace(photo, contributor="somebody") for photo in new.photos]
+    made_of = [replace(image, sha256=photos[0].sha256) for image in existing().images[:1]]
     here = replace(existing(), images=(*made_of, *existing().images[1:]))
     asked = CorroboratingPhotos(
         photos=photos,
@@ -111,7 +110,7 @@ def test_photos_that_overlap_with_a_map_are_asked_about_it(new: NewPhotos) -> No
     of_photos = replace(here, images=tuple(made_of), observations=_of_image(here, made_of[0].image_id))
     assert asked.that_may_see(of_photos) == [2, 3]
     assert replace(asked, overlaps=None).that_may_see(of_photos) == list(asked.rows)
-    heard = corroborate(of_photos, [], asked, ConfirmationOptions(), write_id="w1")
+    heard = corroborate(of_photos, [], asked, Sources(trusted=("somebody",)), write_id="w1")
     assert {name for name, _ in asked.heard} == {"w1"}
     assert {row for _, row in asked.heard} == {2, 3}
     assert {w.name for w in heard.corroborating} <= {photos[2].name, photos[3].name}

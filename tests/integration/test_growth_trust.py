@@ -22,7 +22,16 @@ from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_b
 from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
-from tests.support.scene_strip import DESCRIPTORS, FRAME, POINTS, east, error_m, strip_map
+from tests.support.scene_strip import (
+    DESCRIPTORS,
+    FRAME,
+    POINTS,
+    east,
+    error_m,
+    note_contributed,
+    put_on_record,
+    strip_map,
+)
 from tests.support.scenes import (
     CAMERA,
     box_points,
@@ -40,8 +49,14 @@ _BUDGET_M = 0.5
 def _database(folder: Path, *maps: FeatureMap) -> Database:
     database = Database.create(folder / "db")
     for feature_map in maps:  # one after the other, as they came
-        database.commit_map(feature_map)
+        _add(database, feature_map)
     return database
+
+
+def _add(database: Database, feature_map: FeatureMap) -> None:
+    """As growth does; photos of "survey" are the operator's, others contributed by that identity."""
+    note_contributed(database, feature_map)
+    database.commit_map(feature_map)
 
 
 def _promoted(database: Database, options: PromotionOptions | None = None) -> dict[str, Promotion]:
@@ -64,7 +79,7 @@ def test_a_map_of_two_owners_is_promoted(tmp_path: Path) -> None:
     outcome = _promoted(database)["m"]
     assert outcome.promoted
     assert _status(database, "m") == "active"
-    assert "3 sources" in database.snapshot().get("m").status_reason  # the survey sees it, too
+    assert "3 owners" in database.snapshot().get("m").status_reason  # the survey sees it, too
     assert [gate.name for gate in outcome.gates if not gate.passes] == []
     assert {"confirmation", "canaries"} == {gate.name for gate in outcome.gates}
 
@@ -73,11 +88,12 @@ def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> N
     """Anna's map reaches beyond the anchor; Ben's map, quarantined too, shows the same from elsewhere."""
     mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     database = _database(tmp_path, _ANCHOR, mine)
+    put_on_record(database, "anna", "ben")
     outcome = _promoted(database)["m"]
     assert not outcome.promoted
     assert outcome.reason_code == "ONE_SOURCE"
     assert _status(database, "m") == "quarantined"
-    database.commit_map(strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    _add(database, strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
     outcomes = _promoted(database)
     assert outcomes["m"].promoted
     assert outcomes["n"].promoted
@@ -86,6 +102,7 @@ def test_a_map_of_one_owner_waits_until_another_one_sees_it(tmp_path: Path) -> N
 def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
     database, work = _database(tmp_path, _ANCHOR, mine), tmp_path / "work"
+    put_on_record(database, "anna")
 
     def ask() -> Promotion:
         return promote_confirmed(database, Localiser.open(database), budget_m=_BUDGET_M, work=work)[0]
@@ -94,8 +111,10 @@ def test_the_same_question_is_not_asked_twice(tmp_path: Path, monkeypatch: pytes
     with monkeypatch.context() as patch:
         patch.setattr("ingest.growth.trust.promotion.examine", None)
         assert ask() == first
-    database.commit_map(strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
-    assert ask().promoted  # something new has come
+    _add(database, strip_map("n", 88.0, owners=["ben"], parents=[_ANCHOR], seed=2))
+    assert not ask().promoted  # something new has come, of somebody whose word does not count yet
+    put_on_record(database, "ben")
+    assert ask().promoted
 
 
 def test_photos_of_the_anchor_bear_witness_to_a_map_that_lies_on_it(tmp_path: Path) -> None:
@@ -106,7 +125,9 @@ def test_photos_of_the_anchor_bear_witness_to_a_map_that_lies_on_it(tmp_path: Pa
 def test_a_map_that_has_known_photos_elsewhere_is_contradicted(tmp_path: Path) -> None:
     """Two owners agree on it, and it lies five metres from where the anchor's photos are."""
     wrong = strip_map("m", 30.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(5.0), seed=1)
-    outcome = _promoted(_database(tmp_path, _ANCHOR, wrong))["m"]
+    database = _database(tmp_path, _ANCHOR, wrong)
+    put_on_record(database, "anna", "eve")
+    outcome = _promoted(database)["m"]
     assert not outcome.promoted
     assert outcome.reason_code == "CONTRADICTED"
     assert "5.0" in outcome.reason
@@ -116,6 +137,7 @@ def test_a_copy_of_a_block_elsewhere_is_refused_by_canaries(tmp_path: Path) -> N
     """The anchor's block is claimed 500 m away, by two owners who agree."""
     copy = strip_map("m", 20.0, owners=["anna", "eve"], parents=[_ANCHOR], move=east(500.0), seed=1)
     database = _database(tmp_path, _ANCHOR, copy)
+    put_on_record(database, "anna", "eve")
     before = _answer(database, 20.0)
     outcome = _promoted(database)["m"]
     assert not outcome.promoted
@@ -319,7 +341,7 @@ def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -
 
 def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
     mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    options = PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=("anna",)))
+    options = PromotionOptions(confirmation=ConfirmationOptions(trusted=("anna",)))
     assert _promoted(_database(tmp_path, _ANCHOR, mine), options)["m"].promoted
 
 

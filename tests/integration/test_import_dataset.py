@@ -15,6 +15,7 @@ from featuredb.export.dataset import import_dataset, read_dataset
 from featuredb.export.dataset.sums import write_sums
 from featuredb.export.selection import Selection
 from featuredb.store import Database
+from featuredb.store.changes import IMPORTED
 from featuredb.store.encode import content_digest
 from featuredb.store.verify import verify
 from tests.support.command_line import only_command
@@ -49,7 +50,7 @@ def target(tmp_path: Path) -> Database:
 
 
 def test_all_tables_are_the_same(source: Database, exported: Path, target: Database) -> None:
-    done = import_dataset(target, exported)
+    done = import_dataset(target, exported, trusted=True)
     assert len(done.created) == 10
     assert done.present == ()
     assert done.quarantined == {}
@@ -76,7 +77,7 @@ def test_all_tables_are_the_same(source: Database, exported: Path, target: Datab
 def test_a_second_export_of_what_was_imported_is_the_same(
     exported: Path, target: Database, tmp_path: Path
 ) -> None:
-    import_dataset(target, exported)
+    import_dataset(target, exported, trusted=True)
     export(target, tmp_path / "again")
     first, second = files_of(exported), files_of(tmp_path / "again")
     for name in first:
@@ -195,13 +196,34 @@ def test_another_map_of_the_same_id_is_not_touched(exported: Path, target: Datab
     assert target.poll_version() == 1
     target.retire("fiji", "gives way")
     assert "fiji" in import_dataset(target, exported).created
-    assert target.snapshot().get("fiji").status == "active"
+    assert target.snapshot().get("fiji").status == "quarantined"
+
+
+def test_nothing_of_it_answers_before_somebody_vouches_for_it(
+    source: Database, exported: Path, target: Database
+) -> None:
+    """Later, too: by an import that is trusted, or map by map."""
+    done = import_dataset(target, exported)
+    active = {m.map_id for m in source.snapshot().maps() if m.status == "active"}
+    assert set(done.quarantined) == active
+    kept = {m.map_id: m for m in target.snapshot().maps()}
+    assert {m.status for m in kept.values()} == {"quarantined"}
+    assert {m.status_reason for m in kept.values()} == {IMPORTED}  # not what the dataset says
+    assert len(active) < len(kept)
+    before = target.poll_version()
+    assert import_dataset(target, exported, trusted=True, dry_run=True).created == ()
+    assert target.poll_version() == before
+    assert import_dataset(target, exported, trusted=True).created == ()
+    assert {m.map_id for m in target.snapshot().maps() if m.status == "active"} == active
+    target.rollback(before)
+    target.set_status(["fiji"], "active", "I know where it is from")
+    assert {m.map_id for m in target.snapshot().maps() if m.status == "active"} == {"fiji"}
 
 
 def test_a_map_whose_parents_are_missing_waits_in_quarantine(source: Database, tmp_path: Path) -> None:
     export(source, tmp_path / "out", Selection(maps=("grandchild", "cape-town")))
     target = Database.create(tmp_path / "target.db")
-    done = import_dataset(target, tmp_path / "out")
+    done = import_dataset(target, tmp_path / "out", trusted=True)
     assert done.quarantined == {"grandchild": ("child", "karlsruhe")}
     found = target.snapshot().get("grandchild")
     assert found.status == "quarantined"
@@ -216,7 +238,7 @@ def test_parents_may_be_in_the_database_already(source: Database, tmp_path: Path
     export(source, tmp_path / "out", Selection(maps=("grandchild",)))
     target = Database.create(tmp_path / "target.db")
     target.commit_map(source.snapshot().load_map("karlsruhe"))
-    assert import_dataset(target, tmp_path / "out").quarantined == {}
+    assert import_dataset(target, tmp_path / "out", trusted=True).quarantined == {}
     assert target.snapshot().get("grandchild").status == "active"
 
 
@@ -227,7 +249,7 @@ def test_parents_come_first(tmp_path: Path) -> None:
     source.commit_map(random_map(2, map_id="second", parents=("first",)))
     source.commit_map(random_map(3, map_id="first"))
     export(source, tmp_path / "out")
-    assert import_dataset(target, tmp_path / "out").created == ("first", "second", "third")
+    assert import_dataset(target, tmp_path / "out", trusted=True).created == ("first", "second", "third")
     assert import_dataset(target, tmp_path / "out").quarantined == {}
 
 
@@ -257,16 +279,23 @@ def test_the_command(
 ) -> None:
     export(source, tmp_path / "out", replace(EVERYTHING, maps=("grandchild", "fiji")))
     argv = ["import", target.url, str(tmp_path / "out")]
+    held = (
+        "2 of them in quarantine, because nobody here has vouched for them: `featuredb promote` takes one "
+        "into service, `--trusted` the whole of a dataset\n"
+    )
     assert main([*argv, "--dry-run"]) == 0
     missing = (
         "grandchild: in quarantine, what placed it is neither in the dataset nor in the database: child, "
         "karlsruhe\n"
     )
-    assert capsys.readouterr().out == f"would import 2 maps; 0 were there already\n{missing}"
+    assert capsys.readouterr().out == f"would import 2 maps; 0 were there already\n{held}{missing}"
     assert main(argv) == 0
-    assert capsys.readouterr().out == f"imported 2 maps; 0 were there already\n{missing}version 2\n"
+    assert capsys.readouterr().out == f"imported 2 maps; 0 were there already\n{held}{missing}version 2\n"
     assert main(argv) == 0
     assert capsys.readouterr().out == "imported 0 maps; 2 were there already\nversion 2\n"
+    assert main([*argv, "--trusted"]) == 0
+    assert target.snapshot().get("fiji").status == "active"
+    assert target.snapshot().get("grandchild").status == "quarantined"
     (tmp_path / "out" / "README.md").write_text("mine")
     assert main(argv) == 2
     assert "README.md: the content is not what SHA256SUMS says" in capsys.readouterr().err

@@ -30,7 +30,7 @@ from tests.support.service import (
     running_server,
 )
 
-GIFT = {"contribute": True, "owner": "A. Person", "licence": "CC-BY-4.0"}
+GIFT = {"contribute": True, "credit": "A. Person", "licence": "CC-BY-4.0"}
 WAIT_S = 20.0
 
 
@@ -88,7 +88,8 @@ def test_a_contributed_query_lands_in_the_database(database):
     assert "contribution" in reply.timings_ms
     (found,) = list_candidates(database)
     assert load_image(database, found.candidate_id) == data
-    assert (found.owner, found.licence, found.state) == ("A. Person", "CC-BY-4.0", "waiting")
+    assert (found.owner, found.credit) == ("anonymous", "A. Person")
+    assert (found.licence, found.state) == ("CC-BY-4.0", "waiting")
     assert (found.contributors[0].client_id, found.snapshot) == ("phone 7", 7)
     assert (found.width, found.height) == (160, 120)
     assert found.request["prior"]["sigma_m"] == 30.0
@@ -115,18 +116,19 @@ def test_photos_that_are_not_localised_are_welcome(database):
     assert list_candidates(database)[0].answer["reason"] == "TOO_FEW_INLIERS"
 
 
-def test_the_same_photo_by_two_owners_is_one_candidate(database):
+def test_who_is_not_authenticated_is_one_owner_whatever_names_are_given(database):
     with (
         running_server(ScriptedLocaliser(1), inbox=Inbox(DatabaseInbox(database))) as server,
         client_of(server) as client,
     ):
-        for owner in ("Ada", "Bob", "Ada"):
+        client.name = "Cleo"
+        for name in ("Ada", "Bob", "Ada"):
             assert client.localise(
-                photo(), contribute=True, owner=owner, licence="CC0-1.0"
+                photo(), contribute=True, credit=name, licence="CC0-1.0"
             ).contribution.accepted
         written(server, 3)
     (found,) = list_candidates(database)
-    assert [c.owner for c in found.contributors] == ["Ada", "Bob"]
+    assert [(c.owner, c.credit) for c in found.contributors] == [("anonymous", "Ada")]
 
 
 def test_a_server_that_stops_writes_what_it_has_taken(database):
@@ -163,7 +165,7 @@ def test_a_query_never_waits_for_the_store():
 @pytest.mark.parametrize(
     ("options", "stored", "failure", "reason"),
     [
-        (InboxOptions(max_owner_photos=1), {"A. Person": 1}, None, "OWNER_LIMIT"),
+        (InboxOptions(max_owner_photos=1), {"anonymous": 1}, None, "OWNER_LIMIT"),
         (InboxOptions(max_photos=2), {"Ada": 2}, None, "INBOX_FULL"),
         (InboxOptions(max_stored_bytes=1000), {}, None, "INBOX_FULL"),
         (InboxOptions(), {}, StoreError("bucket unreachable"), "STORE_FAILED"),
@@ -245,17 +247,17 @@ def test_what_fails_as_a_query_contributes_nothing():
             ok, said = raw(session, payload, GIFT)
             assert (ok, said["code"]) == (False, code)
         for request in (
-            {**GIFT, "owner": None},
+            {**GIFT, "credit": None},
             {**GIFT, "licence": ""},
-            {**GIFT, "owner": "A" * 201},
-            {**GIFT, "owner": "A\nB"},
-            {**GIFT, "owner": "\x1b]0;title\x07"},
-            {**GIFT, "owner": {"name": "A"}},
+            {**GIFT, "credit": "A" * 201},
+            {**GIFT, "credit": "A\nB"},
+            {**GIFT, "credit": "\x1b]0;title\x07"},
+            {**GIFT, "credit": {"name": "A"}},
             {**GIFT, "licence": 4},
             {**GIFT, "client_id": ""},
             {**GIFT, "contribute": 1},
-            b'{"contribute": true, "owner": "\\ud800", "licence": "x"}',
-            b'{"contribute": true, "owner": "\xff\xfe", "licence": "x"}',
+            b'{"contribute": true, "credit": "\\ud800", "licence": "x"}',
+            b'{"contribute": true, "credit": "\xff\xfe", "licence": "x"}',
         ):
             ok, said = raw(session, data, request)
             assert (ok, said["code"]) == (False, "BAD_REQUEST"), request
@@ -288,7 +290,7 @@ def test_random_gifts_are_answered_one_by_one():
     told = {"taken": 0, "refused": 0}
     with running_server(ScriptedLocaliser(1), inbox=Inbox(store)) as server, client_of(server) as client:
         for _ in range(150):
-            request = {name: rng.choice(values) for name in ("owner", "licence") if rng.random() < 0.9}
+            request = {name: rng.choice(values) for name in ("credit", "licence") if rng.random() < 0.9}
             request["contribute"] = rng.choice([True, True, True, False, None])
             ok, said = raw(client._session(), photo(seed=rng.randrange(3)), request)
             if ok and said["contribution"] is not None and said["contribution"]["accepted"]:
@@ -307,15 +309,15 @@ def test_a_server_without_an_inbox_says_so():
             client.localise(photo(), **GIFT)
         assert caught.value.code == "UNSUPPORTED"
         assert client.status().contributions is None
-        assert client.localise(photo(), owner="A. Person", licence="CC0-1.0").contribution is None
+        assert client.localise(photo(), credit="A. Person", licence="CC0-1.0").contribution is None
 
 
 def test_the_client_refuses_what_no_server_takes():
     with running_server(ScriptedLocaliser(1)) as server, client_of(server) as client:
         with pytest.raises(InvalidValueError, match="expected licence"):
-            client.localise(photo(), contribute=True, owner="A. Person")
-        with pytest.raises(InvalidValueError, match="owner"):
-            client.localise(photo(), contribute=True, owner="\n", licence="CC0-1.0")
+            client.localise(photo(), contribute=True, credit="A. Person")
+        with pytest.raises(InvalidValueError, match="credit"):
+            client.localise(photo(), contribute=True, credit="\n", licence="CC0-1.0")
 
 
 def test_readers_take_replies_of_servers_that_know_no_contributions():

@@ -378,7 +378,7 @@ def test_hot_reload_commit_retire_and_a_clean_end(tmp_path, field, photos):
 
 def test_a_query_is_contributed_and_the_inbox_lists_it(server, database, photos, capsys):
     query = ["query", str(photos / "a.png"), "--connect", server.endpoint, "--camera", CAMERA_TEXT]
-    assert run(*query, "--contribute", "--owner", "A. Person", "--licence", "CC0-1.0") == 0
+    assert run(*query, "--contribute", "--credit", "A. Person", "--licence", "CC0-1.0") == 0
     given = re.search(r"^  given     candidate ([0-9a-f]{32})$", capsys.readouterr().out, flags=re.MULTILINE)
     end = time.monotonic() + 30.0
     while not (found := list_candidates(Database.open(database))):
@@ -387,8 +387,8 @@ def test_a_query_is_contributed_and_the_inbox_lists_it(server, database, photos,
     assert [c.candidate_id for c in found] == [given[1]]
     assert found[0].answer["maps"] == ["field"]
     assert load_image(Database.open(database), given[1]) == (photos / "a.png").read_bytes()
-    assert run(*query, "--contribute", "--owner", "A. Person") == 2
-    assert "expected --owner and --licence" in capsys.readouterr().err
+    assert run(*query, "--contribute", "--credit", "A. Person") == 2
+    assert "expected --credit and --licence" in capsys.readouterr().err
 
 
 def test_a_stop_signal_that_another_thread_receives_ends_the_server(database):
@@ -413,6 +413,6 @@ def test_a_stop_signal_that_another_thread_receives_ends_the_server(database):
 def test_a_server_told_to_take_no_contributions(database, photos, capsys):
     process = ServeProcess(database, "--contributions", "off")
     query = ["query", str(photos / "a.png"), "--connect", process.endpoint, "--camera", CAMERA_TEXT]
-    assert run(*query, "--contribute", "--owner", "A. Person", "--licence", "CC0-1.0") == 2
+    assert run(*query, "--contribute", "--credit", "A. Person", "--licence", "CC0-1.0") == 2
     assert "UNSUPPORTED" in capsys.readouterr().err
     assert process.stop() == 0

@@ -75,7 +75,7 @@ def messages():
                 found["localise_reply"].append(
                     raw(session, "localise/anonymous", payload=photo(), attachment=attachment)
                 )
-            gift = b'{"contribute": true, "owner": "A", "licence": "CC0-1.0"}'
+            gift = b'{"contribute": true, "credit": "A", "licence": "CC0-1.0"}'
             for seed in (1, 2):
                 found["localise_reply"].append(
                     raw(session, "localise/anonymous", payload=photo(seed=seed), attachment=gift)
@@ -177,9 +177,9 @@ GOOD_REQUESTS = [
         }
     },
     {"camera": None, "prior": None, "request_id": None, "contribute": False, "options": {}},
-    {"contribute": True, "owner": "A. Person", "licence": "CC-BY-4.0", "client_id": "phone 7"},
-    {"contribute": True, "owner": "Ä" * 200, "licence": "x", "client_id": None},
-    {"contribute": False, "owner": None, "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "A. Person", "licence": "CC-BY-4.0", "client_id": "phone 7"},
+    {"contribute": True, "credit": "Ä" * 200, "licence": "x", "client_id": None},
+    {"contribute": False, "credit": None, "licence": "CC0-1.0"},
     {"options": {"inliers": True, "exif_prior": False, "maps": ["a", "b"], "deadline_ms": 250}},
 ]
 BAD_REQUESTS = [
@@ -207,16 +207,16 @@ BAD_REQUESTS = [
     {"contribute": "yes"},
     {"contribute": 1},
     {"contribute": True},
-    {"contribute": True, "owner": "A"},
+    {"contribute": True, "credit": "A"},
     {"contribute": True, "licence": "CC0-1.0"},
-    {"contribute": True, "owner": None, "licence": "CC0-1.0"},
-    {"contribute": True, "owner": "", "licence": "CC0-1.0"},
-    {"contribute": True, "owner": " A", "licence": "CC0-1.0"},
-    {"contribute": True, "owner": "A" * 201, "licence": "CC0-1.0"},
-    {"contribute": True, "owner": "A\nB", "licence": "CC0-1.0"},
-    {"contribute": True, "owner": "A\x1b[2J", "licence": "CC0-1.0"},
-    {"contribute": True, "owner": "A\x9b2J", "licence": "CC0-1.0"},
-    {"contribute": True, "owner": ["A"], "licence": "CC0-1.0"},
+    {"contribute": True, "credit": None, "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "", "licence": "CC0-1.0"},
+    {"contribute": True, "credit": " A", "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "A" * 201, "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "A\nB", "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "A\x1b[2J", "licence": "CC0-1.0"},
+    {"contribute": True, "credit": "A\x9b2J", "licence": "CC0-1.0"},
+    {"contribute": True, "credit": ["A"], "licence": "CC0-1.0"},
     {"client_id": "\t"},
     {"options": None},
     {"options": {"inlier": True}},

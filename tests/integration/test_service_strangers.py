@@ -16,6 +16,9 @@ import zenoh
 
 from featuredb.cli.main import main
 from featuredb.errors import ServiceError
+from featuredb.store import Database
+from featuredb.store.candidates.photos import contribute, list_candidates
+from featuredb.store.candidates.states import ANONYMOUS
 from reloc.client import NO_SERVER, Client, LiveTrack, TrackPose
 from reloc.wire.query import encode
 from reloc.wire.track import LiveStatus, TrackEvent, TrackFrame
@@ -202,14 +205,23 @@ def test_a_client_s_events_are_the_server_s_own(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize("kind", ["open", "guarded"])
-def test_a_contribution_carries_who_was_authenticated(request: pytest.FixtureRequest, kind: str) -> None:
+def test_a_contribution_is_of_who_was_authenticated(
+    request: pytest.FixtureRequest, tmp_path: Path, kind: str
+) -> None:
+    """Both give the other's name; the attacker's photo is his own all the same, and so is the victim's."""
     wire: Wire = request.getfixturevalue("unguarded" if kind == "open" else "guarded")
-    with wire.client(_VICTIM) as client:
-        reply = client.localise(photo(), contribute=True, owner="A. Person", licence="CC0-1.0")
-    assert reply.contribution is not None
-    assert reply.contribution.accepted
-    wait_until(lambda: bool(wire.contributions.written), "the contribution")
-    assert wire.contributions.written[-1].request["identity"] == (None if kind == "open" else _VICTIM)
+    wire.contributions.written.clear()
+    for k, (name, claimed) in enumerate(((_VICTIM, _ATTACKER), (_ATTACKER, _VICTIM))):
+        with wire.client(name) as client:
+            reply = client.localise(photo(seed=k), contribute=True, credit=claimed, licence="CC0-1.0")
+        assert reply.contribution is not None
+        assert reply.contribution.accepted
+        wait_until(lambda k=k: len(wire.contributions.written) > k, "the contribution")  # type: ignore[misc]
+    database = Database.create(tmp_path / "db")
+    contribute(database, wire.contributions.written)
+    found = {c.credit: c.owner for c in list_candidates(database)}
+    owners = (ANONYMOUS, ANONYMOUS) if kind == "open" else (_VICTIM, _ATTACKER)
+    assert found == dict(zip((_ATTACKER, _VICTIM), owners, strict=True))
 
 
 @pytest.mark.parametrize("who", ["a client", "nobody", "a client of another authority"])

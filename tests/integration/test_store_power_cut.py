@@ -23,7 +23,7 @@ PHOTO = random.Random(7).randbytes(2000)
 
 def give(database: Database) -> list[str]:
     now = datetime.now(UTC)
-    photo = Contribution(image=PHOTO, width=9, height=9, owner="ann", licence="CC0-1.0", received_at=now)
+    photo = Contribution(image=PHOTO, width=9, height=9, credit="ann", licence="CC0-1.0", received_at=now)
     return contribute(database, [photo])
 
 

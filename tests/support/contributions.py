@@ -14,13 +14,16 @@ from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING
 NOON = datetime(2026, 5, 1, 12, tzinfo=UTC)
 
 
-def contribution(seed: int = 0, owner: str = "A. Person", *, minute: int = 0) -> Contribution:
+def contribution(
+    seed: int = 0, owner: str = "ada", *, credit: str = "A. Person", minute: int = 0
+) -> Contribution:
     """A few hundred bytes that are no picture (the store does not look), different for each seed."""
     return Contribution(
         image=hashlib.sha512(f"photo {seed}".encode()).digest() * 8,
         width=640,
         height=480,
         owner=owner,
+        credit=credit,
         licence="CC-BY-4.0",
         client_id="phone 7",
         received_at=NOON + timedelta(minutes=minute),

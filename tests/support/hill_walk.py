@@ -78,6 +78,7 @@ def give(database: Database, shots: list[Shot], at: datetime = NOW) -> list[str]
         [
             Contribution(
                 image=shot.data, width=CAMERA.width, height=CAMERA.height, owner=shot.owner,
+                credit=f"name of {shot.owner}",
                 licence="CC0-1.0", received_at=at + timedelta(seconds=k),
             )
             for k, shot in enumerate(shots)

@@ -1,8 +1,9 @@
 """Maps of one long strip of made-up points: overlapping, owned by different people, displaced at will."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,12 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapStatus, Placement
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import move_map
+from featuredb.store import Database
+from featuredb.store.candidates.owners import Owners
+from featuredb.store.candidates.photos import contribute, mark_confirmed, mark_used
+from featuredb.store.candidates.states import Contribution
 from ingest.growth.graph.map_graph import StoredEdge, place_of
+from ingest.growth.trust.confirmation import Sources
 from tests.support.scenes import (
     EASTING,
     EPSG,
@@ -79,7 +85,7 @@ def strip_map(
         replace(
             image,
             name=f"{map_id}/{image.name}",
-            sha256=f"{hash_of(map_id)}{image.image_id:04x}",
+            sha256=hashlib.sha256(photo_of(map_id, image.image_id)).hexdigest(),
             owner=owners[k % len(owners)],
             capture_time=datetime(2026, 5, days[k % len(days)], 12),
         )
@@ -132,6 +138,52 @@ def error_m(feature_map: FeatureMap, east_m: float, reach_m: float = 30.0) -> fl
     return float(np.linalg.norm(feature_map.points_local(FRAME) - POINTS[near], axis=1).max())
 
 
-def hash_of(text: str) -> str:
-    """60 hex digits."""
-    return text.encode().hex().ljust(60, "0")[:60]
+def photo_of(map_id: str, image_id: int) -> bytes:
+    """What stands for the bytes of an image's photo."""
+    return f"photo {image_id} of {map_id}".encode()
+
+
+def given_by(feature_map: FeatureMap) -> dict[str, str]:
+    """Who has contributed which photo of a map, by candidate id: each its `owner`, but those of a survey."""
+    return {i.sha256[:32]: i.owner for i in feature_map.images if i.owner not in ("", "survey")}
+
+
+def sources_of(*maps: FeatureMap, on_record: Sequence[str] = (), trusted: Sequence[str] = ()) -> Sources:
+    """The sources of maps that were made of contributions by their images' `owner`s."""
+    owners = Owners(
+        givers={c: owner for m in maps for c, owner in given_by(m).items()},
+        made_of={m.map_id: frozenset(given_by(m)) for m in maps},
+        on_record=frozenset(on_record),
+    )
+    return Sources(owners=owners, trusted=tuple(trusted))
+
+
+def put_on_record(database: Database, *owners: str, by: str = "A") -> None:
+    """As if a photo of each of them had been confirmed in that map."""
+    photos = [f"known photo of {owner}".encode() for owner in owners]
+    mark_confirmed(database, contribute(database, list(map(_contribution, photos, owners))), by)
+
+
+def note_contributed(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
+    """Have the photos of a map contributed and used for it, as the server and growth do.
+
+    Args:
+        owner: of all of them, whatever names were given with them; default: each by its `owner`.
+    """
+    given = given_by(feature_map)
+    ids = contribute(
+        database,
+        [
+            _contribution(photo_of(feature_map.map_id, image.image_id), owner or image.owner)
+            for image in feature_map.images
+            if image.sha256[:32] in given
+        ],
+    )
+    mark_used(database, ids, feature_map.map_id)
+
+
+def _contribution(image: bytes, owner: str) -> Contribution:
+    return Contribution(
+        image=image, width=1, height=1, owner=owner, credit="A. Person", licence="CC0-1.0",
+        received_at=datetime(2026, 6, 1, tzinfo=UTC),
+    )  # fmt: skip

@@ -1,5 +1,6 @@
 """What has become of a contributed photo, from its events and the maps that live."""
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from featuredb.errors import InvalidValueError
 from featuredb.store.candidates.states import (
+    ANONYMOUS,
     candidate_id_of,
     candidate_of,
     contributors_of,
@@ -38,9 +40,10 @@ def events(text: str) -> list[dict[str, Any]]:
             "reason": None,
         }
         if kind == "contributed":
-            row |= {"owner": detail or "Ada", "licence": "CC0-1.0", "client_id": None, "sha256": "c0"}
-            row |= {"size_bytes": 9, "width": 3, "height": 2, "snapshot": 1, "request": "{}", "answer": "{}"}
-        elif kind == "used":
+            row |= {"owner": "A. Person", "licence": "CC0-1.0", "client_id": None, "sha256": "c0"}
+            row |= {"request": json.dumps({"identity": detail or "Ada"}), "answer": "{}"}
+            row |= {"size_bytes": 9, "width": 3, "height": 2, "snapshot": 1}
+        elif kind in ("used", "confirmed"):
             row["map_id"] = detail
         else:
             row |= {"reason_code": detail, "reason": f"because of {detail}"}
@@ -69,6 +72,9 @@ def events(text: str) -> list[dict[str, Any]]:
         ("contributed used:m1 withdrawn:OWNER", "m1", "withdrawn"),
         ("contributed withdrawn:OWNER contributed", "", "waiting"),
         ("contributed used:m1 withdrawn:OWNER contributed", "m1", "waiting"),
+        ("contributed used:m1 confirmed:m1", "m1", "used"),
+        ("contributed used:m1 withdrawn:OWNER confirmed:m1", "m1", "withdrawn"),
+        ("contributed used:m1 confirmed:m1", "", "waiting"),
     ],
 )
 def test_states(history: str, live: str, state: str) -> None:
@@ -91,6 +97,7 @@ def test_the_same_bytes_by_another_are_noted() -> None:
     ]
     candidate = candidate_of(rows, ())
     assert (candidate.owner, candidate.licence, candidate.received_at) == ("Ada", "CC0-1.0", NOON)
+    assert (candidate.credit, candidate.request) == ("A. Person", {})
 
 
 def test_who_gives_a_withdrawn_photo_again_is_its_contributor() -> None:
@@ -98,6 +105,16 @@ def test_who_gives_a_withdrawn_photo_again_is_its_contributor() -> None:
     assert [c.owner for c in candidate_of(rows, ()).contributors] == ["Ada", "Bob"]
     rows += events("contributed:Ada contributed:Ada withdrawn:OWNER contributed:Cleo")[3:]
     assert [c.owner for c in candidate_of(rows, ()).contributors] == ["Cleo"]
+
+
+@pytest.mark.parametrize("asked", [None, "", "{}", '{"prior": null}', '{"identity": null}'])
+def test_a_claimed_name_is_no_owner(asked: str | None) -> None:
+    """Rows of before there were identities have nothing but a name that their senders chose."""
+    rows = events("contributed contributed")
+    for row, name in zip(rows, ("Ada", "Bob"), strict=True):
+        row |= {"owner": name, "request": asked}
+    (only,) = candidate_of(rows, ()).contributors
+    assert (only.owner, only.credit) == (ANONYMOUS, "Ada")
 
 
 def test_events_sort_by_time_then_as_they_were_given() -> None:
@@ -117,6 +134,7 @@ def test_a_photo_is_named_by_its_bytes() -> None:
     [
         {"image": b""},
         {"owner": " "},
+        {"credit": ""},
         {"licence": ""},
         {"owner": "x" * 201},
         {"received_at": datetime(2026, 1, 1)},
@@ -130,7 +148,16 @@ def test_what_is_no_contribution(wrong: dict[str, Any]) -> None:
 
 
 _KINDS = st.sampled_from(
-    ["contributed", "contributed:Bob", "used:m1", "used:m2", "refused:X", "reopened", "withdrawn:OWNER"]
+    [
+        "contributed",
+        "contributed:Bob",
+        "used:m1",
+        "used:m2",
+        "confirmed:m1",
+        "refused:X",
+        "reopened",
+        "withdrawn:OWNER",
+    ]
 )
 
 

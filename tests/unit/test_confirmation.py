@@ -1,12 +1,13 @@
 """Who confirms whom: gates of confirmation that fire and that do not."""
 
+from collections.abc import Sequence
 from dataclasses import replace
-from datetime import date
 
 import numpy as np
 import pytest
 
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.trust.confirmation import (
     Confirmation,
     ConfirmationOptions,
@@ -15,9 +16,10 @@ from ingest.growth.trust.confirmation import (
     confirm,
     independent,
 )
-from tests.support.scene_strip import strip_map
+from tests.support.scene_strip import sources_of, strip_map
 
 _OPTIONS = ConfirmationOptions()
+_KNOWN = ("anna", "ben", "carl", "eve")  # have a record, where a test does not say otherwise
 
 
 def _reason(found: Confirmation) -> str:
@@ -25,36 +27,74 @@ def _reason(found: Confirmation) -> str:
     return "" if found.gate.passes else found.gate.reason
 
 
-def _owned(owners: list[str], **more: object) -> FeatureMap:
+def _owned(owners: Sequence[str], **more: object) -> FeatureMap:
     return strip_map("m", 40.0, owners=owners, **more)  # type: ignore[arg-type]
 
 
-def test_two_owners_of_one_place_confirm_each_other() -> None:
-    found = confirm(_owned(["anna", "ben"]), _OPTIONS)
+def _confirm(
+    feature_map: FeatureMap,
+    corroborating: Sequence[CorroboratingImage] = (),
+    *,
+    options: ConfirmationOptions = _OPTIONS,
+    on_record: Sequence[str] = _KNOWN,
+    trusted: Sequence[str] = (),
+    against: Sequence[str] = (),
+) -> Confirmation:
+    sources = sources_of(feature_map, on_record=on_record, trusted=trusted)
+    return confirm(feature_map, sources, options, corroborating, against)
+
+
+def test_two_owners_on_record_confirm_each_other() -> None:
+    found = _confirm(_owned(["anna", "ben"]))
     assert found.gate.passes
-    assert {s.owner for s in found.sources} == {"anna", "ben"}
+    assert set(found.owners) == {"anna", "ben"}
     assert len(found.confirmed) == 8
-    assert "8 photos confirmed by 2 sources" in found.message
+    assert "8 photos confirmed by 2 owners" in found.message
 
 
 def test_one_owner_does_not_confirm_himself() -> None:
-    found = confirm(_owned(["anna"], days=(1, 2)), _OPTIONS)
+    """Whatever names are given, and whatever days and cameras his files tell."""
+    found = _confirm(_owned(["anna"], days=(1, 2)))
     assert not found.gate.passes
     assert _reason(found) == "ONE_SOURCE"
-    assert found.confirmed == ()
+    assert found.confirmed == found.earned == ()
 
 
-def test_another_day_is_enough_where_it_is_asked_so() -> None:
-    found = confirm(_owned(["anna"], days=(1, 2)), replace(_OPTIONS, independent_by="any"))
-    assert found.gate.passes
-    same = confirm(_owned(["anna"], days=(1,)), replace(_OPTIONS, independent_by="any"))
-    assert _reason(same) == "ONE_SOURCE"
+@pytest.mark.parametrize("on_record", [(), ("stranger 0",)])
+def test_ten_identities_without_a_record_confirm_nothing(on_record: Sequence[str]) -> None:
+    """Nor do they together with one that has a record: it would be one person's word still."""
+    ten = [f"stranger {k}" for k in range(10)]
+    found = _confirm(_owned(ten, cameras=20), on_record=on_record)
+    assert _reason(found) == "ONE_SOURCE"
+    assert found.confirmed == found.earned == ()
+    assert _confirm(_owned(ten, cameras=20), on_record=ten).gate.passes
 
 
-def test_a_trusted_owner_needs_nobody() -> None:
-    found = confirm(_owned(["anna"]), replace(_OPTIONS, trusted_owners=("anna",)))
-    assert found.gate.passes
-    assert not confirm(_owned(["eve"]), replace(_OPTIONS, trusted_owners=("anna",))).gate.passes
+def test_all_without_a_certificate_are_one() -> None:
+    assert _reason(_confirm(_owned([ANONYMOUS]))) == "ONE_SOURCE"
+    assert _reason(_confirm(_owned([ANONYMOUS, "anna"]))) == "ONE_SOURCE"
+
+
+def test_what_makes_a_record() -> None:
+    """A proven photo of the same, or photos of two others on record; a copy of a proven photo does not."""
+    alone = _owned(["dora", "anna"])
+    assert _confirm(alone).earned == ()
+    two = _confirm(_owned(["dora", "anna", "ben"]))
+    dora = [i.image_id for i in _owned(["dora", "anna", "ben"]).images if i.owner == "dora"]
+    assert set(two.earned) >= set(dora)
+    mine = _owned(["dora"])
+    outside = _outside(mine, OPERATOR)
+    by_operator = _confirm(mine, [outside], on_record=())
+    assert by_operator.earned == tuple(i.image_id for i in mine.images)
+    copied = replace(outside, center=mine.images[0].cam_from_local.center)
+    assert _confirm(mine, [outside, copied], on_record=()).earned == by_operator.earned[1:]
+    assert _confirm(mine, on_record=(), trusted=("dora",)).earned == by_operator.earned
+
+
+def test_photos_of_the_operator_and_of_whom_he_trusts_need_nobody() -> None:
+    assert _confirm(_owned(["survey"]), on_record=()).gate.passes
+    assert _confirm(_owned(["anna"]), on_record=(), trusted=("anna",)).gate.passes
+    assert not _confirm(_owned(["eve"]), on_record=(), trusted=("anna",)).gate.passes
 
 
 def test_photos_that_share_no_points_confirm_nothing() -> None:
@@ -66,7 +106,7 @@ def test_photos_that_share_no_points_confirm_nothing() -> None:
     keep = np.flatnonzero(west == anna)
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     apart = replace(feature_map, observations=type(seen)(**parts))
-    assert _reason(confirm(apart, _OPTIONS)) == "ONE_SOURCE"
+    assert _reason(_confirm(apart)) == "ONE_SOURCE"
 
 
 def test_the_same_picture_given_by_two_is_one_source() -> None:
@@ -87,8 +127,8 @@ def test_the_same_picture_given_by_two_is_one_source() -> None:
             }
         ),
     )
-    assert _reason(confirm(pair_only, alone)) == "FEW_PAIRS"
-    assert _reason(confirm(pair_only, _OPTIONS)) == "ONE_SOURCE"
+    assert _reason(_confirm(pair_only, options=alone)) == "FEW_PAIRS"
+    assert _reason(_confirm(pair_only)) == "ONE_SOURCE"
 
 
 def test_one_pair_at_the_rim_confirms_no_map() -> None:
@@ -102,7 +142,7 @@ def test_one_pair_at_the_rim_confirms_no_map() -> None:
         np.isin(seen.point_index, seen.point_index[shared]) & np.isin(seen.image_id, [0, 7])
     )
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
-    found = confirm(replace(feature_map, images=tuple(images), observations=type(seen)(**parts)), _OPTIONS)
+    found = _confirm(replace(feature_map, images=tuple(images), observations=type(seen)(**parts)))
     assert found.confirmed == (0, 7)
     assert _reason(found) == "FEW_PAIRS"
 
@@ -110,20 +150,20 @@ def test_one_pair_at_the_rim_confirms_no_map() -> None:
 def test_one_photo_confirms_nothing_alone() -> None:
     """Eve's photo shows what all nineteen of Anna's do."""
     one = _owned(["eve"] + 19 * ["anna"], cameras=20)
-    found = confirm(one, _OPTIONS)
+    found = _confirm(one)
     assert len(found.confirmed) == 20
     assert _reason(found) == "FEW_PAIRS"
     assert "confirmed by one photo alone" in found.message
-    assert _reason(confirm(_owned(["eve", "anna"], cameras=2), _OPTIONS)) == "FEW_PAIRS"
-    assert confirm(_owned(["eve", "eve"] + 18 * ["anna"], cameras=20), _OPTIONS).gate.passes
-    assert confirm(_owned(["eve", "anna", "ben"], cameras=3), _OPTIONS).gate.passes
-    assert confirm(one, replace(_OPTIONS, trusted_owners=("anna",))).gate.passes
+    assert _reason(_confirm(_owned(["eve", "anna"], cameras=2))) == "FEW_PAIRS"
+    assert _confirm(_owned(["eve", "eve"] + 18 * ["anna"], cameras=20)).gate.passes
+    assert _confirm(_owned(["eve", "anna", "ben"], cameras=3)).gate.passes
+    assert _confirm(one, trusted=("anna",)).gate.passes
 
 
 def _outside(feature_map: FeatureMap, owner: str, points: int = 200) -> CorroboratingImage:
     return CorroboratingImage(
         name="w",
-        source=Source(owner=owner),
+        source=sources_of(on_record=_KNOWN).of_owner(owner),
         center=np.array([20.0, -50.0, 30.0]),
         points=np.arange(points, dtype=np.int64),
     )
@@ -131,41 +171,47 @@ def _outside(feature_map: FeatureMap, owner: str, points: int = 200) -> Corrobor
 
 def test_two_witnesses_of_other_owners_confirm_and_one_does_not() -> None:
     feature_map = _owned(["anna"])
-    assert _reason(confirm(feature_map, _OPTIONS, [_outside(feature_map, "ben")])) == "FEW_PAIRS"
+    assert _reason(_confirm(feature_map, [_outside(feature_map, "ben")])) == "FEW_PAIRS"
     two = [_outside(feature_map, "ben"), _outside(feature_map, "carl")]
-    assert confirm(feature_map, _OPTIONS, two).gate.passes
-    found = confirm(feature_map, _OPTIONS, [_outside(feature_map, "anna")])
+    assert _confirm(feature_map, two).gate.passes
+    found = _confirm(feature_map, [_outside(feature_map, "anna")])
     assert _reason(found) == "ONE_SOURCE"
     assert found.corroborating == ()
-    few = confirm(feature_map, _OPTIONS, [_outside(feature_map, "ben", points=5)])
+    few = _confirm(feature_map, [_outside(feature_map, "ben", points=5)])
     assert not few.gate.passes
 
 
 def test_photos_from_outside_that_contradict_count_against_pairs() -> None:
     feature_map = _owned(["anna", "ben"])
-    pairs = confirm(feature_map, _OPTIONS).gate.figure
+    pairs = _confirm(feature_map).gate.figure
     assert pairs == 4.0
-    assert confirm(feature_map, _OPTIONS, against=["a", "b"]).gate.passes
-    found = confirm(feature_map, _OPTIONS, against=["a is 5.0 m off", "b", "c"])
+    assert _confirm(feature_map, against=["a", "b"]).gate.passes
+    found = _confirm(feature_map, against=["a is 5.0 m off", "b", "c"])
     assert _reason(found) == "CONTRADICTED"
     assert "a is 5.0 m off" in found.message
-    trusted = replace(_OPTIONS, trusted_owners=("anna",))
-    assert confirm(_owned(["anna"]), trusted).gate.passes
-    assert _reason(confirm(_owned(["anna"]), trusted, against=["a"])) == "CONTRADICTED"
+    assert _confirm(_owned(["anna"]), trusted=("anna",)).gate.passes
+    assert _reason(_confirm(_owned(["anna"]), trusted=("anna",), against=["a"])) == "CONTRADICTED"
 
 
 @pytest.mark.parametrize(
-    ("a", "b", "by", "expected"),
+    ("a", "b", "expected"),
     [
-        (Source(owner="x"), Source(owner="y"), "owner", True),
-        (Source(owner="x", camera="c", day=date(2026, 1, 1)), Source(owner="x", camera="d"), "owner", False),
-        (Source(owner="x", camera="c"), Source(owner="x", camera="d"), "any", True),
-        (Source(camera="c"), Source(camera="d"), "owner", True),
-        (Source(owner="x", camera="c"), Source(camera="c"), "owner", False),
-        (Source(day=date(2026, 1, 1)), Source(day=date(2026, 1, 2)), "owner", True),
-        (Source(), Source(), "any", False),
+        (Source(owner="x", on_record=True), Source(owner="y", on_record=True), True),
+        (Source(owner="x", on_record=True), Source(owner="y"), False),
+        (Source(owner="x"), Source(owner="y"), False),
+        (Source(owner="x", proven=True), Source(owner="y"), True),
+        (Source(owner="x", proven=True, on_record=True), Source(owner="x", proven=True), False),
     ],
 )
-def test_independence(a: Source, b: Source, by: str, expected: bool) -> None:
-    assert independent(a, b, by) is expected  # type: ignore[arg-type]
-    assert independent(b, a, by) is expected  # type: ignore[arg-type]
+def test_independence(a: Source, b: Source, expected: bool) -> None:
+    assert independent(a, b) is expected
+    assert independent(b, a) is expected
+
+
+def test_who_is_asked_about_a_map() -> None:
+    """Those whose word counts, of another owner; strangers speak neither for it nor against it."""
+    own = [Source(owner="x"), Source(owner="y")]
+    assert Source(owner="x", on_record=True).speaks_to(own)
+    assert Source(owner="z", proven=True).speaks_to(own)
+    assert not Source(owner="z").speaks_to(own)
+    assert not Source(owner="x", proven=True).speaks_to(own[:1])

@@ -23,7 +23,7 @@ from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import ConfirmationOptions, CorroboratingImage, Source
 from ingest.growth.trust.promotion import Promotion, canary_gate
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
-from tests.support.scene_strip import EDGE, FRAME, east, strip_map
+from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])
 
@@ -173,7 +173,8 @@ def test_only_points_of_two_sources_answer() -> None:
     keep = ~fake[seen.point_index] | np.isin(seen.image_id, eve)
     parts = {name: getattr(seen, name)[keep] for name in type(seen).__slots__}
     poisoned = replace(feature_map, observations=type(seen)(**parts))
-    points = confirmed_points(poisoned, ConfirmationOptions())
+    known = ("anna", "ben", "eve")
+    points = confirmed_points(poisoned, sources_of(poisoned, on_record=known), ConfirmationOptions())
     assert not points[fake].any()
     assert points[~fake].mean() > 0.9
     part = answering_with(poisoned, points)
@@ -184,18 +185,23 @@ def test_only_points_of_two_sources_answer() -> None:
     # Where all is seen by two, nothing changes; a trusted owner's points need nobody.
     clean = strip_map("m", 40.0, owners=["anna", "ben"])
     assert answering_with(clean, np.ones(len(clean.points), dtype=bool)) is clean
-    trusted = confirmed_points(poisoned, ConfirmationOptions(trusted_owners=("eve",)))
+    trusted = confirmed_points(poisoned, sources_of(poisoned, trusted=("eve",)), ConfirmationOptions())
     assert trusted[fake].mean() > 0.5
+    # Whose word does not count yet takes no part.
+    assert not confirmed_points(
+        poisoned, sources_of(poisoned, on_record=["eve"]), ConfirmationOptions()
+    ).any()
 
 
 def test_a_witness_makes_points_answer() -> None:
     feature_map = strip_map("m", 40.0, owners=["anna"])
     rows = np.arange(100, dtype=np.int64)
     outside = CorroboratingImage(
-        name="w", source=Source(owner="ben"), center=np.array([0.0, -60.0, 20.0]), points=rows
+        name="w", source=Source(owner="ben", proven=True), center=np.array([0.0, -60.0, 20.0]), points=rows
     )
-    alone = confirmed_points(feature_map, ConfirmationOptions())
-    found = confirmed_points(feature_map, ConfirmationOptions(), [outside])
+    sources = sources_of(feature_map)
+    alone = confirmed_points(feature_map, sources, ConfirmationOptions())
+    found = confirmed_points(feature_map, sources, ConfirmationOptions(), [outside])
     assert not alone.any()
     assert found[rows].mean() > 0.9
     assert not found[100:].any()

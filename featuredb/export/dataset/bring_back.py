@@ -1,4 +1,4 @@
-"""A dataset back into a database: the same maps, with the status that they had."""
+"""A dataset back into a database: the same maps, in quarantine unless somebody vouches for the dataset."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -10,7 +10,7 @@ from featuredb.export.dataset.own_frame import load_own, own_rows
 from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
-from featuredb.store.changes import ACTIVE, RETIRED, anchored
+from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, anchored, is_imported
 from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
 
@@ -24,8 +24,8 @@ class Imported:
     Attributes:
         created: ids of maps that are visible now and were not before.
         present: ids of maps that the database had already, with the same content; they are left as they are.
-        quarantined: active maps of the dataset that came in quarantine, because maps that placed them are
-            neither in the dataset nor in the database; with the ids of those.
+        quarantined: active maps of the dataset that came in quarantine; with the ids of maps that placed them
+            and are neither in the dataset nor in the database.
         version: the database's newest version.
         dry_run: nothing was written.
     """
@@ -41,19 +41,23 @@ def import_dataset(
     database: Database,
     folder: Path,
     *,
+    trusted: bool = False,
     dry_run: bool = False,
     told: Told = lambda done, total: None,
 ) -> Imported:
     """Commit the maps of a dataset, one after the other, parents before what they have placed.
 
     All of it is compared with its checksums before the first commit. Importing again changes nothing; an
-    import that was killed goes on where it was. A map keeps its status, with one exception: the store lets a
-    map answer only if a chain of maps leads from it to an anchor. Where the dataset and the database lack
-    the maps that an active one stands on, it comes in quarantine; `featuredb lineage` shows it, and it can
-    be promoted when they are there. Scans of the dataset are left where they are: `featuredb lidar add`
+    import that was killed goes on where it was. Active maps come in quarantine until they are promoted, and
+    growth does not listen to them. With `trusted` a map keeps its status, with one exception: the store
+    lets a map answer only if a chain of maps leads from it to an anchor. Where the dataset and the database
+    lack the maps that an active one stands on, it comes in quarantine; `featuredb lineage` shows it, and it
+    can be promoted when they are there. Scans of the dataset are left where they are: `featuredb lidar add`
     takes LAZ.
 
     Args:
+        trusted: you vouch for the dataset, and its photos count as your own; also for maps of it that an
+            earlier import has left in quarantine.
         dry_run: read and check everything, write nothing.
         told: called with the number of maps done and their total.
 
@@ -78,6 +82,7 @@ def import_dataset(
     missing = _missing_parents(
         rows, {map_id: m.parents if isinstance(m, MapSummary) else () for map_id, m in live.items()}
     )
+    held = missing if trusted else {r["map_id"]: () for r in rows if r["status"] == ACTIVE} | missing
     created: list[str] = []
     present: list[str] = []
     for done, row in enumerate(_parents_first(rows)):
@@ -87,21 +92,32 @@ def import_dataset(
         if dry_run or new:
             found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
             if not dry_run:
-                _commit(database, found, row["status_reason"], missing.get(map_id, ()))
+                _commit(database, found, row["status_reason"], missing.get(map_id, ()), trusted)
         told(done + 1, len(rows))
+    known = {row["map_id"]: row["status"] for row in rows if row["map_id"] not in missing}
+    waiting = [m for m in live.values() if is_imported(m.status, m.status_reason)]
+    vouched = [m.map_id for m in waiting if trusted and known.get(m.map_id) == ACTIVE]
+    if vouched and not dry_run:
+        database.set_status(vouched, "active", "imported, and vouched for later")
     return Imported(
         created=tuple(created),
         present=tuple(present),
-        quarantined={map_id: missing[map_id] for map_id in created if map_id in missing},
+        quarantined={map_id: held[map_id] for map_id in created if map_id in held},
         version=database.poll_version(),
         dry_run=dry_run,
     )
 
 
-def _commit(database: Database, feature_map: AnyMap, reason: str, missing: Sequence[str]) -> None:
+def _commit(
+    database: Database, feature_map: AnyMap, reason: str, missing: Sequence[str], trusted: bool
+) -> None:
     if missing and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
         reason = f"what placed it is not here: {', '.join(missing)}"
+    if not trusted and feature_map.status != RETIRED:
+        if isinstance(feature_map, FeatureMap):
+            feature_map = feature_map.with_status("quarantined")
+        reason = IMPORTED  # not what the dataset says: reasons decide what growth does with a map
     if feature_map.status == RETIRED and not reason:
         reason = "it was retired where the dataset is from"
     database.commit_maps([feature_map], reasons={feature_map.map_id: reason})

@@ -27,6 +27,7 @@ from featuredb.store.candidates.events import (
     read_events,
 )
 from featuredb.store.candidates.states import (
+    CONFIRMED,
     CONTRIBUTED,
     REFUSED,
     REOPENED,
@@ -37,6 +38,8 @@ from featuredb.store.candidates.states import (
     Contribution,
     candidate_id_of,
     candidate_of,
+    owner_of,
+    request_column,
     standing_of,
 )
 from featuredb.store.commits import new_write_id
@@ -46,7 +49,7 @@ from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CANDIDATE_IMAGES, CANDIDATE_TABLES, SPECS
 
-_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "owner")
+_ORDER = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request")
 _LIGHT = (*_ORDER, "size_bytes", "map_id", "reason_code", "reason")
 
 
@@ -128,6 +131,16 @@ def mark_used(database: Database, candidate_ids: Iterable[str], map_id: str) -> 
         CandidateNotFoundError, StoreError
     """
     note_events(database, {c: {"event": USED, "map_id": map_id} for c in candidate_ids})
+
+
+def mark_confirmed(database: Database, candidate_ids: Iterable[str], map_id: str) -> None:
+    """Note that more than their owners' word confirms photos of a map: this makes their owners' record
+    (`featuredb.store.candidates.owners`). It counts only while the map is active, so call it before that.
+
+    Raises:
+        CandidateNotFoundError, StoreError
+    """
+    note_events(database, {c: {"event": CONFIRMED, "map_id": map_id} for c in candidate_ids})
 
 
 def refuse(database: Database, reasons: Mapping[str, tuple[str, str]]) -> None:
@@ -214,7 +227,7 @@ def count_candidates(database: Database) -> InboxCounts:
         state = standing_of(events, live).state
         states[state] += 1
         if state == "waiting":
-            owners[given["owner"]] += 1
+            owners[owner_of(given)] += 1
         if state != "withdrawn":
             stored += given["size_bytes"]
     return InboxCounts(by_state=dict(states), waiting_by_owner=dict(owners), stored_bytes=stored)
@@ -254,7 +267,7 @@ def _owners(events: Iterable[Row]) -> dict[str, set[str]]:
     owners: dict[str, set[str]] = {}
     for event in events:
         if event["event"] == CONTRIBUTED:
-            owners.setdefault(event["candidate_id"], set()).add(event["owner"])
+            owners.setdefault(event["candidate_id"], set()).add(owner_of(event))
         elif event["event"] == WITHDRAWN:
             owners.pop(event["candidate_id"], None)
     return owners
@@ -262,7 +275,7 @@ def _owners(events: Iterable[Row]) -> dict[str, set[str]]:
 
 def _contribution_row(contribution: Contribution) -> Row:
     return {
-        "owner": contribution.owner,
+        "owner": contribution.credit,
         "licence": contribution.licence,
         "client_id": contribution.client_id,
         "sha256": hashlib.sha256(contribution.image).hexdigest(),
@@ -271,6 +284,6 @@ def _contribution_row(contribution: Contribution) -> Row:
         "height": contribution.height,
         "snapshot": contribution.snapshot,
         "answer_status": str(contribution.answer.get("status", "")),
-        "request": json.dumps(dict(contribution.request), sort_keys=True, allow_nan=False),
+        "request": request_column(contribution),
         "answer": json.dumps(dict(contribution.answer), sort_keys=True, allow_nan=False),
     }

@@ -21,8 +21,14 @@ CandidateState = Literal["waiting", "used", "refused", "withdrawn"]
 CANDIDATE_STATES: tuple[CandidateState, ...] = get_args(CandidateState)
 
 CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN = "contributed", "used", "refused", "reopened", "withdrawn"
+CONFIRMED = "confirmed"
+EVENTS = (CONTRIBUTED, USED, CONFIRMED, REFUSED, REOPENED, WITHDRAWN)
 
-LONGEST_NAME = 200  # of an owner, a licence, a client; longer ones are no names
+# Owners that no certificate names: whoever was not authenticated, all of them one; who keeps the database.
+ANONYMOUS = "anonymous"
+OPERATOR = "the operator"  # with a space, so that no client can be called so
+LONGEST_NAME = 200  # of an owner, a credit, a licence, a client; longer ones are no names
+_IDENTITY = "identity"  # member of a contribution's `request` in the table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,24 +38,25 @@ class Contribution:
     Attributes:
         image: bytes of the image file.
         width, height: of the stored picture, pixels.
-        owner, licence: who gives it, and under what terms; never empty.
+        owner: the name by which who gives it was authenticated; ANONYMOUS where nobody was.
+        credit, licence: whom to name with it, as the sender says, and under what terms; never empty.
         client_id: what the sender calls itself, "" where it does not.
         received_at: aware time.
-        request: camera, prior, options and EXIF of the query, and `identity`: the name by which its client
-            was authenticated, None where it was not; JSON-able.
+        request: camera, prior, options and EXIF of the query; JSON-able.
         answer: summary of the answer (status, reason, pose, accuracy, maps), JSON-able.
         snapshot: version of the database that answered.
 
     Raises:
-        InvalidValueError: an empty image, owner or licence, a naive time, or what JSON cannot hold.
+        InvalidValueError: an empty image, owner, credit or licence, a naive time, or what JSON cannot hold.
     """
 
     image: bytes
     width: int
     height: int
-    owner: str
+    credit: str
     licence: str
     received_at: datetime
+    owner: str = ANONYMOUS
     client_id: str = ""
     request: Mapping[str, Any] = field(default_factory=dict)
     answer: Mapping[str, Any] = field(default_factory=dict)
@@ -58,7 +65,8 @@ class Contribution:
     def __post_init__(self) -> None:
         if not self.image:
             raise InvalidValueError("Contribution.image: expected the bytes of an image file, found none")
-        for name, value in (("owner", self.owner), ("licence", self.licence)):
+        for name in ("owner", "credit", "licence"):
+            value: str = getattr(self, name)
             if not value.strip() or len(value) > LONGEST_NAME:
                 raise InvalidValueError(
                     f"Contribution.{name}: expected 1 to {LONGEST_NAME} characters, found {value[:50]!r}"
@@ -73,9 +81,10 @@ class Contribution:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contributor:
-    """One who gave the photo, and when."""
+    """One who gave the photo, and when; see `Contribution`."""
 
     owner: str
+    credit: str
     licence: str
     client_id: str
     at: datetime
@@ -113,6 +122,10 @@ class Candidate:
     @property
     def owner(self) -> str:
         return self.contributors[0].owner
+
+    @property
+    def credit(self) -> str:
+        return self.contributors[0].credit
 
     @property
     def licence(self) -> str:
@@ -157,6 +170,8 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidat
     used: list[str] = []
     for event in events:
         kind = event["event"]
+        if kind == CONFIRMED:
+            continue  # says something of its owner, and nothing of what becomes of the photo
         if kind == USED:
             if latest is None or latest["event"] != WITHDRAWN:  # noted too late, the bytes are gone
                 used.append(event["map_id"])
@@ -176,6 +191,17 @@ def standing_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candidat
     )
 
 
+def request_column(contribution: Contribution) -> str:
+    """What the table keeps of a contribution's request: with its owner, null for ANONYMOUS."""
+    owner = None if contribution.owner == ANONYMOUS else contribution.owner
+    return json.dumps({**contribution.request, _IDENTITY: owner}, sort_keys=True, allow_nan=False)
+
+
+def owner_of(event: "Row") -> str:
+    """Who was authenticated when a photo was contributed; what the sender claimed is no owner."""
+    return str(json.loads(event["request"] or "{}").get(_IDENTITY) or ANONYMOUS)
+
+
 def contributors_of(events: Iterable["Row"]) -> tuple[Contributor, ...]:
     """Those who gave the photo, each owner once, by their first contribution since it was last withdrawn."""
     found: dict[str, Contributor] = {}
@@ -184,10 +210,12 @@ def contributors_of(events: Iterable["Row"]) -> tuple[Contributor, ...]:
         if event["event"] == WITHDRAWN:
             gone, found = found or gone, {}
         elif event["event"] == CONTRIBUTED:
+            owner = owner_of(event)
             found.setdefault(
-                event["owner"],
+                owner,
                 Contributor(
-                    owner=event["owner"],
+                    owner=owner,
+                    credit=event["owner"],
                     licence=event["licence"],
                     client_id=event["client_id"] or "",
                     at=event["happened_at"],
@@ -201,9 +229,11 @@ def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candida
     given = [event for event in events if event["event"] == CONTRIBUTED]
     contributors = contributors_of(events)
     first = next(
-        e for e in given if e["happened_at"] == contributors[0].at and e["owner"] == contributors[0].owner
+        e for e in given if e["happened_at"] == contributors[0].at and owner_of(e) == contributors[0].owner
     )
     standing = standing_of(events, live_maps)
+    request: dict[str, Any] = json.loads(first["request"] or "{}")
+    request.pop(_IDENTITY, None)
     return Candidate(
         candidate_id=first["candidate_id"],
         sha256=first["sha256"],
@@ -211,7 +241,7 @@ def candidate_of(events: Sequence["Row"], live_maps: Collection[str]) -> Candida
         width=first["width"],
         height=first["height"],
         contributors=contributors,
-        request=json.loads(first["request"] or "{}"),
+        request=request,
         answer=json.loads(first["answer"] or "{}"),
         snapshot=first["snapshot"],
         state=standing.state,

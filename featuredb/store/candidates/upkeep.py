@@ -9,11 +9,10 @@ import pyarrow as pa
 from featuredb.errors import FeatureDbError
 from featuredb.store.canaries import has_canaries, list_canaries, load_canary_image
 from featuredb.store.candidates.events import by_candidate, has_candidates, live_maps, read_events
-from featuredb.store.candidates.states import CONTRIBUTED, REFUSED, REOPENED, USED, WITHDRAWN, standing_of
+from featuredb.store.candidates.states import CONTRIBUTED, EVENTS, standing_of
 from featuredb.store.database import Database
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, CANDIDATE_TABLES
 
-_EVENTS = (CONTRIBUTED, USED, REFUSED, REOPENED, WITHDRAWN)
 _COLUMNS = (
     "candidate_id", "write_id", "event_index", "event", "happened_at", "sha256", "map_id", "reason_code",
     "reason",
@@ -69,8 +68,8 @@ def check_candidates(database: Database) -> Iterator[tuple[str, str]]:
     whole = by_candidate(events)
     for event in events:
         where = f"candidate {event['candidate_id']}"
-        if event["event"] not in _EVENTS:
-            yield where, f"an event {event['event']!r} that is none of {', '.join(_EVENTS)}"
+        if event["event"] not in EVENTS:
+            yield where, f"an event {event['event']!r} that is none of {', '.join(EVENTS)}"
         elif event["candidate_id"] not in whole:
             yield where, f"an event {event['event']!r} of a photo that nobody contributed"
     for candidate_id, own in whole.items():

@@ -14,7 +14,6 @@ from ingest.colmap.submodel import keep_photos
 from ingest.growth.gates import Gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, solve_with_new
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
-from ingest.growth.trust.confirmation import ConfirmationOptions, confirm, sources_json
 from ingest.growth.values import GrownMap, Refused
 
 _LEAST_PHOTOS = 3  # of a reconstruction
@@ -38,7 +37,6 @@ def grow_within_budget(
     model: Model,
     grow: Callable[[Model], GrownMap | Refused],
     maps: Mapping[str, PlacedMap],
-    confirmation: ConfirmationOptions,
     budget_m: float,
 ) -> GrownMap | Refused:
     """The map of a reconstruction with its drift, of the part of it that is within the budget.
@@ -54,7 +52,7 @@ def grow_within_budget(
         grown = grow(part)
         if isinstance(grown, Refused):
             return replace(grown, rows=everything)
-        feature_map, drift, relative = with_drift(grown, maps, confirmation, budget_m)
+        feature_map, drift, relative = with_drift(grown, maps, budget_m)
         gate = drift_gate(drift, budget_m)
         if gate.passes:
             return replace(grown, feature_map=feature_map, left_out={**beyond, **grown.left_out})
@@ -72,7 +70,7 @@ def grow_within_budget(
 
 
 def with_drift(
-    grown: GrownMap, maps: Mapping[str, PlacedMap], confirmation: ConfirmationOptions, budget_m: float
+    grown: GrownMap, maps: Mapping[str, PlacedMap], budget_m: float
 ) -> tuple[FeatureMap, float, FloatArray]:
     """The map with its overlaps, drift and covariance by the graph of all maps.
 
@@ -98,15 +96,13 @@ def with_drift(
         covariance = solution.covariance[feature_map.map_id]
         relative = solution.covariance_relative[feature_map.map_id]
     drift = drift_m(relative, places_of(feature_map))
-    confirmed = confirm(feature_map, confirmation)
-    gates = {g.name: g.as_json() for g in (confirmed.gate, drift_gate(drift, budget_m))}
+    gate = drift_gate(drift, budget_m)
     growth |= {
         "drift_m": round(drift, 6),
         "budget_m": budget_m,
         "covariance_relative": relative.ravel().tolist(),
         "edges": [edge.as_json() for edge in edges],
-        "sources": sources_json(confirmed),
-        "gates": {**growth.get("gates", {}), **gates},
+        "gates": {**growth.get("gates", {}), gate.name: gate.as_json()},
     }
     placement = replace(
         feature_map.placement,

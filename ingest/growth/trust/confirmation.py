@@ -1,26 +1,23 @@
-"""Confirmation of a quarantined map by independent sources: photos of different people see the same of it.
+"""Confirmation of a quarantined map: photos of those whose word counts see the same of it.
 
 A map is the claim of those whose photos made it. Its parents vouch for its place, and only where it overlaps
-them; what it adds beyond is believed when photos of someone else show it, too. Sources are told apart by
-owner, and where the owner is unknown by camera and day. One person with several accounts is several sources
-here; who an owner is, is not for this system to know (docs/growth.md).
+them; what it adds beyond is believed when photos of another owner show it, too. An owner is an identity that
+the wire has authenticated, and its word counts once more than identities has confirmed it (docs/growth.md).
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from datetime import date
-from typing import Any, Literal
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.csgraph import connected_components, maximum_bipartite_matching
+from scipy.sparse.csgraph import maximum_bipartite_matching
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store.candidates.owners import Owners
+from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from ingest.growth.gates import Gate
-
-Independence = Literal["owner", "any"]
 
 # A photo may lie or be mistaken: whichever is left out, a pair that confirms has to be left. Pairs with one
 # photo in common count as one, three photos that confirm each other as one and a half.
@@ -28,34 +25,11 @@ _ONE_PAIR = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Source:
-    """Where a photo comes from; "" and None are unknown, and never tell two sources apart.
-
-    Attributes:
-        owner: who gave it. camera: its EXIF key. day: of capture, by the camera's own clock.
-    """
-
-    owner: str = ""
-    camera: str = ""
-    day: date | None = None
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "owner": self.owner,
-            "camera": self.camera,
-            "day": None if self.day is None else self.day.isoformat(),
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ConfirmationOptions:
     """When a map counts as confirmed.
 
     Attributes:
-        independent_by: "owner": photos of different owners are independent, and photos without an owner by
-            another camera or day; the same owner never confirms himself. "any": another owner, camera or
-            day is enough, which a contributor who means harm can make up.
-        trusted_owners: whose photos need nobody else: surveys of those who keep the database.
+        trusted: identities that the operator vouches for: their photos need nobody else, as his own.
         min_shared_points: two photos confirm each other from so many common points of the map on. An
             accepted pose has at least so many inliers (reloc.localise.options), and chance gives a few.
         min_parallax: distance of two cameras over their distance from what both see. The same picture given
@@ -63,10 +37,65 @@ class ConfirmationOptions:
             thousandths.
     """
 
-    independent_by: Independence = "owner"
-    trusted_owners: tuple[str, ...] = ()
+    trusted: tuple[str, ...] = ()
     min_shared_points: int = 15
     min_parallax: float = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Where a photo comes from.
+
+    Attributes:
+        owner: who gave it, by identity.
+        proven: it needs nobody's word: it is the operator's, a trusted identity's, or of a map that measured
+            its own place.
+        on_record: its owner's word counts, beside that of another such owner.
+    """
+
+    owner: str
+    proven: bool = False
+    on_record: bool = False
+
+    def speaks_to(self, sources: Iterable["Source"]) -> bool:
+        """Whether its word counts, for or against a map of these sources, not all its own."""
+        return (self.proven or self.on_record) and any(self.owner != other.owner for other in sources)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sources:
+    """Tells where photos come from.
+
+    Attributes:
+        owners: of the database as it is; by default, one to which nobody has contributed.
+        trusted: see `ConfirmationOptions`.
+    """
+
+    owners: Owners = field(default_factory=Owners)
+    trusted: tuple[str, ...] = ()
+
+    def with_records(self, owners: Iterable[str]) -> "Sources":
+        """The same with these owners on record, too, as far as they may be."""
+        more = frozenset(owners) - {ANONYMOUS, OPERATOR}
+        return replace(self, owners=replace(self.owners, on_record=self.owners.on_record | more))
+
+    def of_owner(self, owner: str, *, anchor: bool = False) -> Source:
+        """Of a photo of this owner; `anchor`: of a map that measured its own place."""
+        proven = anchor or owner == OPERATOR or owner in self.trusted
+        return Source(owner=owner, proven=proven, on_record=owner in self.owners.on_record)
+
+    def of_map(self, feature_map: FeatureMap) -> list[Source]:
+        """Of the images of a map, in their order."""
+        anchor = feature_map.map_id in self.owners.anchors
+        return [self.of_owner(owner, anchor=anchor) for owner in self.owners.of_map(feature_map)]
+
+
+def independent(a: Source, b: Source) -> bool:
+    """Whether two photos that see the same confirm each other.
+
+    They are of two owners, and one of them is proven, or both owners are on record.
+    """
+    return a.owner != b.owner and (a.proven or b.proven or (a.on_record and b.on_record))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,14 +120,17 @@ class Confirmation:
 
     Attributes:
         gate: the map is confirmed when it passes.
-        sources: those among the photos that confirm each other, or are trusted.
+        owners: of the photos that confirm each other, or are proven.
         confirmed: image ids of the map.
+        earned: those of the map's that make a record for their owner: proven themselves, or confirmed by a
+            proven photo, or by photos of two other owners on record.
         corroborating: names of photos from outside that confirm one of the map.
     """
 
     gate: Gate
-    sources: tuple[Source, ...]
+    owners: tuple[str, ...]
     confirmed: tuple[int, ...]
+    earned: tuple[int, ...] = ()
     corroborating: tuple[str, ...] = ()
 
     @property
@@ -106,64 +138,61 @@ class Confirmation:
         """Why it is not confirmed, or how it was; for people."""
         if not self.gate.passes:
             return self.gate.message
-        return f"{len(self.confirmed)} photos confirmed by {len(self.sources)} sources"
-
-
-def source_of(image: MapImage, camera_keys: Sequence[str]) -> Source:
-    """Where a map's image comes from."""
-    return Source(
-        owner=image.owner,
-        camera=camera_keys[image.camera_id] if camera_keys else "",
-        day=None if image.capture_time is None else image.capture_time.date(),
-    )
-
-
-def independent(a: Source, b: Source, by: Independence = "owner") -> bool:
-    """Whether two photos come from sources that do not know of each other."""
-    other_owner = bool(a.owner and b.owner and a.owner != b.owner)
-    other_camera = bool(a.camera and b.camera and a.camera != b.camera)
-    other_day = a.day is not None and b.day is not None and a.day != b.day
-    if by == "owner" and a.owner and b.owner:
-        return other_owner
-    return other_owner or other_camera or other_day
+        return f"{len(self.confirmed)} photos confirmed by {len(self.owners)} owners"
 
 
 def confirm(
     feature_map: FeatureMap,
+    sources: Sources,
     options: ConfirmationOptions,
     corroborating: Sequence[CorroboratingImage] = (),
     against: Sequence[str] = (),
 ) -> Confirmation:
-    """How far independent sources confirm a map.
+    """How far a map is confirmed by those whose word counts.
 
-    A photo of the map is confirmed when it shares enough of the map's points with a photo of an independent
-    source, the map's own or one from outside, or when its owner is trusted.
+    A photo of the map is confirmed when it is proven, or shares enough of the map's points with a photo that
+    is independent of it, the map's own or one from outside.
 
     Args:
         against: sentences on photos from outside that the map has elsewhere than they are.
     """
-    sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
-    own = len(sources)
-    everyone = [*sources, *(w.source for w in corroborating)]
-    shared = _shared_points(feature_map, corroborating)
-    agree = np.zeros_like(shared, dtype=np.bool_)
-    enough = (shared >= options.min_shared_points) & (
-        parallax(feature_map, corroborating) >= options.min_parallax
-    )
-    for i, j in np.argwhere(np.triu(enough, 1)).tolist():
-        agree[i, j] = agree[j, i] = independent(everyone[i], everyone[j], options.independent_by)
-    trusted = np.array([bool(s.owner) and s.owner in options.trusted_owners for s in everyone], dtype=bool)
-    confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | trusted, dtype=np.bool_)
-    groups = _groups(everyone, confirmed, agree, options.independent_by)
-    gate = _gate(int(confirmed[:own].sum()), _pairs(agree), bool((confirmed & trusted)[:own].any()), against)
-    ids = [image.image_id for image in feature_map.images]
+    everyone = [*sources.of_map(feature_map), *(w.source for w in corroborating)]
+    own = len(feature_map.images)
+    sees_same = _shared_points(feature_map, corroborating) >= options.min_shared_points
+    apart = parallax(feature_map, corroborating) >= options.min_parallax
+    agree = sees_same & apart & independent_pairs(everyone)
+    proven = np.array([s.proven for s in everyone], dtype=bool)
+    confirmed: NDArray[np.bool_] = np.asarray(agree.any(axis=1) | proven, dtype=np.bool_)
     vouching: list[bool] = [bool(row.any()) for row in agree[own:, :own]]
+    ids = [image.image_id for image in feature_map.images]
     return Confirmation(
-        gate=gate,
-        sources=tuple(groups),
+        gate=_gate(int(confirmed[:own].sum()), _pairs(agree), bool(proven[:own].any()), against),
+        owners=tuple(dict.fromkeys(s.owner for s, yes in zip(everyone, confirmed, strict=True) if yes)),
         confirmed=tuple(i for i, yes in zip(ids, confirmed[:own], strict=True) if yes),
+        earned=tuple(i for k, i in enumerate(ids) if _earns(k, everyone, sees_same, apart)),
         corroborating=tuple(w.name for w, yes in zip(corroborating, vouching, strict=True) if yes),
     )
+
+
+def independent_pairs(sources: Sequence[Source]) -> NDArray[np.bool_]:
+    """Which photos (n, n) are independent of each other."""
+    return np.array([[independent(a, b) for b in sources] for a in sources], dtype=bool).reshape(
+        len(sources), len(sources)
+    )
+
+
+def _earns(
+    row: int, sources: Sequence[Source], sees_same: NDArray[np.bool_], apart: NDArray[np.bool_]
+) -> bool:
+    """Whether a photo makes a record for its owner; one that copies a proven photo does not."""
+    mine, same, moved = sources[row], sees_same[row], apart[row]
+    others = [
+        (s, far) for s, yes, far in zip(sources, same, moved, strict=True) if yes and s.owner != mine.owner
+    ]
+    if mine.proven or not all(far for s, far in others if s.proven):
+        return mine.proven
+    known = {s.owner for s, far in others if s.on_record and far}
+    return any(s.proven for s, _ in others) or len(known) > 1
 
 
 def _pairs(agree: NDArray[np.bool_]) -> float:
@@ -175,10 +204,10 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(partner >= 0)) / 2.0
 
 
-def _gate(confirmed: int, pairs: float, trusted: bool, against: Sequence[str]) -> Gate:
+def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[str]) -> Gate:
     """Whether more pairs confirm the map than one and those that photos contradict it with."""
-    needed = len(against) + (0.0 if trusted else _ONE_PAIR)
-    if against and (trusted or pairs > _ONE_PAIR):
+    needed = len(against) + (0.0 if proven else _ONE_PAIR)
+    if against and (proven or pairs > _ONE_PAIR):
         reason = "CONTRADICTED"
         message = (
             f"{len(against)} photos from outside contradict it, {pairs:g} pairs confirm it: {against[0]}"
@@ -190,13 +219,13 @@ def _gate(confirmed: int, pairs: float, trusted: bool, against: Sequence[str]) -
             "needed"
         )
     else:
-        reason, message = "ONE_SOURCE", "no two independent sources see the same of it"
+        reason, message = "ONE_SOURCE", "no two owners whose word counts see the same of it"
     return Gate(
         name="confirmation",
         reason=reason,
         figure=pairs,
         limit=needed,
-        passes=pairs > needed or (trusted and not against),
+        passes=pairs > needed or (proven and not against),
         message=message,
     )
 
@@ -237,25 +266,3 @@ def parallax(feature_map: FeatureMap, corroborating: Sequence[CorroboratingImage
     )
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     return np.asarray(apart / np.maximum(np.minimum(reach[:, None], reach[None]), 1e-9), dtype=np.float64)
-
-
-def _groups(
-    sources: Sequence[Source], confirmed: NDArray[np.bool_], agree: NDArray[np.bool_], by: Independence
-) -> list[Source]:
-    """One source of each group of photos that are not independent of each other, among those confirmed."""
-    distinct = list(dict.fromkeys(sources[i] for i in np.flatnonzero(confirmed).tolist()))
-    if not distinct:
-        return []
-    same = [[not independent(a, b, by) for b in distinct] for a in distinct]
-    _, label = connected_components(sparse.csr_array(np.array(same, dtype=np.int8)), directed=False)
-    found = {int(k): source for k, source in zip(label[::-1], distinct[::-1], strict=True)}
-    # Photos of unknown source join groups to one; where two of them confirm each other all the same, by what
-    # is known of them, there are two.
-    groups = [found[k] for k in sorted(found)]
-    if len(groups) == 1 and agree.any():
-        return [sources[k] for k in np.argwhere(agree)[0].tolist()]
-    return groups
-
-
-def sources_json(confirmation: Confirmation) -> list[Mapping[str, Any]]:
-    return [source.as_json() for source in confirmation.sources]

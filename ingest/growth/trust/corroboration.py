@@ -9,16 +9,11 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.store.candidates.states import OPERATOR
 from ingest.growth.map_images import features_and_points
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_each
 from ingest.growth.place.overlaps import localise_image
-from ingest.growth.trust.confirmation import (
-    ConfirmationOptions,
-    CorroboratingImage,
-    Source,
-    independent,
-    source_of,
-)
+from ingest.growth.trust.confirmation import CorroboratingImage, Source, Sources
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
 from ingest.sfm.pairs import Pair
@@ -89,12 +84,12 @@ def corroborate(
     feature_map: FeatureMap,
     others: Sequence[FeatureMap],
     new: NewPhotos | None,
-    by: ConfirmationOptions,
+    sources: Sources,
     options: CorroborationOptions | None = None,
     *,
     write_id: str,
 ) -> Corroboration:
-    """Localise photos of sources that are not the map's own in the map alone.
+    """Localise photos of other owners than the map's, whose word counts, in the map alone.
 
     Args:
         others: maps around it, active or quarantined.
@@ -105,11 +100,11 @@ def corroborate(
     if not len(area.points):
         return Corroboration(corroborating=(), contradictions=())
     indexed = IndexedArea(area=area, index=build_index(area.descriptors))
-    own = {source_of(image, feature_map.camera_keys) for image in feature_map.images}
+    own = set(sources.of_map(feature_map))
     names = {image.sha256 for image in feature_map.images}
     corroborating: list[CorroboratingImage] = []
     against: list[str] = []
-    for other, image in _images_around(feature_map, others, own, by, options):
+    for other, image, source in _images_around(feature_map, others, own, sources, options):
         found = localise_image(other, image, 0, [indexed], options.localise)
         if found is None or image.sha256 in names:
             continue
@@ -118,18 +113,10 @@ def corroborate(
         apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
         spread = _spread(found) + _center_variance(other, image)
         what = f"{image.name} of map {other.map_id}"
-        _sort_in(
-            found, source_of(image, other.camera_keys), what, apart, spread, options, corroborating, against
-        )
+        _sort_in(found, source, what, apart, spread, options, corroborating, against)
     if new is not None:
-        _hear_new(feature_map, write_id, indexed, new, own, names, by, options, corroborating, against)
+        _hear_new(feature_map, write_id, indexed, new, own, names, sources, options, corroborating, against)
     return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
-
-
-def source_of_photo(photo: Photo) -> Source:
-    """Where a new photo comes from."""
-    day = None if photo.capture_time is None else photo.capture_time.date()
-    return Source(owner=photo.owner, camera=photo.camera_key, day=day)
 
 
 def _hear_new(
@@ -139,16 +126,19 @@ def _hear_new(
     new: NewPhotos,
     own: set[Source],
     names: set[str],
-    by: ConfirmationOptions,
+    sources: Sources,
     options: CorroborationOptions,
     corroborating: list[CorroboratingImage],
     against: list[str],
 ) -> None:
-    sources = {row: source_of_photo(new.photos[row]) for row in new.that_may_see(feature_map)}
+    source_of = {
+        row: sources.of_owner(new.photos[row].contributor or OPERATOR)
+        for row in new.that_may_see(feature_map)
+    }
     asked = [
         row
-        for row, source in sources.items()
-        if new.photos[row].sha256 not in names and any(independent(source, s, by.independent_by) for s in own)
+        for row, source in source_of.items()
+        if new.photos[row].sha256 not in names and source.speaks_to(own)
     ]
     unheard = [row for row in asked if (write_id, row) not in new.heard]
     for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], options.localise):
@@ -163,7 +153,7 @@ def _hear_new(
             there = in_frame(new.localised[row], feature_map.frame)
             apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
             spread += _spread(there)
-        _sort_in(found, sources[row], new.photos[row].name, apart, spread, options, corroborating, against)
+        _sort_in(found, source_of[row], new.photos[row].name, apart, spread, options, corroborating, against)
 
 
 def _sort_in(
@@ -207,28 +197,27 @@ def _images_around(
     feature_map: FeatureMap,
     others: Sequence[FeatureMap],
     own: set[Source],
-    by: ConfirmationOptions,
+    sources: Sources,
     options: CorroborationOptions,
-) -> list[tuple[FeatureMap, MapImage]]:
-    """Images of other maps by independent sources, nearest to the map's cameras first."""
+) -> list[tuple[FeatureMap, MapImage, Source]]:
+    """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = np.array([image.cam_from_local.center for image in feature_map.images])
-    found: list[tuple[float, str, FeatureMap, MapImage]] = []
+    found: list[tuple[float, str, FeatureMap, MapImage, Source]] = []
     for other in others:
         if other.map_id == feature_map.map_id:
             continue
         here_from_other = feature_map.frame.enu_from(other.frame)
-        for image in other.images:
-            source = source_of(image, other.camera_keys)
-            if not any(independent(source, s, by.independent_by) for s in own):
+        for image, source in zip(other.images, sources.of_map(other), strict=True):
+            if not source.speaks_to(own):
                 continue
             center = here_from_other.act(image.cam_from_local.center)
             distance = float(np.linalg.norm(centers - center, axis=1).min())
             if distance <= options.near_m + _reach(centers):
-                found.append((distance, f"{other.map_id} {image.name}", other, image))
+                found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     chosen = []
-    for _, _, other, image in sorted(found, key=lambda e: e[:2]):
+    for _, _, other, image, source in sorted(found, key=lambda e: e[:2]):
         if len(features_and_points(other, image)[1]) >= options.min_features:
-            chosen.append((other, image))
+            chosen.append((other, image, source))
         if len(chosen) == options.max_images:
             break
     return chosen

@@ -2,16 +2,19 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
+from featuredb.store.candidates.owners import read_owners
+from featuredb.store.candidates.photos import mark_confirmed
+from featuredb.store.changes import is_imported
 from ingest.growth.gates import Gate
 from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, run_canaries
-from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, confirm
+from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, Sources, confirm
 from ingest.growth.trust.corroboration import CorroborationOptions, NewPhotos, corroborate
 from ingest.growth.trust.examined import question, recall, remember
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
@@ -38,7 +41,7 @@ class PromotionOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """What others say of a map; `feature_map` has descriptors where they confirm it."""
+    """A map that others confirm; `feature_map` has descriptors where they do."""
 
     feature_map: FeatureMap
     confirmation: Confirmation
@@ -46,11 +49,15 @@ class ExaminedMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Ready:
-    """A map that only the canaries may still refuse, and the write id of its state in the database."""
+    """A map that only the canaries may still refuse, and the write id of its state in the database.
+
+    `earned`: candidate ids of its photos that make a record for their owners.
+    """
 
     map_id: str
     write_id: str
     found: ExaminedMap
+    earned: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,10 +108,12 @@ def promote_confirmed(
     """
     options = options or PromotionOptions()
     snapshot = database.snapshot()
-    asked = question(database, snapshot, _digests(new), options)
+    sources = Sources(owners=read_owners(database, snapshot), trusted=options.confirmation.trusted)
+    asked = _question(database, snapshot, sources, new, options)
     waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
     ready: list[_Ready] = []
     outcomes: list[Promotion] = []
+    open_maps: list[MapSummary] = []
     for summary in waiting:
         held_back = _held_back(summary, snapshot, budget_m)
         if held_back is not None:
@@ -114,16 +123,19 @@ def promote_confirmed(
         if known is not None:
             outcomes.append(_stays(summary.map_id, *known))
             continue
-        found = examine(snapshot.load_map(summary.map_id), snapshot, options, new)
-        gate = found.confirmation.gate
-        if not gate.passes:
+        open_maps.append(summary)
+    for summary, found in zip(open_maps, _examined(open_maps, snapshot, sources, options, new), strict=True):
+        if isinstance(found, Confirmation):
+            gate = found.gate
             outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
             remember(work, summary.map_id, asked, gate.reason, gate.message, (gate,))
         else:
-            ready.append(_committed(database, summary, found))
+            ready.append(_committed(database, summary, found, sources))
     if ready:
         decided = _promote(database, localiser, ready, options)
-        after = question(database, database.snapshot(), _digests(new), options)
+        now = database.snapshot()
+        sources = replace(sources, owners=read_owners(database, now))
+        after = _question(database, now, sources, new, options)
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
                 remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
@@ -131,8 +143,36 @@ def promote_confirmed(
     return outcomes
 
 
-def _digests(new: NewPhotos | None) -> list[str]:
-    return [] if new is None else [new.photos[row].sha256 for row in new.rows]
+def _examined(
+    waiting: Sequence[MapSummary],
+    snapshot: Snapshot,
+    sources: Sources,
+    options: PromotionOptions,
+    new: NewPhotos | None,
+) -> list[ExaminedMap | Confirmation]:
+    """All of them, with the records that they make for each other: else what two newcomers show beside what
+    an anchor shows would lose its descriptors, which do not come back.
+    """
+    while True:
+        found = [examine(snapshot.load_map(m.map_id), snapshot, sources, options, new) for m in waiting]
+        more = sources.with_records(
+            sources.owners.of_image(one.feature_map, image)
+            for one in found
+            if isinstance(one, ExaminedMap)
+            for image in one.feature_map.images
+            if image.image_id in one.confirmation.earned
+        )
+        if more == sources:
+            return found
+        sources = more
+
+
+def _question(
+    database: Database, snapshot: Snapshot, sources: Sources, new: NewPhotos | None, options: PromotionOptions
+) -> str:
+    photos = [] if new is None else [new.photos[row].sha256 for row in new.rows]
+    records = [f"{owner} is on record" for owner in sources.owners.on_record]
+    return question(database, snapshot, [*photos, *records], options)
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -153,26 +193,35 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
     if not gate.passes and not force:
         return _stays(map_id, gate.reason, gate.message, (gate,))
     text = f"{reason} (by hand; {gate.message})"
+    mark_confirmed(database, read_owners(database, snapshot).made_of.get(map_id, ()), map_id)
     database.set_status([map_id], "active", text, based_on={map_id: summary.write_id})
     return Promotion(map_id=map_id, promoted=True, reason_code="", reason=text, gates=(gate,))
 
 
 def examine(
-    feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
-) -> ExaminedMap:
-    """How far others confirm a map: photos of its own, and from outside."""
+    feature_map: FeatureMap,
+    snapshot: Snapshot,
+    sources: Sources,
+    options: PromotionOptions,
+    new: NewPhotos | None,
+) -> ExaminedMap | Confirmation:
+    """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
     heard = corroborate(
         feature_map,
         _others(feature_map.map_id, snapshot),
         new,
-        options.confirmation,
+        sources,
         options.corroboration,
         write_id=snapshot.get(feature_map.map_id).write_id,
     )
-    confirmation = confirm(feature_map, options.confirmation, heard.corroborating, heard.contradictions)
+    confirmation = confirm(
+        feature_map, sources, options.confirmation, heard.corroborating, heard.contradictions
+    )
+    if not confirmation.gate.passes:
+        return confirmation
     part = feature_map
     if options.answer_with == "confirmed":
-        points = confirmed_points(feature_map, options.confirmation, heard.corroborating)
+        points = confirmed_points(feature_map, sources, options.confirmation, heard.corroborating)
         part = answering_with(feature_map, points)
     return ExaminedMap(feature_map=part, confirmation=confirmation)
 
@@ -191,6 +240,8 @@ def canary_gate(run: CanaryRun) -> Gate:
 
 def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
+    if is_imported(summary.status, summary.status_reason):
+        return _stays(summary.map_id, "IMPORTED", summary.status_reason, ())
     if "was placed anew" in summary.status_reason:
         return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason, ())
     inactive = [p for p in summary.parents if not _active(snapshot, p)]
@@ -229,19 +280,20 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
         box.max_easting + _AROUND_M,
         box.max_northing + _AROUND_M,
     )
-    same = [m for m in near if m.map_id != map_id and m.extractor_fingerprint == me.extractor_fingerprint]
+    heard = [m for m in near if m.map_id != map_id and not is_imported(m.status, m.status_reason)]
+    same = [m for m in heard if m.extractor_fingerprint == me.extractor_fingerprint]
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> _Ready:
+def _committed(database: Database, summary: MapSummary, found: ExaminedMap, sources: Sources) -> _Ready:
     """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    seen, described = found.feature_map.observations, summary.descriptors
-    if int(seen.has_descriptor.sum()) == described:
-        return _Ready(map_id=summary.map_id, write_id=summary.write_id, found=found)
-    result = database.commit_map(
-        found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
-    )
-    return _Ready(map_id=summary.map_id, write_id=result.write_id, found=found)
+    feature_map, write_id = found.feature_map, summary.write_id
+    if int(feature_map.observations.has_descriptor.sum()) != summary.descriptors:
+        result = database.commit_map(feature_map, replaces=summary.map_id, based_on=write_id, moves=False)
+        write_id = result.write_id
+    known, earned = sources.owners.made_of.get(summary.map_id, frozenset()), found.confirmation.earned
+    theirs = frozenset(i.sha256[:32] for i in feature_map.images if i.image_id in earned)
+    return _Ready(map_id=summary.map_id, write_id=write_id, found=found, earned=theirs & known)
 
 
 def _promote(
@@ -284,6 +336,8 @@ def _decide(
     reason = f"{confirmed}; {run.message}"
     asked = database.snapshot(before.snapshot)
     active = [m.write_id for m in asked.maps() if m.status == "active"]
+    for item in ready:
+        mark_confirmed(database, item.earned, item.map_id)
     try:
         database.set_status(
             ids, "active", reason, based_on={r.map_id: r.write_id for r in ready}, active=active

@@ -15,18 +15,21 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.trust.confirmation import (
     ConfirmationOptions,
     CorroboratingImage,
-    independent,
+    Sources,
+    independent_pairs,
     parallax,
-    source_of,
 )
 
 
 def confirmed_points(
-    feature_map: FeatureMap, options: ConfirmationOptions, corroborating: Sequence[CorroboratingImage] = ()
+    feature_map: FeatureMap,
+    sources: Sources,
+    options: ConfirmationOptions,
+    corroborating: Sequence[CorroboratingImage] = (),
 ) -> NDArray[np.bool_]:
-    """Which points (n,) photos of two independent sources see, the map's or from outside, or trusted ones."""
-    sources = [source_of(image, feature_map.camera_keys) for image in feature_map.images]
-    sources += [w.source for w in corroborating]
+    """Which points (n,) two independent photos see, the map's or from outside, or a proven one of the map."""
+    own = sources.of_map(feature_map)
+    everyone = [*own, *(w.source for w in corroborating)]
     row = {image.image_id: i for i, image in enumerate(feature_map.images)}
     seen = feature_map.observations
     images = [np.array([row[int(i)] for i in seen.image_id], dtype=np.int64)]
@@ -34,22 +37,17 @@ def confirmed_points(
     for k, outside in enumerate(corroborating, start=len(row)):
         images.append(np.full(len(outside.points), k, dtype=np.int64))
         points.append(outside.points)
-    shape = (len(sources), max(len(feature_map.points), 1))
+    shape = (len(everyone), max(len(feature_map.points), 1))
     entries = (np.concatenate(images), np.concatenate(points))
     sees = sparse.csr_array((np.ones(len(entries[0])), entries), shape=shape)
     sees.sum_duplicates()
     sees.data[:] = 1.0
     apart = parallax(feature_map, corroborating) >= options.min_parallax
-    pairs = np.array(
-        [[apart[i, j] and independent(a, b, options.independent_by) for j, b in enumerate(sources)]
-         for i, a in enumerate(sources)],
-        dtype=np.float64,
-    )  # fmt: skip
+    pairs = (apart & independent_pairs(everyone)).astype(np.float64)
     others = sparse.csr_array(pairs) @ sees  # for each photo, how many independent ones see the point
     both = np.asarray(sees.multiply(others).sum(axis=0)).ravel() > 0
-    trusted = np.array([bool(s.owner) and s.owner in options.trusted_owners for s in sources], dtype=bool)
-    by_trusted = np.asarray(sees[np.flatnonzero(trusted)].sum(axis=0)).ravel() > 0
-    return np.asarray((both | by_trusted)[: len(feature_map.points)], dtype=np.bool_)
+    proven = np.asarray(sees[[k for k, s in enumerate(own) if s.proven]].sum(axis=0)).ravel() > 0
+    return np.asarray((both | proven)[: len(feature_map.points)], dtype=np.bool_)
 
 
 def answering_with(feature_map: FeatureMap, points: NDArray[np.bool_]) -> FeatureMap:

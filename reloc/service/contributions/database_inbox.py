@@ -45,11 +45,11 @@ def contribution_of(
     request: LocaliseWireRequest,
     reply: LocaliseReply,
     received_at: datetime,
-    identity: str | None = None,
+    owner: str,
 ) -> Contribution:
     """The row of a contributed photo out of its query, which has been answered and found valid.
 
-    `identity`: the name by which the client was authenticated; None: it was not.
+    `owner`: the name by which the client was authenticated, ANONYMOUS where it was not.
     """
     header = read_header(data)
     asked = request.model_dump(mode="json", include={"request_id", "camera", "prior", "options"})
@@ -57,11 +57,12 @@ def contribution_of(
         image=data,
         width=header.width,
         height=header.height,
-        owner=request.owner or "",
+        owner=owner,
+        credit=request.credit or "",
         licence=request.licence or "",
         client_id=request.client_id or "",
         received_at=received_at,
-        request={**asked, "identity": identity, "exif": _told(read_exif(data, header))},
+        request={**asked, "exif": _told(read_exif(data, header))},
         answer=reply.model_dump(mode="json", include=_ANSWER),
         snapshot=reply.snapshot,
     )

@@ -29,8 +29,8 @@ class InboxOptions:
         max_queue: photos that wait for the writing thread. It writes them together, in less than a second on
             a disk; two workers answer some eight queries a second.
         max_queued_bytes: of these photos, so that they cannot fill the memory.
-        max_owner_photos: photos of one owner that wait for growth; a day's walk has some hundreds, and one
-            owner cannot crowd out the others.
+        max_owner_photos: photos of one owner (an identity; all who have none are one) that wait for growth; a
+            day's walk has some hundreds, and one owner cannot crowd out the others.
         max_photos: photos of all owners that wait for growth.
         max_stored_bytes: of all stored photos, whatever has become of them; some thousands of a drone's.
         batch: photos that are written in one commit.
