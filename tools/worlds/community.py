@@ -45,8 +45,7 @@ class CommunityOptions:
 
     Attributes:
         seed: of everything. town_size_m: width and height of the town.
-        flight: the anchored survey, of most of what people visit (`tools/growth_community.py` prints how much
-            of their photos it has mapped).
+        flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
