@@ -1,5 +1,6 @@
 """What the programs that measure growth share: an anchored database, contributions, errors."""
 
+import argparse
 import json
 import logging
 import shutil
@@ -99,6 +100,19 @@ class Verdict:
     name: str
     text: str
     holds: bool
+
+
+def growth_arguments(doc: str | None, name: str, seed: int) -> argparse.ArgumentParser:
+    """What the programs of made worlds take."""
+    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path(f"growth-{name}"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=seed)
+    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
+    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
+    return parser
 
 
 def say(text: str) -> None:

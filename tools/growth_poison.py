@@ -50,6 +50,7 @@ from tools.growth_common import (
     failures,
     give,
     growing_options,
+    growth_arguments,
     log_to_stderr,
     made,
     newest_copy,
@@ -325,15 +326,8 @@ def outcome_table(outcomes: Sequence[PoisonOutcome]) -> str:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("growth-poison"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=4)
+    parser = growth_arguments(__doc__, "poison", seed=4)
     parser.add_argument("--poison", action="append", choices=(*POISONS, _ALL), help="only these kinds")
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     return parser.parse_args(argv)
 
 

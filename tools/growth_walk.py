@@ -20,7 +20,6 @@ the second anchor every probe that is answered is within 0.3 m, and the maps tha
 commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -47,6 +46,7 @@ from tools.growth_common import (
     failures,
     give,
     growing_options,
+    growth_arguments,
     log_to_stderr,
     made,
     none_failed,
@@ -102,7 +102,7 @@ class Step:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = growth_arguments(__doc__, "walk", seed=2).parse_args(argv)
     log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     world = WalkOptions.short(args.seed) if args.size == "short" else WalkOptions(seed=args.seed)
@@ -312,18 +312,6 @@ def _read_steps(log: Path) -> list[Step]:
         return []
     rows = json.loads(log.read_text(encoding="utf-8"))
     return [Step(**{**row, "probes": tuple(Probe(**p) for p in row["probes"])}) for row in rows]
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("growth-walk"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=2)
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
+from tools.worlds.album import PlannedPhoto, Progress, Subject, write_album
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -129,11 +129,12 @@ def write_community(
     Raises:
         OSError: the folder cannot be written.
     """
-    if album_is_complete(folder):
-        return Path(folder)
-    home = options.scene("home/0/000")
-    photos = survey_photos(home, options.flight, options.seed) + plan_community(options)
-    return write_album(folder, options, home, photos, workers, progress)
+
+    def plan() -> list[PlannedPhoto]:
+        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+        return survey + plan_community(options)
+
+    return write_album(folder, options, plan, workers, progress)
 
 
 def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:
