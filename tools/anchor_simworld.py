@@ -24,7 +24,6 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.scan_world import ScanWorld, make_scan_world
 from featuredb.simworld.scoring import PoseError, pose_error
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
@@ -32,6 +31,7 @@ from reloc.client import Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from tools.figures import add_json_option, write_figures
+from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _ROOT = Path(__file__).resolve().parent.parent
 

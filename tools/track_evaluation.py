@@ -2,7 +2,7 @@
 
     python -m tools.track_evaluation --out DIR [--size full] [--films smooth jerky cut]
 
-1. The world of `featuredb.simworld.scan_world`: `featuredb ingest photos` maps the drone's photos,
+1. The world of `tools.worlds.scan_world`: `featuredb ingest photos` maps the drone's photos,
    `featuredb lidar add` and `featuredb anchor --auto` place the map on the scan.
 2. Films of the same town at 1280x720 and 30 Hz: smooth; jerky, with gusts and turns on the spot; cut, which
    shows another town for a while. All pass over water. They are drawn once and kept.
@@ -32,7 +32,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import matrix_from_quaternion, so3_exp, so3_log
 from featuredb.lidar.load import load_cloud
-from featuredb.simworld.scan_world import make_scan_world
 from featuredb.simworld.scoring import pose_difference
 from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
@@ -49,6 +48,7 @@ from tools.figures import write_figures
 from tools.growth_common import say, table
 from tools.worlds.film_world import FILM_FILE, FilmOptions, FilmTruth, read_film_truth, write_film
 from tools.worlds.flight_path import PathOptions
+from tools.worlds.scan_world import make_scan_world
 
 _FILMS = ("smooth", "jerky", "cut")
 _START_M, _START_DEG = 10.0, 5.0  # how far off the first pose on a scan is
@@ -125,7 +125,7 @@ def anchored_map(out: Path, size: str, seed: int, workers: int, inputs: Path | N
     out = out / f"{size}-{seed}"
     out.mkdir(parents=True, exist_ok=True)
     folder = out / "world" if inputs is None else inputs / f"scan-world-{size}-{seed}"
-    world = make_scan_world(folder, seed, "short" if size == "short" else "full", workers)
+    world = make_scan_world(folder, seed, size, workers)
     done = out / "anchored.txt"
     if not done.exists():
         mapped = out / "mapped"

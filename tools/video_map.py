@@ -17,7 +17,6 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.scan_world import make_scan_world
 from featuredb.stage_clock import StageClock
 from featuredb.store import Database
 from ingest.workspace import default_root
@@ -25,6 +24,7 @@ from tools.anchor_simworld import featuredb
 from tools.figures import write_figures
 from tools.track_evaluation import film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
+from tools.worlds.scan_world import make_scan_world
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -40,14 +40,14 @@ def run_simworld(args: argparse.Namespace) -> int:
     """Write the world and say what is in it."""
     from rich.console import Console
 
-    from featuredb.simworld.scan_world import ScanWorldOptions, write_lidar
+    from featuredb.simworld.scan_world import write_lidar
     from featuredb.simworld.world import WorldOptions
 
     options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
     options = replace(options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error))
     console = Console(stderr=True)
     if args.lidar:  # first, since it may lack a package
-        write_lidar(args.out, ScanWorldOptions(world=options), lambda name: console.print(f"writing {name}"))
+        write_lidar(args.out, options, lambda name: console.print(f"writing {name}"))
     world = _write_with_progress(args.out, options)
     Console().print(_summary(world, lidar=args.lidar))
     return 0
