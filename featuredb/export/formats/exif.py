@@ -39,7 +39,7 @@ class _File(NamedTuple):
     reason: str
 
 
-def write_exif(job: ExportJob, photos: Path) -> Exported:
+def write_exif(job: ExportJob, photos: Path | None) -> Exported:
     """Write copies to `job.out`/<map>/<photo>, with files.csv and attribution.csv.
 
     A photo that is not in the folder, or no JPEG, is named in files.csv with the reason, and not counted.
@@ -48,6 +48,8 @@ def write_exif(job: ExportJob, photos: Path) -> Exported:
         ExportError: nothing is selected, none of the photos can be written, no such folder, or there is
             something at `job.out`.
     """
+    if photos is None:
+        raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")
     if not photos.is_dir():
         raise ExportError(f"--photos {photos}: expected the folder of the photos, found none")
     found = files_by_sha256(photos)
