@@ -1,10 +1,10 @@
 """The simulated world end to end: photos, scan, anchoring without a person, queries against the truth.
 
-    python -m tools.anchor_simworld [--size short|full] [--seed N] [--ortho] [--work DIR]
+    python -m tools.anchor_simworld [--size short|full] [--seed N] [--work DIR]
 
 1. `featuredb simworld --lidar` writes photos whose GPS has a drone's errors, an airborne scan with
    intensities only, an ortho image of another day, and the same of another town at the same place.
-2. `featuredb ingest photos` places the map by GPS; `featuredb lidar add` adds the scan, coloured by --ortho.
+2. `featuredb ingest photos` places the map by GPS; `featuredb lidar add` adds the scan.
 3. `featuredb anchor --auto` places the map on the scan of the other town, which it must refuse, and then on
    its own.
 4. The map's cameras and the held-out queries are compared with the truth, before and after.
@@ -24,11 +24,14 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.scan_world import ScanWorld, make_scan_world
+from featuredb.simworld.scoring import PoseError, pose_error
 from featuredb.simworld.truth import Truth
 from featuredb.store import Database
-from tools.asked_photos import ask
+from reloc.client import Client
+from reloc.service.options import ServeOptions
+from reloc.service.serve import start_server
 from tools.figures import add_json_option, write_figures
+from tools.worlds.scan_world import ScanWorld, make_scan_world
 
 _ROOT = Path(__file__).resolve().parent.parent
 
@@ -44,9 +47,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         mapped = work / f"mapped-{args.size}-{args.seed}"
         if not mapped.exists():
             featuredb("ingest", "photos", str(mapped), str(world.world.folder / "drone"), "--quiet")
-        refused = anchored(work, mapped, world, args.ortho, other=True)[1]
-        database, placed = anchored(work, mapped, world, args.ortho, other=False)
-        queries = world.world.images("queries") if args.queries else []
+        refused = anchored(work, mapped, world, other=True)[1]
+        database, placed = anchored(work, mapped, world, other=False)
+        queries = world.world.images("queries")
         say = sys.stdout.write
         say(f"scan of another town: {'refused' if not refused else 'PLACED, which is wrong'}\n")
         figures: dict[str, float] = {"placed": int(placed), "other_placed": int(refused)}
@@ -58,14 +61,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0 if placed and not refused else 1
 
 
-def anchored(work: Path, mapped: Path, world: ScanWorld, ortho: bool, *, other: bool) -> tuple[Path, bool]:
+def anchored(work: Path, mapped: Path, world: ScanWorld, *, other: bool) -> tuple[Path, bool]:
     """A copy of the database with one of the scans, anchored; and whether the map was placed."""
-    database = work / f"anchored-{'other' if other else 'own'}-{'ortho' if ortho else 'intensity'}"
+    database = work / f"anchored-{'other' if other else 'own'}-intensity"
     shutil.rmtree(database, ignore_errors=True)
     shutil.copytree(mapped, database)
-    scan, image = (world.other_scan, world.other_ortho) if other else (world.scan, world.ortho)
-    coloured = ("--ortho", str(image)) if ortho else ()
-    featuredb("lidar", "add", str(database), str(scan), *coloured)
+    featuredb("lidar", "add", str(database), str(world.other_scan if other else world.scan))
     map_id = Database.open(database).snapshot().maps()[0].map_id
     photos, out = world.world.folder / "drone", work / f"{database.name}-report"
     words = ("anchor", str(database), map_id, "--photos", str(photos), "--out", str(out), "--auto", "--quiet")
@@ -76,7 +77,7 @@ def judged(database: Database, truth: Truth, queries: Sequence[Path]) -> dict[st
     """Errors of the map's cameras and of what is answered to queries."""
     snapshot = database.snapshot()
     metres, degrees = camera_errors(snapshot.load_map(snapshot.maps()[0].map_id), truth)
-    answers = [a.error for a in ask(database, truth, queries).values() if a is not None] if queries else []
+    answers = ask(database, truth, queries)
     asked_m = [e.position_m for e in answers] or [float("nan")]
     return {
         "cameras_m": float(np.median(metres)),
@@ -87,6 +88,26 @@ def judged(database: Database, truth: Truth, queries: Sequence[Path]) -> dict[st
         "queries_m": float(np.median(asked_m)),
         "queries_largest_m": max(asked_m),
     }
+
+
+def ask(database: Database, truth: Truth, photos: Sequence[Path]) -> list[PoseError]:
+    """Errors of what a server answers to photos of the world."""
+    with (
+        start_server(database, ServeOptions(listen=("tcp/127.0.0.1:0",))) as server,
+        Client(server.endpoints[0]) as client,
+    ):
+        replies = {photo: client.localise(photo, timeout_s=60.0).utm for photo in photos}
+    return [
+        pose_error(
+            truth,
+            f"{photo.parent.name}/{photo.name}",
+            utm.epsg,
+            (utm.easting, utm.northing, utm.height),
+            utm.cam_from_utm_xyzw,
+        )
+        for photo, utm in replies.items()
+        if utm is not None
+    ]
 
 
 def camera_errors(feature_map: FeatureMap, truth: Truth) -> tuple[FloatArray, FloatArray]:
@@ -123,8 +144,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--size", choices=("short", "full"), default="short")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--ortho", action="store_true", help="colour the scan by the ortho image")
-    parser.add_argument("--queries", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--workers", type=int, default=0, help="processes that render photos; default: cores")
     parser.add_argument("--work", type=Path, default=None, help="keep world, databases and reports there")
     parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")

@@ -26,7 +26,6 @@ from reloc.localise.result import LocalisedPose
 # An answer, and the true cam_from_local in the frame of the answer.
 Pair = tuple[LocalisedPose, Rigid3]
 
-COVERAGE = (0.58, 0.78)  # of a radius that claims 68 %
 _STEP_S = 3.1  # between the survey's photos
 _SURVEY_SIGMA_M = 0.02  # as the demo ingests exact positions
 _FLIGHTS_FOR_SIGMA = 2000  # drawn to measure a receiver's own standard deviations to about 2 %
@@ -72,16 +71,6 @@ class Coverage:
     horizontal: float
     vertical: float
     orientation: float
-
-    def verdict(self) -> str:
-        """ "holds" if both position radii hold what they claim, give or take ten points.
-
-        Otherwise "too sure" if one of them holds less, or "too cautious" if both hold enough and one more.
-        """
-        shares = (self.horizontal, self.vertical)
-        if min(shares) < COVERAGE[0]:
-            return "too sure"
-        return "holds" if max(shares) <= COVERAGE[1] else "too cautious"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

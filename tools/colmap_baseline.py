@@ -5,7 +5,7 @@
 COLMAP is pycolmap with its defaults: SIFT, exhaustive matching, incremental mapping of every picture in the
 folder. Ours is `featuredb ingest photos` into a new database, and what is read back from it: maps, placed or
 not; with `--no-positions` of copies without any position (JPEG). Prints the photos of COLMAP's largest model,
-how many of these are in our largest map, and the time of both; exit code 1 below `--least-share`. COLMAP's
+how many of these are in our largest map, and the time of both. COLMAP's
 result stays in the work folder and is made once.
 """
 
@@ -73,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if missing:
         sys.stdout.write(f"of COLMAP's not in ours: {', '.join(missing)}\n")
     write_figures(args.json, figures)
-    return 0 if figures["share"] >= args.least_share else 1
+    return 0
 
 
 def pictures(folder: Path) -> list[str]:
@@ -122,7 +122,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--no-positions", action="store_true")
     parser.add_argument("--work", type=Path, required=True, help="where COLMAP's result is kept")
-    parser.add_argument("--least-share", type=float, default=0.9, help="of COLMAP's largest model in ours")
     add_json_option(parser)
     return parser.parse_args(argv)
 

@@ -12,7 +12,7 @@
 4. `featuredb track` of every film, without being told a lens. A frame's errors are inside their bounds where
    all six together are in the region that the stated covariance gives 95 %.
 
-Prints what holds, writes community_films.json. Exit code 0 if everything holds.
+Prints the maps and tracks.
 """
 
 import argparse
@@ -31,13 +31,10 @@ from tools.anchor_simworld import featuredb
 from tools.figures import add_json_option, write_figures
 from tools.film_folder import FilmsTruth, place_scene, write_films, write_truth
 from tools.film_maps import FilmMaps, keyframe_to_pick_in, read_film_maps
-from tools.film_scripts import Script, six_films
+from tools.film_scripts import six_films
 from tools.film_tracks import JudgedTrack, judge_track, track_figures
-from tools.growth_common import Verdict, conclude, say, table
+from tools.growth_common import say, table
 from tools.picked import place_by_picks, read_scan
-
-_TRACKED = 0.9  # of the place's frames, inside their bounds
-_WRONG_M = 1.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -53,72 +50,27 @@ def main(argv: Sequence[str] | None = None) -> int:
         seconds = _ingest(made, inputs / "films", work)
     found = read_film_maps(made, work / "report", truth)
     say(found.as_text())
-    verdicts = map_verdicts(found, scripts)
     figures: dict[str, Any] = found.figures(scripts) | {"ingest_s": seconds, "placed": 0}
     if found.of_place:
         database = work / "placed"
         shutil.rmtree(database, ignore_errors=True)
         shutil.copytree(made, database)
         placed = _placed(database, found, truth, _scan(inputs, args.seed), work, args.seed)
-        verdicts.append(Verdict(name="placed", text="by six picks in one frame", holds=placed))
         figures["placed"] = int(placed)
         tracks = _tracked(database, inputs / "films", work, truth) if placed else []
         figures |= track_figures(tracks)
-        verdicts += track_verdicts(tracks)
+        sys.stdout.write(track_table(tracks))
     write_figures(args.json, figures)
-    return conclude(args.work, f"community_films-{args.seed}", verdicts, figures)
+    return 0
 
 
-def map_verdicts(found: FilmMaps, scripts: Sequence[Script]) -> list[Verdict]:
-    """The lines about maps."""
-    figures = found.figures(scripts)
-    shots, mapped = figures["place_shots"], figures["shots_in_maps"]
-    foreign, silent = figures["foreign_in_maps"], figures["lost_without_reason"]
-    return [
-        Verdict(
-            name="shots of the place",
-            text=f"{mapped} of {shots} in {figures['place_maps']} maps of it, all wanted",
-            holds=mapped == shots,
-        ),
-        Verdict(
-            name="other town, titles, black",
-            text=f"{foreign} keyframes in maps of the place, none wanted",
-            holds=foreign == 0,
-        ),
-        Verdict(
-            name="lost",
-            text=f"{silent} shots or keyframes in no map and without a reason, none wanted",
-            holds=silent == 0,
-        ),
-    ]
-
-
-def track_verdicts(tracks: Sequence[JudgedTrack]) -> list[Verdict]:
-    """The lines about tracks."""
+def track_table(tracks: Sequence[JudgedTrack]) -> str:
+    """A line for each film."""
     rows = [
         (t.film, t.frames, len(t.metres), t.inside, t.foreign, *track_figures([t]).values()) for t in tracks
     ]
     head = ("film", "frames", "tracked", "inside", "foreign", *track_figures([]))
-    sys.stdout.write(table(rows, head) + "\n" if rows else "")
-    figures = track_figures(tracks)
-    largest = figures["largest_m"]
-    return [
-        Verdict(
-            name="tracked inside their bounds",
-            text=f"{figures['inside_share']:.1%} of {figures['place_frames']} frames of the place "
-            f"({figures['tracked_share']:.1%} tracked), {_TRACKED:.0%} wanted; median "
-            f"{figures['median_m']:.3f} m, 95 % {figures['p95_m']:.3f} m",
-            holds=figures["inside_share"] >= _TRACKED,
-        ),
-        Verdict(
-            name="wrong", text=f"largest {largest:.2f} m, under {_WRONG_M:g} wanted", holds=largest < _WRONG_M
-        ),
-        Verdict(
-            name="tracked elsewhere",
-            text=f"{figures['foreign_tracked']} frames that do not show the place, none wanted",
-            holds=bool(tracks) and figures["foreign_tracked"] == 0,
-        ),
-    ]
+    return table(rows, head) + "\n" if rows else ""
 
 
 def _ingest(database: Path, films: Path, work: Path) -> float:

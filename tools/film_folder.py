@@ -1,12 +1,8 @@
 """Draws the films of scripts into a folder, and the truth of every frame into a file beside it."""
 
 import json
-import multiprocessing
-import os
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +14,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from featuredb.simworld.world import WorldOptions
+from featuredb.simworld.world import WorldOptions, other_town_of, town_of
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
 from tools.film_scripts import HEIGHT, RATE_HZ, WIDTH, Kind, Piece, Script
-from tools.worlds.film_frame import Exposure, draw_frame
+from tools.worlds.film_frame import Exposure, draw_frame, in_order
 from tools.worlds.flight_path import FlightPath
 
 _FORMAT = 1  # raised when the same scripts give other films
-_OTHER_SEED = 1000
 _SAMPLES = 1
-_CHUNK = 5  # frames that travel to a process at a time
 _CARD = (38, 30, 26)
 
 
@@ -68,7 +61,7 @@ def write_films(folder: Path, scripts: tuple[Script, ...], workers: int = 0) -> 
             continue
         quality = VideoWriterOptions(crf=script.crf, preset="veryfast")
         with VideoWriter(file, width=WIDTH, height=HEIGHT, fps=RATE_HZ, options=quality) as writer:
-            for picture in _pictures(script, workers):
+            for picture in in_order(partial(film_picture, script), script.frames, workers):
                 writer.write(picture)
         known[file.name] = stamp
         stamps.write_text(json.dumps(known) + "\n", encoding="utf-8")
@@ -126,10 +119,8 @@ def place_scene(seed: int) -> Scene:
 
 @lru_cache(maxsize=2)
 def _scene(seed: int, kind: Kind) -> Scene:
-    size = WorldOptions.short(seed).town_size_m
-    if kind == "place":
-        return make_town(seed, size_m=size)
-    return make_town(seed + _OTHER_SEED, name="other town", size_m=size, place=OTHER_TOWN_PLACE)
+    world = WorldOptions.short(seed)
+    return town_of(world) if kind == "place" else other_town_of(world)
 
 
 @lru_cache(maxsize=8)
@@ -157,22 +148,3 @@ def _with_logo(picture: Image8, bar: int) -> Image8:
     font = cv2.FONT_HERSHEY_DUPLEX
     cv2.putText(drawn, "SKY TV", (right - 120, low), font, 0.95, (245, 245, 245), 2, cv2.LINE_AA)
     return np.asarray(cv2.addWeighted(drawn, 0.75, picture, 0.25, 0.0), dtype=np.uint8)
-
-
-def _pictures(script: Script, workers: int) -> Iterator[Image8]:
-    """All frames in their order, from a pool of processes."""
-    count = workers or os.cpu_count() or 1
-    # Spawned, not forked: the caller may have threads that a fork would cut off.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=cv2.setNumThreads, initargs=(1,)) as pool:
-        chunks = range(0, script.frames, _CHUNK)
-        ahead = 4 * count
-        waiting = [pool.submit(_chunk, script, first) for first in chunks[:ahead]]
-        for k in range(len(chunks)):
-            yield from waiting.pop(0).result()
-            if k + ahead < len(chunks):
-                waiting.append(pool.submit(_chunk, script, chunks[k + ahead]))
-
-
-def _chunk(script: Script, first: int) -> list[Image8]:
-    return [film_picture(script, i) for i in range(first, min(first + _CHUNK, script.frames))]

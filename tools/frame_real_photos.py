@@ -1,7 +1,7 @@
 """Real photos registered to a real scan, one by one, from their EXIF alone and from priors that are wrong.
 
     python -m tools.frame_real_photos SCAN.laz PHOTO_FOLDER --lens OPENCV:fx,fy,cx,cy,k1,k2,p1,p2 \\
-        [--photos NAME ...] [--refine] [--json FILE]
+        [--photos NAME ...] [--json FILE]
 
 Two registrations of each photo:
 
@@ -9,8 +9,7 @@ Two registrations of each photo:
 - `wrong`: the pose found so, made wrong by 15 m and 10 degrees in random directions.
 
 Both have to end at one pose; the table prints how far apart they are, in metres and degrees, with inliers,
-wall and CPU seconds and the time by stage. Exit code 0 if all were accepted, agree within 0.3 m and 0.25
-degrees, and none of the second kind took more than --max-s of CPU time divided by two cores.
+wall and CPU seconds and the time by stage.
 """
 
 import argparse
@@ -36,7 +35,6 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from tools.figures import add_json_option, write_figures
-from tools.intensity_refinement import refine_by_intensity
 
 _SIGMA_M, _SIGMA_DEG = 15.0 / np.sqrt(3.0), 10.0 / np.sqrt(3.0)
 
@@ -46,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     cloud = read_cloud(args.scan, args.epsg)
     options = FrameOptions(threads=2)
     names = args.photos or sorted(p.name for p in args.folder.iterdir() if p.suffix.lower() == ".jpg")
-    passed, accepted, apart, seconds = True, 0, [], []
+    accepted, apart, seconds = 0, [], []
     for number, name in enumerate(names):
         data = (args.folder / name).read_bytes()
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -55,24 +53,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         image = np.asarray(image, dtype=np.uint8)
         camera = lens(args.lens, image.shape[1], image.shape[0])
         first, _ = _timed(name, "exif", image, camera, exif_prior(data, cloud), cloud, options, None)
-        passed &= first.accepted
         if first.cam_from_local is None:
             continue
         wrong = wrong_prior(first.cam_from_local, np.random.default_rng(number))
         second, cpu_s = _timed(name, "wrong", image, camera, wrong, cloud, options, first.cam_from_local)
         seconds.append(cpu_s)
-        if args.refine and first.cam_from_local is not None:
-            _tell_refined(name, image, camera, first.cam_from_local, cloud)
         accepted += first.accepted and second.accepted
-        passed &= second.cam_from_local is not None and cpu_s <= 2.0 * args.max_s
         if second.cam_from_local is not None:
             apart.append(_apart(second.cam_from_local, first.cam_from_local))
-            passed &= apart[-1][0] <= 0.3 and apart[-1][1] <= 0.25
     figures: dict[str, float] = {"photos": len(names), "accepted": accepted}
     for at, name in enumerate(("apart_m", "apart_deg")):
         figures[f"largest_{name}"] = max((one[at] for one in apart), default=float("nan"))
     write_figures(args.json, figures | {"cpu_s": float(np.median(seconds or [np.nan]))})
-    return 0 if passed else 1
+    return 0
 
 
 def _timed(
@@ -99,19 +92,6 @@ def _timed(
     )
     sys.stdout.flush()
     return found, cpu_s
-
-
-def _tell_refined(
-    name: str, image: NDArray[np.uint8], camera: Camera, pose: Rigid3, cloud: PointCloud
-) -> None:
-    """How far the refinement by intensities moves a registered frame."""
-    start = time.perf_counter()
-    refined = refine_by_intensity(image, camera, pose, cloud, "rgb")
-    metres, degrees = _apart(refined.cam_from_local, pose)
-    sys.stdout.write(
-        f"{name:<14} refined by intensities: moved {metres:.3f} m {degrees:.3f} deg, "
-        f"{time.perf_counter() - start:.1f} s {refined.message}\n"
-    )
 
 
 def read_cloud(path: Path, epsg: int) -> PointCloud:
@@ -182,8 +162,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--lens", required=True, metavar="MODEL:PARAMS", help="COLMAP's model and parameters")
     parser.add_argument("--epsg", type=int, default=32615, help="UTM zone of the scan")
     parser.add_argument("--photos", nargs="+", default=[], metavar="NAME")
-    parser.add_argument("--refine", action="store_true", help="and refine by intensities")
-    parser.add_argument("--max-s", type=float, default=10.0, help="seconds on two cores")
     add_json_option(parser)
     return parser.parse_args(argv)
 

@@ -1,5 +1,6 @@
-"""What the programs that measure growth share: an anchored database, contributions, errors, a plan."""
+"""What the programs that measure growth share: an anchored database, contributions, errors."""
 
+import argparse
 import json
 import logging
 import shutil
@@ -13,8 +14,6 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-import matplotlib.pyplot as plt
 import numpy as np
 
 from featuredb.features.extractor import ExtractorOptions
@@ -36,12 +35,9 @@ from tools.figures import write_figures
 from tools.growth_gates import WRONG_M, recorded
 from tools.worlds.album_files import TABLE_FILES, AlbumFact, read_facts
 
-mpl.use("Agg")  # no display is needed
-
 # The survey's receivers: 1.5 and 2.5 cm of noise, and what the reconstruction adds.
 _SURVEY_SIGMA_M = (0.02, 0.03)
 _UNSAID_M = 30.0  # accuracy of a geotag that names none
-_COLOURS = ("tab:blue", "tab:green", "tab:orange", "tab:purple", "tab:brown", "tab:pink")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,6 +100,19 @@ class Verdict:
     name: str
     text: str
     holds: bool
+
+
+def growth_arguments(doc: str | None, name: str, seed: int) -> argparse.ArgumentParser:
+    """What the programs of made worlds take."""
+    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
+    parser.add_argument("--out", type=Path, default=Path(f"growth-{name}"))
+    parser.add_argument("--size", choices=("short", "full"), default="full")
+    parser.add_argument("--seed", type=int, default=seed)
+    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
+    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
+    return parser
 
 
 def say(text: str) -> None:
@@ -310,37 +319,3 @@ def failures(report: GrowthReport) -> int:
 
 def none_failed(count: int) -> Verdict:
     return Verdict(name="no step failed", text=f"{count} photos lost by an exception", holds=count == 0)
-
-
-def plan_view(
-    path: Path, album: Album, found: Sequence[Registered], title: str, among: Sequence[str]
-) -> None:
-    """Truth, places and errors from above: generations by colour, crosses where nothing is registered."""
-    figure, axis = plt.subplots(figsize=(12, 9), layout="constrained")
-    in_map = {r.fact.name for r in found}
-    missed = [
-        i.cam_from_local.center
-        for n, i in album.truth.images.items()
-        if n not in in_map and album.facts[n].kind in among
-    ]
-    if missed:
-        at = np.array(missed)
-        axis.plot(at[:, 0], at[:, 1], "x", color="0.6", markersize=4, label=f"not registered ({len(at)})")
-    for generation in sorted({r.generation for r in found}):
-        mine = [r for r in found if r.generation == generation and r.offset_m is not None]
-        true = np.array([album.truth.images[r.fact.name].cam_from_local.center for r in mine]).reshape(-1, 3)
-        colour = _COLOURS[generation % len(_COLOURS)]
-        word = "anchor" if generation == 0 else f"generation {generation}"
-        axis.plot(true[:, 0], true[:, 1], ".", color=colour, label=f"{word} ({len(mine)})")
-        for r, t in zip(mine, true, strict=True):
-            assert r.offset_m is not None
-            wrong, held = r.wrong, r.status != "active"
-            end = t + r.offset_m * (1.0 if wrong else 20.0)
-            axis.plot([t[0], end[0]], [t[1], end[1]], "-", color="red" if wrong else colour, linewidth=1)
-            if held:
-                axis.plot(*t[:2], "s", color=colour, markersize=7, fillstyle="none")
-    axis.set(title=f"{title}; errors x 20, wrong ones red and as they are; squares: quarantined")
-    axis.set_aspect("equal")
-    axis.legend(loc="upper left", fontsize=8)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)

@@ -1,17 +1,13 @@
 """Twelve people's photos of a town that a survey has mapped in part: how many register, and how well?
 
-    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--survey 9 13 100 14] [--alike 30]
+    python -m tools.growth_community --out DIR [--size full] [--seed 1] [--alike 30]
 
 The world is that of `tools.worlds.community`: geotags with 30 m of error per axis, a tenth of them
 wrong by kilometres; another town's photos, re-uploads, rooms and faces among them. The survey is ingested
 with the accuracy of its receiver. All other photos are contributed and grown at once. A few landmarks have
 most of the photos, as on photo sites; with --alike 30, thirty sights have nearly as many each.
 
-With --scan an airborne scan of the town is in store, and what grows is compared with it
-(`ingest/growth/trust/scan_check.py`).
-
-Prints what became of each kind of photo, by kind, owner and geotag, and by how much of what it shows the
-survey has mapped; writes community.json and plan.png.
+Prints what became of each kind of photo, by kind, owner and geotag; writes community.json.
 Everything is kept in DIR and goes on where it was. Exit code 0 if at least 70 % of the town's photos are in
 active maps with a median error of at most 0.30 m, none of another town or of nowhere, and none is wrong by
 more than 2 m.
@@ -22,18 +18,9 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from featuredb.lidar.add import add_scan
-from featuredb.simworld.camera.photograph import render_depth
-from featuredb.simworld.laser.airborne import scan_town
-from featuredb.simworld.laser.scan_file import write_scan
-from featuredb.store import Database
-from featuredb.store.scans import has_scans
 from ingest.growing import grow_candidates
 from tools.growth_common import (
     Album,
@@ -44,10 +31,10 @@ from tools.growth_common import (
     failures,
     give,
     growing_options,
+    growth_arguments,
     log_to_stderr,
     made,
     none_failed,
-    plan_view,
     recording,
     registered,
     say,
@@ -60,8 +47,6 @@ from tools.worlds.community import CommunityOptions, write_community
 _OWN = ("street", "drone")
 _FOREIGN = ("other_town", "indoor", "portrait")
 _SHARE, _MEDIAN_M = 0.70, 0.30
-_RAYS, _FAR_M, _NEAR_M = 200, 150.0, 4.0  # what a photo shows: across the picture, how far, how near a point
-_SHARES = (0.0, 0.1, 0.3, 0.6, 1.01)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -72,47 +57,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.pieces is not None:
         options = replace(options, pieces=args.pieces)
     name = f"world-{args.size}-{args.seed}-{options.pieces}"
-    if args.survey is not None:
-        lines, per_line, height_m, oblique = args.survey
-        flight = replace(
-            options.flight, lines=lines, per_line=per_line, height_m=float(height_m), oblique=oblique
-        )
-        options = replace(options, flight=flight)
-        name += "-" + "-".join(map(str, args.survey))
     if args.alike is not None:
         options = replace(options, sights=args.alike, zipf=None)
         name += f"-alike-{args.alike}"
-    folder = args.world or args.out / name
-    album = made(write_community, folder, options, args.workers)
+    album = made(write_community, args.out / name, options, args.workers)
     database = anchored(
         args.out / "db", album, "survey", max_features=args.max_features, workers=args.workers
     )
-    if args.scan and not has_scans(database):
-        scan = args.out / "town.laz"
-        write_scan(scan, scan_town(options.scene("home/0/000")))
-        add_scan(database, [scan])
     everything = album.of(*_OWN, *_FOREIGN, "copy")
     give(database, album, everything)
     say(f"{len(everything)} photos contributed")
     growing = growing_options(args.max_features, args.workers, args.budget)
-    if args.min_link is not None:
-        growth = growing.growth
-        grow = replace(
-            growth.grow.grow, refinement=replace(growth.grow.grow.refinement, min_link=args.min_link)
-        )
-        growing = replace(growing, growth=replace(growth, grow=replace(growth.grow, grow=grow)))
     with recording(args.out, album):
         report = grow_candidates(database, growing)
     tell(report)
     found = registered(database, album)
     codes = Counter(p.reason_code for p in report.photos if p.reason_code)
     sys.stdout.write(breakdown(album, found))
-    shares = surveyed_shares(database, album, options)
-    sys.stdout.write(surveyed_table(shares, {r.fact.name for r in found if r.status == "active"}))
     verdicts = [*judge(album, found), none_failed(failures(report))]
-    for status in ("active", "quarantined"):
-        some = [r for r in found if r.status == status]
-        plan_view(args.out / f"plan-{status}.png", album, some, f"community, {status} maps", _OWN)
     figures = {"reasons": dict(codes), "seconds": report.seconds, "rounds": report.rounds}
     return conclude(args.out, "community", verdicts, figures)
 
@@ -148,35 +110,6 @@ def judge(album: Album, found: Sequence[Registered]) -> list[Verdict]:
         ),
         Verdict(name="wrong by more than 2 m", text=f"{len(wrong)}, none wanted", holds=not wrong),
     ]
-
-
-def surveyed_shares(database: Database, album: Album, options: CommunityOptions) -> dict[str, float]:
-    """For each photo of the town, the share of what it truly shows that the survey has points of.
-
-    Up to `_FAR_M`, on rays over the picture; a place counts if a point of the survey is within `_NEAR_M`.
-    """
-    survey = next(m for m in database.snapshot().maps() if m.method == "gps")
-    tree = cKDTree(database.snapshot().load_map(survey.map_id).points_local(album.truth.frame))
-    scene, shares = options.scene("home/0/000"), {}
-    for fact in album.of(*_OWN):
-        true = album.truth.images[fact.name]
-        camera = true.camera.scaled_to(_RAYS, round(_RAYS * true.camera.height / true.camera.width))
-        depth = render_depth(scene, camera, true.cam_from_local).depth
-        v, u = (5 * rows for rows in np.nonzero(depth[::5, ::5] < _FAR_M))
-        xy = camera.unproject(np.stack([u, v], axis=1) + 0.5)
-        seen = np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth[v, u, None]
-        near, _ = tree.query(true.cam_from_local.inverse().act(seen), distance_upper_bound=_NEAR_M)
-        shares[fact.name] = float(np.isfinite(near).sum() / depth[::5, ::5].size)
-    return shares
-
-
-def surveyed_table(shares: dict[str, float], active: set[str]) -> str:
-    """How many photos show how much of the survey, and how many of them are in active maps."""
-    rows = []
-    for low, high in pairwise(_SHARES):
-        those = [name for name, share in shares.items() if low <= share < high]
-        rows.append((f"{low:.0%} to {min(high, 1.0):.0%}", len(those), sum(name in active for name in those)))
-    return table(rows, ("of the photo surveyed", "photos", "active")) + "\n"
 
 
 def breakdown(album: Album, found: Sequence[Registered]) -> str:
@@ -215,29 +148,11 @@ def breakdown(album: Album, found: Sequence[Registered]) -> str:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("growth-community"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
+    parser = growth_arguments(__doc__, "community", seed=1)
     parser.add_argument("--pieces", type=int, default=None, help="of the town's walls; 1: a town of twins")
-    parser.add_argument(
-        "--survey",
-        type=int,
-        nargs=4,
-        default=None,
-        metavar=("LINES", "PHOTOS", "METRES", "OBLIQUE"),
-        help="the anchored flight: lines, photos of each, height, oblique photos around",
-    )
     parser.add_argument(
         "--alike", type=int, default=None, metavar="SIGHTS", help="so many sights, visited nearly alike"
     )
-    parser.add_argument("--scan", action="store_true", help="a scan of the town is in store")
-    parser.add_argument("--min-link", type=float, default=None, help="of photos that hang on others")
     return parser.parse_args(argv)
 
 

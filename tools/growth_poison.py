@@ -16,7 +16,7 @@ Then wrong maps are forced in by hand: every quarantined map with poison, and, s
 honest grown map moved by 3 m under a new id. Answers to the canaries and to honest photos are compared,
 before, while it is in service, and after `retire`: bit for bit, but for the number of the snapshot.
 
-Prints a line per poison; writes poison.json and a plan per poison. Exit code 0 if nothing wrong was promoted
+Prints a line per poison; writes poison.json. Exit code 0 if nothing wrong was promoted
 and every answer came back.
 """
 
@@ -50,11 +50,11 @@ from tools.growth_common import (
     failures,
     give,
     growing_options,
+    growth_arguments,
     log_to_stderr,
     made,
     newest_copy,
     none_failed,
-    plan_view,
     recording,
     registered,
     say,
@@ -99,7 +99,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     world = PoisonOptions.short(args.seed) if args.size == "short" else PoisonOptions(seed=args.seed)
-    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    folder = args.out / f"world-{args.size}-{args.seed}"
     album = made(write_poison, folder, world, args.workers)
     options = growing_options(args.max_features, args.workers, args.budget)
     base = honest_base(args.out / "db", album, args.max_features, options)
@@ -167,7 +167,6 @@ def try_poison(
         tell(report)
         failed += failures(report)
     found = registered(database, album)
-    plan_view(out / f"plan-{name}.png", album, found, poison, (*kinds, "late", "honest"))
     active = [r for r in found if r.status == "active" and r.generation > 0]
     poisoned = {r.map_id for r in active if r.fact.kind in kinds}
     shares = off_shares(database, album, world)
@@ -327,16 +326,8 @@ def outcome_table(outcomes: Sequence[PoisonOutcome]) -> str:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("growth-poison"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=4)
-    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
+    parser = growth_arguments(__doc__, "poison", seed=4)
     parser.add_argument("--poison", action="append", choices=(*POISONS, _ALL), help="only these kinds")
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
     return parser.parse_args(argv)
 
 

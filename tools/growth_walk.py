@@ -10,8 +10,8 @@ survey at the far end is ingested and growth runs again.
 For each step: active maps, how far coverage reaches, the drift that the maps claim (95 %, against the
 anchor), the bound on Earth (95 %, with what the anchor is uncertain by) beside the true error (length of the
 median error of a map's photos) of the map where the two are closest, the photo that is worst, probes
-answered, their errors, how many lie inside their own 95 % ellipsoid. Writes walk.json, walk.png (error and
-bound along the way) and plan-before.png, plan-after.png; everything is kept in DIR, and a run that was
+answered, their errors, how many lie inside their own 95 % ellipsoid. Writes
+walk.json; everything is kept in DIR, and a run that was
 interrupted goes on.
 
 Exit code 0 if: coverage follows for at least 600 m (the default budget ends before); the true drift of every
@@ -20,7 +20,6 @@ the second anchor every probe that is answered is within 0.3 m, and the maps tha
 commit. At no step may a probe be answered more than 2 m off: one that shows land beyond the maps, too.
 """
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -28,7 +27,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import chi2
 
@@ -48,10 +46,10 @@ from tools.growth_common import (
     failures,
     give,
     growing_options,
+    growth_arguments,
     log_to_stderr,
     made,
     none_failed,
-    plan_view,
     recording,
     registered,
     say,
@@ -104,11 +102,11 @@ class Step:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    args = _arguments(argv)
+    args = growth_arguments(__doc__, "walk", seed=2).parse_args(argv)
     log_to_stderr(args.verbose)
     args.out.mkdir(parents=True, exist_ok=True)
     world = WalkOptions.short(args.seed) if args.size == "short" else WalkOptions(seed=args.seed)
-    folder = args.world or args.out / f"world-{args.size}-{args.seed}"
+    folder = args.out / f"world-{args.size}-{args.seed}"
     album = made(write_walk, folder, world, args.workers)
     common = {"max_features": args.max_features, "workers": args.workers}
     database = anchored(args.out / "db", album, "survey", **common)
@@ -119,13 +117,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for batch in batches[len(steps) :]:
         steps.append(take_step(database, album, batch, options))
         log.write_text(json.dumps([asdict(s) for s in steps]) + "\n", encoding="utf-8")
-    before = registered(database, album)
-    if not _has_far(database, album):
-        plan_view(args.out / "plan-before.png", album, before, "walk before the second anchor", ("walk",))
     end, commits = second_anchor(database, album, options, common)
-    plan_view(args.out / "plan-after.png", album, registered(database, album), "walk after it", ("walk",))
     sys.stdout.write(step_table(steps))
-    plot(args.out / "walk.png", steps, end)
     figures: dict[str, Any] = {"steps": [asdict(s) for s in steps], "after": asdict(end), "commits": commits}
     return conclude(args.out, "walk", judge(steps, end, commits, args.budget, world), figures)
 
@@ -303,25 +296,6 @@ def step_table(steps: Sequence[Step]) -> str:
     return table(rows, head) + "\n"
 
 
-def plot(path: Path, steps: Sequence[Step], end: Step) -> None:
-    """Errors of the probes along the way, before and after the second anchor, and the claimed drift."""
-    figure, axis = plt.subplots(figsize=(10, 5), layout="constrained")
-    for step, colour, word in (
-        (steps[-1] if steps else end, "tab:blue", "one anchor"),
-        (end, "tab:green", "two"),
-    ):
-        known = [(p.away_m, p.error_m) for p in step.probes if p.error_m is not None]
-        if known:
-            axis.plot(*zip(*known, strict=True), ".", color=colour, label=f"probes, {word}")
-    axis.plot(
-        [s.reach_m for s in steps], [s.drift_m for s in steps], "r-", label="claimed 95 % of the furthest map"
-    )
-    axis.set(xlabel="distance from the first anchor's edge, m", ylabel="error, m", yscale="log")
-    axis.legend()
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
-
-
 def _along(album: Album, fact: AlbumFact) -> float:
     """Coordinate along the way: the direction from the first survey to the far one."""
     center = album.truth.images[fact.name].cam_from_local.center
@@ -333,28 +307,11 @@ def _along(album: Album, fact: AlbumFact) -> float:
     return float((center[:2] - ends[0]) @ way / np.linalg.norm(way))
 
 
-def _has_far(database: Database, album: Album) -> bool:
-    return any(m.name == "survey_far" for m in database.snapshot().maps())
-
-
 def _read_steps(log: Path) -> list[Step]:
     if not log.exists():
         return []
     rows = json.loads(log.read_text(encoding="utf-8"))
     return [Step(**{**row, "probes": tuple(Probe(**p) for p in row["probes"])}) for row in rows]
-
-
-def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("growth-walk"))
-    parser.add_argument("--size", choices=("short", "full"), default="full")
-    parser.add_argument("--seed", type=int, default=2)
-    parser.add_argument("--world", type=Path, default=None, help="a world of these options, made before")
-    parser.add_argument("--budget", type=float, default=0.5, help="drift budget, metres; default: 0.5")
-    parser.add_argument("--max-features", type=int, default=8000, help="of a photo; default: 8000")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("-v", "--verbose", action="store_true", help="what growth logs, on stderr")
-    return parser.parse_args(argv)
 
 
 if __name__ == "__main__":

@@ -11,8 +11,7 @@ the map. Then twenty photos that the map has not seen are localised by EXIF alon
 For each sigma of the positions: shares of errors of position and orientation inside their 68 % and 95 %
 bounds, over all answers and over the quarter with fewest inliers, and how many lie outside twice their
 99.9 % bound. The answers of one draw share its lens and place, so the shares' own standard deviations are
-taken over draws. Exit code 0 if all shares are within five points (the quarter: within two of those standard
-deviations) and none is outside twice the 99.9 % bound.
+taken over draws.
 """
 
 import argparse
@@ -110,22 +109,20 @@ class LensDraw:
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     figures: dict[str, float] = {}
-    holds = True
     for sigma in args.sigma:
         with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
             seeds = range(args.seed, args.seed + args.draws)
             draws = list(pool.map(partial(drawn, sigma_m=sigma), seeds))
-        found, text, fine = judged(draws)
+        found, text = judged(draws)
         sys.stdout.write(f"positions of {sigma:g} m\n{text}\n")
         sys.stdout.flush()
         figures |= {f"{name}_{100.0 * sigma:g}cm": value for name, value in found.items()}
-        holds &= fine
-    write_figures(args.json, figures | {"holds": float(holds)})
-    return 0 if holds else 1
+    write_figures(args.json, figures)
+    return 0
 
 
-def judged(draws: Sequence[Sequence[AnswerErrors]]) -> tuple[dict[str, float], str, bool]:
-    """Figures of all draws, a table of them, and whether the bounds hold."""
+def judged(draws: Sequence[Sequence[AnswerErrors]]) -> tuple[dict[str, float], str]:
+    """Figures of all draws, and a table of them."""
     answers = [answer for draw in draws for answer in draw]
     quarter = np.quantile([a.inliers for a in answers], 0.25) if answers else 0.0
     figures = {
@@ -133,14 +130,13 @@ def judged(draws: Sequence[Sequence[AnswerErrors]]) -> tuple[dict[str, float], s
         "empty": float(sum(not draw for draw in draws)),
         "answers": float(len(answers)),
     }
-    lines, fine = [], bool(answers)
+    lines = []
     for kind in ("position", "orientation"):
         for level in _LEVELS:
             bound = chi2.ppf(level, 3)
             share, _ = _share(draws, kind, bound, 10**9)
             hardest, deviation = _share(draws, kind, bound, quarter)
             figures |= {f"{kind}_{level * 100:.0f}": share, f"{kind}_{level * 100:.0f}_hardest": hardest}
-            fine &= abs(share - level) <= 0.05 and abs(hardest - level) <= 2.0 * deviation
             lines.append(
                 f"  {kind:<12}{level:>5.0%} bound holds {share:6.1%}, "
                 f"of the hardest quarter {hardest:6.1%} +- {deviation:.1%}"
@@ -148,10 +144,9 @@ def judged(draws: Sequence[Sequence[AnswerErrors]]) -> tuple[dict[str, float], s
         far = sum(getattr(a, kind) > 4.0 * chi2.ppf(0.999, 3) for a in answers)
         middle = float(np.median([getattr(a, kind) for a in answers])) if answers else float("nan")
         figures |= {f"{kind}_far": float(far), f"{kind}_median": middle}
-        fine &= far == 0
         lines.append(f"  {kind:<12}{far} outside twice the 99.9% bound; median {middle:.2f} (2.37 is right)")
     lines.append(f"  {len(answers)} answers of {len(draws)} draws, {figures['empty']:.0f} without a map")
-    return figures, "\n".join(lines), fine
+    return figures, "\n".join(lines)
 
 
 def _share(

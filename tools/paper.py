@@ -26,7 +26,6 @@ from typing import Any
 import numpy as np
 
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.simworld.scan_world import make_scan_world
 from featuredb.store import Database
 from ingest.workspace import default_root
 from reloc.localiser import Localiser
@@ -40,6 +39,7 @@ from tools.made_maps import bare_film, copied, make, photo_names
 from tools.picked import Seen, place_by_picks, read_scan
 from tools.track_evaluation import errors, film_options
 from tools.worlds.film_world import FILM_FILE, FilmTruth, read_film_truth, write_film
+from tools.worlds.scan_world import make_scan_world
 
 _PARTS = ("descriptors", "film", "shares")
 _METHODS = ("SIFT", "SIFT upright", "KAZE upright", "ORB", "FREAK")

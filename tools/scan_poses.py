@@ -1,23 +1,17 @@
 """Poses of photos registered directly to a coloured scan: the truth by which an anchored map is judged.
 
     python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --poses poses.json
-    python -m tools.scan_poses SCAN.laz PHOTO_FOLDER --given poses.json --database DB \\
-        --held-out DJI_0020.JPG DJI_0025.JPG DJI_0030.JPG DJI_0033.JPG
 
-The first registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
+Registers every photo of the folder (tools/scan_to_photo.py, which shares no code with the map, with
 anchoring or with localisation), estimates one camera over all of them, and measures its own accuracy:
 
 - halves of the correspondences: each photo's pose from two disjoint sets of picture blocks;
 - halves of the photos: poses from two disjoint sets of photos, each with a camera of its own. This is the
   larger one, for it shows how far focal length, principal point and height trade.
-
-The second asks `featuredb localise DB` for the held-out photos and prints how far its answers are from the
-poses: east, north, up, rotation. Exit code 0 if the medians are within the limits, else 1.
 """
 
 import argparse
 import json
-import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
@@ -48,17 +42,11 @@ _ROUNDS = ((0, 3), (0, 1, 2, 3, 4), tuple(range(7)))  # lens parameters that are
 def main(argv: Sequence[str] | None = None) -> int:
     args = _arguments(argv)
     cv2.setNumThreads(1)
-    if args.given is None:
-        found = register(args.scan, args.photos, args.crs, args.focal_px)
-        _print_accuracy(found)
-        if args.poses:
-            args.poses.write_text(json.dumps(found, indent=1) + "\n")
-    else:
-        found = json.loads(args.given.read_text())
-    if args.database is None:
-        return 0
-    names = args.held_out or sorted(found["poses"])
-    return compare(found, args.database, [args.photos / name for name in names], args.max_m, args.max_deg)
+    found = register(args.scan, args.photos, args.crs, args.focal_px)
+    _print_accuracy(found)
+    if args.poses:
+        args.poses.write_text(json.dumps(found, indent=1) + "\n")
+    return 0
 
 
 def register(scan_path: Path, folder: Path, crs: str | None, focal_px: float | None) -> dict[str, Any]:
@@ -169,54 +157,6 @@ def _difference(first: list[PosedPicture], second: list[PosedPicture]) -> dict[s
     }
 
 
-def compare(
-    found: dict[str, Any], database: Path, photos: Sequence[Path], max_m: float, max_deg: float
-) -> int:
-    """Print the differences of localised photos from their poses; 0 if the medians are within the limits."""
-    command = [sys.executable, "-m", "featuredb.cli", "localise", str(database), *map(str, photos), "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 1):  # 1: some photo was not localised, which is a row of the table
-        raise SystemExit(f"featuredb localise failed:\n{done.stderr}")
-    answers = {Path(a["image"]).name: a for a in map(json.loads, done.stdout.splitlines())}
-    print(
-        f"{'photo':<16}{'east m':>9}{'north m':>9}{'up m':>9}{'all m':>9}{'deg':>9}{'focal px':>10}  camera"
-    )
-    metres, degrees = [], []
-    for path in photos:
-        answer, truth = answers[path.name], found["poses"].get(path.name)
-        if truth is None or answer["status"] != "localised":
-            metres.append(np.inf)
-            degrees.append(np.inf)
-            print(f"{path.name:<16}  {'no pose by the scan' if truth is None else answer['reason']}")
-            continue
-        utm = answer["utm"]
-        shift = np.array([utm["easting"], utm["northing"], utm["height"]]) - truth["center_grid"]
-        turn = _angle_deg(_rotation(utm["cam_from_utm_xyzw"]), np.array(truth["cam_from_grid_rotation"]))
-        metres.append(float(np.linalg.norm(shift)))
-        degrees.append(turn)
-        camera = answer["camera"]
-        print(
-            f"{path.name:<16}{shift[0]:>9.3f}{shift[1]:>9.3f}{shift[2]:>9.3f}{metres[-1]:>9.3f}{turn:>9.3f}"
-            f"{camera['params'][0]:>10.1f}  {camera['source']}"
-        )
-    median_m, median_deg = float(np.median(metres)), float(np.median(degrees))
-    good = median_m <= max_m and median_deg <= max_deg
-    print(f"median {median_m:.3f} m (at most {max_m:g}), {median_deg:.3f} degrees (at most {max_deg:g})")
-    return 0 if good else 1
-
-
-def _rotation(xyzw: Sequence[float]) -> Floats:
-    """Rotation matrix of a Hamilton quaternion."""
-    x, y, z, w = np.array(xyzw) / np.linalg.norm(xyzw)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def _angle_deg(a: Floats, b: Floats) -> float:
     return float(np.degrees(np.linalg.norm(cv2.Rodrigues(a @ b.T)[0])))
 
@@ -249,11 +189,6 @@ def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--crs", default=None, help="of the scan, where the file names none")
     parser.add_argument("--focal-px", type=float, default=None, help="start; default: 0.6 of the width")
     parser.add_argument("--poses", type=Path, default=None, metavar="FILE", help="write the poses as JSON")
-    parser.add_argument("--given", type=Path, default=None, metavar="FILE", help="poses of an earlier run")
-    parser.add_argument("--database", type=Path, default=None, metavar="DB", help="compare with `localise`")
-    parser.add_argument("--held-out", nargs="+", default=[], metavar="NAME", help="default: all with a pose")
-    parser.add_argument("--max-m", type=float, default=0.30, help="default: 0.30")
-    parser.add_argument("--max-deg", type=float, default=0.25, help="default: 0.25")
     return parser.parse_args(argv)
 
 

@@ -18,7 +18,7 @@ from playwright.sync_api import Page
 
 from featuredb.lidar.add import add_scan
 from featuredb.lidar.options import OrthoChoice
-from featuredb.simworld.scan_world import ORTHO_FILE, SCAN_FILE, ScanWorldOptions, write_lidar
+from featuredb.simworld.scan_world import ORTHO_FILE, SCAN_FILE, write_lidar
 from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
 from reloc.localiser import Localiser
@@ -58,7 +58,7 @@ def make_town(demo: Path, work: Path) -> tuple[Database, Path]:
         shutil.copytree(demo / "db", work / "town.db")
     database = Database.open(work / "town.db")
     if not (work / "lidar" / ORTHO_FILE).exists():
-        write_lidar(work / "lidar", ScanWorldOptions(world=world))
+        write_lidar(work / "lidar", world)
     add_scan(database, [work / "lidar" / SCAN_FILE], ortho=OrthoChoice(path=work / "lidar" / ORTHO_FILE))
     track = work / "film.csv"
     if not track.exists():

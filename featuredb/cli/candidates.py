@@ -4,6 +4,7 @@ import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import Any
 
 from featuredb.cli.common import add_database_argument, format_table, open_database, write_json
@@ -73,7 +74,7 @@ def run_candidates(args: argparse.Namespace) -> int:
         if (args.state is None or c.state == args.state) and _given_by(c, args.owner, args.credit)
     ]
     if args.json:
-        write_json({"candidates": [_as_json(c) for c in shown]})
+        write_json({"candidates": [asdict(c) for c in shown]})
         return 0
     counts = Counter(c.state for c in candidates)
     sys.stdout.write(", ".join(f"{counts[state]} {state}" for state in CANDIDATE_STATES) + "\n")
@@ -132,30 +133,3 @@ def _row(candidate: Candidate) -> tuple[object, ...]:
         round(candidate.size_bytes / 1000),
         about,
     )
-
-
-def _as_json(candidate: Candidate) -> dict[str, Any]:
-    return {
-        "candidate_id": candidate.candidate_id,
-        "sha256": candidate.sha256,
-        "state": candidate.state,
-        "used_by": candidate.used_by,
-        "reason_code": candidate.reason_code,
-        "reason": candidate.reason,
-        "size_bytes": candidate.size_bytes,
-        "width": candidate.width,
-        "height": candidate.height,
-        "contributors": [
-            {
-                "owner": c.owner,
-                "credit": c.credit,
-                "licence": c.licence,
-                "client_id": c.client_id,
-                "at": c.at,
-            }
-            for c in candidate.contributors
-        ],
-        "snapshot": candidate.snapshot,
-        "request": candidate.request,
-        "answer": candidate.answer,
-    }

@@ -12,6 +12,8 @@ from featuredb.errors import InvalidValueError
 from featuredb.plain_json import plain
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from featuredb.store import Database
 
 LONGEST_CELL = 72  # a wider cell makes a table unreadable; csv and json give everything
@@ -109,6 +111,28 @@ def _on_terminal(done: int, total: int) -> None:
 
 def _silent(done: int, total: int) -> None:
     pass
+
+
+def count_bars() -> "Progress":
+    """Bars on stderr that count, with the time gone and the time left; to be used in a `with` block."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+    )
 
 
 def format_table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -7,6 +7,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from featuredb.cli import candidates, lineage
@@ -110,16 +111,8 @@ def _write_unplaced(unplaced: Sequence["UnplacedSummary"]) -> None:
     if not unplaced:
         return
     header = (
-        "map without a place",
-        "name",
-        "status",
-        "metric",
-        "upright",
-        "images",
-        "points",
-        "why",
-        "committed",
-    )
+        "map without a place", "name", "status", "metric", "upright", "images", "points", "why", "committed",
+    )  # fmt: skip
     rows = [
         (
             m.map_id, m.name, m.status, "yes" if m.frame.metric else "no", "yes" if m.frame.upright else "no",
@@ -157,20 +150,7 @@ def run_verify(args: argparse.Namespace) -> int:
 
     report = verify(Database(args.db, storage_options(args)))  # not opened: a damaged log is a finding
     if args.json:
-        write_json(
-            {
-                "ok": report.ok,
-                "version": report.version,
-                "maps": report.maps,
-                "scans": report.scans,
-                "candidates": report.candidates,
-                "canaries": report.canaries,
-                "files": report.files,
-                "rows": report.rows,
-                "problems": [{"where": p.where, "what": p.what} for p in report.problems],
-                "orphans": list(report.orphans),
-            }
-        )
+        write_json({"ok": report.ok, **asdict(report)})
         return 0 if report.ok else 1
     for problem in report.problems:
         sys.stdout.write(f"PROBLEM {problem.where}: {problem.what}\n")

@@ -3,8 +3,9 @@
 import argparse
 import re
 import sys
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,7 +20,7 @@ from featuredb.errors import ExportError
 from featuredb.maps.statuses import MAP_STATUSES, UNPLACED_STATUSES, MapStatus, UnplacedStatus
 
 if TYPE_CHECKING:
-    from featuredb.export.job import Exported, ExportJob
+    from featuredb.export.job import Exported
     from featuredb.export.selection import Selection
 
 # West of Greenwich a box begins with a minus, which argparse takes for an option unless it looks like this.
@@ -32,101 +33,56 @@ class Format:
 
     Attributes:
         text: what it is, for --help.
-        write: imports what it needs itself, so that a missing extra concerns nobody else.
-        options: arguments of its own, by the parser's names; others refuse them.
+        write: module and function in `featuredb.export`; imported when it is wanted, so that a missing extra
+            concerns nobody else. It is given an ExportJob.
+        options: arguments of its own, by the parser's names, which the function is given; others refuse them.
+        given: what it is given besides.
     """
 
     text: str
-    write: Callable[["ExportJob", argparse.Namespace], "Exported"]
+    write: str
     options: tuple[str, ...] = ()
-
-
-def _colmap(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.colmap import write_colmap
-
-    return write_colmap(job, text=args.text)
-
-
-def _las(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.las import write_las_files
-
-    return write_las_files(job, compressed=args.format == "laz")
-
-
-def _ply(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.ply import write_ply_files
-
-    return write_ply_files(job)
-
-
-def _geojson(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.geojson import write_geojson
-
-    return write_geojson(job)
-
-
-def _kml(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.kml import write_kml
-
-    return write_kml(job)
-
-
-def _geopose(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.geopose import write_geopose
-
-    return write_geopose(job)
-
-
-def _opensfm(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.opensfm import write_opensfm
-
-    return write_opensfm(job)
-
-
-def _kapture(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.kapture import write_kapture
-
-    return write_kapture(job)
-
-
-def _exif(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.formats.exif import write_exif
-
-    if args.photos is None:
-        raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")
-    return write_exif(job, args.photos)
-
-
-def _dataset(job: "ExportJob", args: argparse.Namespace) -> "Exported":
-    from featuredb.export.dataset import write_dataset
-
-    return write_dataset(job, with_lidar=args.with_lidar)
+    given: Mapping[str, Any] = field(default_factory=dict)
 
 
 FORMATS: dict[str, Format] = {
     "dataset": Format(
         text="one folder to publish, GeoParquet and more, which `featuredb import` reads",
-        write=_dataset,
+        write="dataset.write:write_dataset",
         options=("with_lidar",),
     ),
     "colmap": Format(
         text="a folder for each map, placed or not: model, database, place",
-        write=_colmap,
+        write="formats.colmap:write_colmap",
         options=("text",),
     ),
-    "las": Format(text="points, a LAS 1.4 file for each UTM zone and height datum", write=_las),
-    "laz": Format(text="the same, compressed", write=_las),
+    "las": Format(
+        text="points, a LAS 1.4 file for each UTM zone and height datum",
+        write="formats.las:write_las_files",
+        given={"compressed": False},
+    ),
+    "laz": Format(
+        text="the same, compressed", write="formats.las:write_las_files", given={"compressed": True}
+    ),
     "ply": Format(
         text="points, a binary PLY file for each UTM zone and datum, or map without a place",
-        write=_ply,
+        write="formats.ply:write_ply_files",
     ),
-    "geojson": Format(text="positions and angles of photos, one file", write=_geojson),
-    "kml": Format(text="photos in space for Google Earth, one file", write=_kml),
-    "geopose": Format(text="OGC GeoPose, a file for each photo", write=_geopose),
-    "opensfm": Format(text="a folder for each map as OpenSfM and OpenDroneMap have it", write=_opensfm),
-    "kapture": Format(text="a folder for each map, placed or not, as kapture 1.1 has it", write=_kapture),
+    "geojson": Format(text="positions and angles of photos, one file", write="formats.geojson:write_geojson"),
+    "kml": Format(text="photos in space for Google Earth, one file", write="formats.kml:write_kml"),
+    "geopose": Format(text="OGC GeoPose, a file for each photo", write="formats.geopose:write_geopose"),
+    "opensfm": Format(
+        text="a folder for each map as OpenSfM and OpenDroneMap have it",
+        write="formats.opensfm:write_opensfm",
+    ),
+    "kapture": Format(
+        text="a folder for each map, placed or not, as kapture 1.1 has it",
+        write="formats.kapture:write_kapture",
+    ),
     "exif": Format(
-        text="copies of the photos with their pose in EXIF and XMP", write=_exif, options=("photos",)
+        text="copies of the photos with their pose in EXIF and XMP",
+        write="formats.exif:write_exif",
+        options=("photos",),
     ),
 }
 _STATUSES = tuple(dict.fromkeys((*MAP_STATUSES, *UNPLACED_STATUSES)))
@@ -212,7 +168,9 @@ def run_export(args: argparse.Namespace) -> int:
         out=args.out,
         told=progress_of_maps(),
     )
-    done = chosen.write(job, args)
+    module, function = chosen.write.split(":")
+    write = getattr(import_module(f"featuredb.export.{module}"), function)
+    done: Exported = write(job, **chosen.given, **{name: getattr(args, name) for name in chosen.options})
     if args.json:
         write_json({"format": args.format, "out": args.out, "version": snapshot.version, **asdict(done)})
         return 0

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import (
     add_command,
+    count_bars,
     format_table,
     open_database,
     storage_options,
@@ -207,28 +208,11 @@ def _register_add(commands: Any) -> None:
 @contextmanager
 def _progress(quiet: bool) -> Iterator[Callable[["Step"], None]]:
     """A callback that draws bars on stderr, if somebody watches."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    console = Console(stderr=True)
-    if quiet or not console.is_terminal:
+    bars = count_bars()
+    if quiet or not bars.console.is_terminal:
         yield lambda step: None
         return
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console) as bars:
+    with bars:
         tasks: dict[str, Any] = {}
 
         def show(step: "Step") -> None:

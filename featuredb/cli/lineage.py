@@ -4,6 +4,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator, Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from featuredb.cli.common import add_as_of_argument, add_database_argument, open_database, write_json
@@ -12,6 +13,7 @@ from featuredb.maps.lineage import MapLineage, describe_lineage, family_of
 if TYPE_CHECKING:
     from featuredb.store import MapSummary, Snapshot
 
+_OF_SUMMARY = ("name", "status", "status_reason", "method", "generation", "parents")
 _DOT_STYLE = {"active": "solid", "quarantined": "dashed", "retired": "dotted"}
 
 
@@ -41,7 +43,11 @@ def run_lineage(args: argparse.Namespace) -> int:
     lineages = snapshot.lineages()
     maps = _wanted(snapshot, args.map_id, include_retired=args.all)
     if args.json:
-        told = [_as_json(summary, lineages[map_id]) for map_id, summary in maps.items()]
+        told = [
+            {name: getattr(summary, name) for name in _OF_SUMMARY}
+            | {"steps": lineages[map_id].steps, **asdict(lineages[map_id])}
+            for map_id, summary in maps.items()
+        ]
         write_json({"snapshot": snapshot.version, "maps": told})
     elif args.dot:
         sys.stdout.writelines(f"{line}\n" for line in draw_dot(maps, lineages))
@@ -119,23 +125,6 @@ def _line(summary: "MapSummary", lineage: MapLineage, drawn_under: str | None) -
     if summary.status != "active":
         parts.append(summary.status + (f": {summary.status_reason}" if summary.status_reason else ""))
     return "; ".join(parts)
-
-
-def _as_json(summary: "MapSummary", lineage: MapLineage) -> dict[str, Any]:
-    return {
-        "map_id": summary.map_id,
-        "name": summary.name,
-        "status": summary.status,
-        "status_reason": summary.status_reason,
-        "method": summary.method,
-        "generation": summary.generation,
-        "parents": summary.parents,
-        "steps": lineage.steps,
-        "anchors": lineage.anchors,
-        "chain": lineage.chain,
-        "drift_m": lineage.drift_m,
-        "budget_m": lineage.budget_m,
-    }
 
 
 def _quoted(text: str) -> str:

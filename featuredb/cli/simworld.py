@@ -5,8 +5,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from featuredb.cli.common import count_bars
+
 if TYPE_CHECKING:
-    from featuredb.simworld.world import World, WorldOptions
+    from featuredb.simworld.world import World
 
 
 def register(subparsers: Any) -> None:
@@ -40,42 +42,21 @@ def run_simworld(args: argparse.Namespace) -> int:
     """Write the world and say what is in it."""
     from rich.console import Console
 
-    from featuredb.simworld.scan_world import ScanWorldOptions, write_lidar
-    from featuredb.simworld.world import WorldOptions
+    from featuredb.simworld.scan_world import write_lidar
+    from featuredb.simworld.world import WorldOptions, write_world
 
     options = WorldOptions.short(args.seed) if args.size == "short" else WorldOptions(seed=args.seed)
     options = replace(options, workers=args.workers, flight=replace(options.flight, gps_error=args.gps_error))
     console = Console(stderr=True)
     if args.lidar:  # first, since it may lack a package
-        write_lidar(args.out, ScanWorldOptions(world=options), lambda name: console.print(f"writing {name}"))
-    world = _write_with_progress(args.out, options)
+        write_lidar(args.out, options, lambda name: console.print(f"writing {name}"))
+    with count_bars() as bars:
+        task = bars.add_task("photos", total=None)
+        world = write_world(
+            args.out, options, lambda done, total: bars.update(task, completed=done, total=total)
+        )
     Console().print(_summary(world, lidar=args.lidar))
     return 0
-
-
-def _write_with_progress(folder: Path, options: "WorldOptions") -> "World":
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    from featuredb.simworld.world import write_world
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("photos", total=None)
-        return write_world(folder, options, lambda done, total: bar.update(task, completed=done, total=total))
 
 
 def _summary(world: "World", *, lidar: bool) -> str:

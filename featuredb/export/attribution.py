@@ -1,21 +1,18 @@
 """Whose photos an export is made of: a table that goes with every export, as licences ask."""
 
-import csv
-import io
-from dataclasses import dataclass
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, TextIO
+from typing import NamedTuple
 from urllib.parse import quote
 
+from featuredb.export.job import write_csv
 from featuredb.export.selection import licence_of
 from featuredb.maps.unplaced_map import AnyMap
 
 ATTRIBUTION = "attribution.csv"
-_COLUMNS = ("map_id", "image", "sha256", "owner", "licence", "capture_time", "source")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attribution:
+class Attribution(NamedTuple):
     """One photo: who made it, under which licence it was given ("" where nobody has said)."""
 
     map_id: str
@@ -43,40 +40,9 @@ def attribution_of(feature_map: AnyMap) -> list[Attribution]:
     ]
 
 
-def attribution_csv(rows: list[Attribution]) -> str:
-    """The rows as CSV with a header: UTF-8, commas, quotes where they are needed."""
-    out = io.StringIO()
-    _writer(out).writerows(_values(row) for row in rows)
-    return out.getvalue()
-
-
-class AttributionFile:
-    """The same, written map by map; use it in a `with` block."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("w", encoding="utf-8", newline="")
-        self._writer = _writer(self._file)
-
-    def add(self, feature_map: AnyMap) -> None:
-        """The photos of a map."""
-        self._writer.writerows(_values(row) for row in attribution_of(feature_map))
-
-    def __enter__(self) -> "AttributionFile":
-        return self
-
-    def __exit__(self, *failed: object) -> None:
-        self._file.close()
-
-
-def _writer(out: TextIO) -> Any:
-    """A CSV writer after the header."""
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(_COLUMNS)
-    return writer
-
-
-def _values(row: Attribution) -> list[str]:
-    return [getattr(row, name) for name in _COLUMNS]
+def write_attribution(folder: Path, rows: Iterable[Attribution]) -> None:
+    """The table of the photos in a folder."""
+    write_csv(folder / ATTRIBUTION, Attribution._fields, rows)
 
 
 def folder_name(map_id: str) -> str:

@@ -1,23 +1,23 @@
 """What every format is given and gives back, and an output that is there whole or not at all."""
 
+import csv
 import json
 import shutil
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, cast
 
 from featuredb.errors import ExportError
-from featuredb.export.selection import Selection, exported_any, exported_maps, selected_any, selected_maps
+from featuredb.export.selection import Selection, exported, selected_any, selected_maps
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 
-_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 Told = Callable[[int, int], None]
 """Called with the number of maps written and their total."""
 
@@ -47,23 +47,19 @@ class ExportJob:
         return selected_any(self.database, self.snapshot, self.selection)
 
     def maps(self) -> Iterator[FeatureMap]:
-        """One in memory at a time, oldest first, telling progress; see `exported_maps`."""
-        return self._telling(
-            exported_maps(self.database, self.snapshot, self.selection), len(self.summaries())
-        )
+        """One in memory at a time, oldest first, telling progress; see `exported`."""
+        return cast("Iterator[FeatureMap]", self._telling(self.summaries()))
 
     def any_maps(self) -> Iterator[AnyMap]:
-        """The same for a format that keeps maps without a place, too; see `exported_any`."""
-        return self._telling(
-            exported_any(self.database, self.snapshot, self.selection), len(self.any_summaries())
-        )
+        """The same for a format that keeps maps without a place, too."""
+        return self._telling(self.any_summaries())
 
-    def _telling(self, maps: Iterator[_Kind], total: int) -> Iterator[_Kind]:
+    def _telling(self, summaries: Sequence[MapSummary | UnplacedSummary]) -> Iterator[AnyMap]:
         done = count(1)
-        for feature_map in maps:
+        for feature_map in exported(self.snapshot, summaries, self.selection.licences):
             yield feature_map
             del feature_map  # or it would stay while the next one is loaded, as it would with `enumerate`
-            self.told(next(done), total)
+            self.told(next(done), len(summaries))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,3 +112,9 @@ def write_json(path: Path, document: dict[str, Any]) -> None:
     path.write_text(
         json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a table with a header: UTF-8, commas, quotes where they are needed."""
+    with path.open("w", encoding="utf-8", newline="") as out:
+        csv.writer(out, lineterminator="\n").writerows([columns, *rows])

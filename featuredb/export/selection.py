@@ -1,9 +1,9 @@
 """Which maps of a snapshot are exported, and what of them: by id, status, place, SQL and licence."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import cast
 
 from featuredb.errors import ExportError, UnplacedMapError
 from featuredb.export.forget import forget, names_of
@@ -15,7 +15,6 @@ from featuredb.store.database import Database
 from featuredb.store.snapshot import MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.sql import SqlSession
 
-_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
 _VERSION = re.compile(r"-v?\d+(\.\d+)*$")
 
 
@@ -73,11 +72,7 @@ def selected_maps(database: Database, snapshot: Snapshot, selection: Selection) 
     return placed
 
 
-KEEP_UNPLACED = (
-    "colmap",
-    "kapture",
-    "ply",
-)  # formats that have a frame of their own
+KEEP_UNPLACED = ("colmap", "kapture", "ply")  # formats that have a frame of their own
 
 
 def selected_any(
@@ -113,41 +108,27 @@ def selected_any(
     return found
 
 
-def exported_maps(database: Database, snapshot: Snapshot, selection: Selection) -> Iterator[FeatureMap]:
-    """The maps as they are exported, oldest first, one in memory at a time.
+def exported(
+    snapshot: Snapshot, maps: Iterable[MapSummary | UnplacedSummary], licences: tuple[str, ...] | None
+) -> Iterator[AnyMap]:
+    """The maps as they are exported, one in memory at a time.
 
     Maps of which no photo has one of the licences are left out.
 
     Raises:
-        ExportError: none is selected, or none is left by its licence.
+        ExportError: none is left by its licence.
     """
-    summaries = selected_maps(database, snapshot, selection)
-    return _some_left(
-        (licensed(snapshot.load_map(m.map_id), selection.licences) for m in summaries), selection
-    )
-
-
-def exported_any(database: Database, snapshot: Snapshot, selection: Selection) -> Iterator[AnyMap]:
-    """The same for a format that keeps maps without a place, too."""
-
-    def part(summary: MapSummary | UnplacedSummary) -> AnyMap | None:
-        if isinstance(summary, UnplacedSummary):
-            return licensed(snapshot.load_unplaced(summary.map_id), selection.licences)
-        return licensed(snapshot.load_map(summary.map_id), selection.licences)
-
-    return _some_left(map(part, selected_any(database, snapshot, selection)), selection)
-
-
-def _some_left(parts: Iterator[_Kind | None], selection: Selection) -> Iterator[_Kind]:
     left = False
-    for part in parts:
+    for summary in maps:
+        # The cast: either kind comes out as it goes in.
+        part: AnyMap | None = licensed(cast("FeatureMap", snapshot.load_any(summary.map_id)), licences)
         if part is not None:
             left = True
             yield part
         del part  # or there would be two maps in memory while the next one is loaded
     if not left:
         raise ExportError(
-            f"expected photos with a licence of {', '.join(selection.licences or ())}, found none in the "
+            f"expected photos with a licence of {', '.join(licences or ())}, found none in the "
             'selected maps; `featuredb sql DB "select licence, count(*) from images group by 1"` lists them'
         )
 

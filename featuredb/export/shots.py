@@ -11,8 +11,6 @@ from featuredb.geo.datum import ellipsoidal_height
 from featuredb.geo.geopose import GeoPose, geopose_from_camera
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
@@ -102,17 +100,15 @@ def pose_covariance(feature_map: FeatureMap, image: MapImage) -> FloatArray:
     Small rotations of the camera (rad) before displacements of its centre (m): the photo's own, relative to
     the map's points, and that of the map's placement. The two are taken for independent.
     """
-    pose: Rigid3 = image.cam_from_local
-    center = pose.center
-    covariance = np.zeros((6, 6))
-    if image.covariance is not None:
-        # The left perturbation of local_from_cam turns about the frame's origin; the centre moves with it.
-        at_center = np.eye(6)
-        at_center[3:, :3] = -skew(center)
-        covariance += at_center @ pose.inverse_covariance(image.covariance) @ at_center.T
+    pose = image.cam_from_local
     by_placement = np.zeros((6, 7))
     by_placement[:3, 1:4] = np.eye(3)
-    by_placement[3:] = point_jacobian(center)
-    covariance += by_placement @ feature_map.placement.covariance @ by_placement.T
-    to_true = np.kron(np.eye(2), feature_map.frame.true_enu_from_enu(center))
-    return np.asarray(to_true @ covariance @ to_true.T, dtype=np.float64)
+    by_placement[3:] = point_jacobian(pose.center)
+    covariance = by_placement @ feature_map.placement.covariance @ by_placement.T
+    if image.covariance is not None:
+        # exp(xi) @ cam_from_local turns the camera by -R' omega and moves its centre by -R' nu.
+        turn = np.kron(np.eye(2), pose.rotation.T)
+        covariance = covariance + turn @ image.covariance @ turn.T
+    to_true = np.kron(np.eye(2), feature_map.frame.true_enu_from_enu(pose.center))
+    covariance = to_true @ covariance @ to_true.T
+    return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)

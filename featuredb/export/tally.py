@@ -9,6 +9,8 @@ from featuredb.export.job import Exported, ExportJob, size_of, whole_or_nothing
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap
 
+_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
+
 
 class ExportTally:
     """Counts of the maps that went through; `exported` is their sum with the bytes on disk."""
@@ -34,24 +36,12 @@ class ExportTally:
         )
 
 
-def folder_for_each_map(job: ExportJob, write: Callable[[Path, FeatureMap], None]) -> Exported:
-    """Make `job.out` with a folder for every selected map, which `write` makes and fills.
+def folder_for_each(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
+    """Make `job.out` with a folder for every map, which `write` makes and fills.
 
     Raises:
-        ExportError: nothing is selected, or there is something at `job.out`; and what `write` raises.
+        ExportError: there is something at `job.out`; and what `write` raises.
     """
-    return _folders(job, job.maps(), write)
-
-
-def folder_for_any_map(job: ExportJob, write: Callable[[Path, AnyMap], None]) -> Exported:
-    """The same for a format that keeps maps without a place, too."""
-    return _folders(job, job.any_maps(), write)
-
-
-_Kind = TypeVar("_Kind", FeatureMap, AnyMap)
-
-
-def _folders(job: ExportJob, maps: Iterable[_Kind], write: Callable[[Path, _Kind], None]) -> Exported:
     tally = ExportTally()
     with whole_or_nothing(job.out) as part:
         part.mkdir()

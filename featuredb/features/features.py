@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import frozen_array
+from featuredb.geometry.arrays import freeze
 
 DESCRIPTOR_SIZE = 128
 
@@ -36,21 +36,12 @@ class Features:
     fingerprint: str
 
     def __post_init__(self) -> None:
-        xy = frozen_array("Features.xy", self.xy, (None, 2), np.float32)
-        n = len(xy)
-        checked: dict[str, NDArray[Any]] = {
-            "xy": xy,
-            "scale": frozen_array("Features.scale", self.scale, (n,), np.float32),
-            "angle": frozen_array("Features.angle", self.angle, (n,), np.float32),
-            "response": frozen_array("Features.response", self.response, (n,), np.float32),
-            "descriptors": frozen_array(
-                "Features.descriptors", self.descriptors, (n, DESCRIPTOR_SIZE), np.uint8
-            ),
-        }
+        freeze(self, np.float32, xy=(None, 2))
+        n = len(self.xy)
+        freeze(self, np.float32, scale=(n,), angle=(n,), response=(n,))
+        freeze(self, np.uint8, descriptors=(n, DESCRIPTOR_SIZE))
         if self.width <= 0 or self.height <= 0:
             raise InvalidValueError(f"Features: expected a size > 0, found {self.width}x{self.height}")
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
 
     def __len__(self) -> int:
         return len(self.xy)

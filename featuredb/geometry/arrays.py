@@ -43,3 +43,14 @@ def frozen_array(
         raise InvalidValueError(f"{name}: expected finite numbers, found NaN or infinity")
     array.setflags(write=False)
     return array
+
+
+def freeze(value: object, dtype: DTypeLike = np.float64, **shapes: tuple[int | None, ...]) -> None:
+    """Put `frozen_array` of each named field, of this shape, in its place in a frozen dataclass.
+
+    Raises:
+        InvalidValueError: as `frozen_array`.
+    """
+    for name, shape in shapes.items():
+        array = frozen_array(f"{type(value).__name__}.{name}", getattr(value, name), shape, dtype)
+        object.__setattr__(value, name, array)

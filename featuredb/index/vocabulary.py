@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.features import DESCRIPTOR_SIZE
-from featuredb.geometry.arrays import frozen_array
+from featuredb.geometry.arrays import freeze
 
 _SHIPPED = "vocabulary.npz"
 _ARRAYS = ("mean", "projection", "words")
@@ -40,10 +40,7 @@ class Vocabulary:
 
     def __post_init__(self) -> None:
         k, d = np.shape(self.words) if np.ndim(self.words) == 2 else (0, 0)
-        shapes = {"mean": (DESCRIPTOR_SIZE,), "projection": (DESCRIPTOR_SIZE, d), "words": (k, d)}
-        for name, shape in shapes.items():
-            value = frozen_array(f"Vocabulary.{name}", getattr(self, name), shape, np.float32)
-            object.__setattr__(self, name, value)
+        freeze(self, np.float32, mean=(DESCRIPTOR_SIZE,), projection=(DESCRIPTOR_SIZE, d), words=(k, d))
         if not k or not d:
             raise InvalidValueError("Vocabulary.words: expected (k, d) with k, d > 0, found none")
 

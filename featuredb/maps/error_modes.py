@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 
 _KEY = "error_modes"
 LENS_SIZE = 8  # parameters of OPENCV
@@ -35,10 +35,8 @@ class ErrorModes:
     lenses: FloatArray
 
     def __post_init__(self) -> None:
-        poses = frozen_array("ErrorModes.poses", self.poses, (len(self.image_id), 6, None))
-        lenses = frozen_array("ErrorModes.lenses", self.lenses, (None, LENS_SIZE, poses.shape[2]))
-        object.__setattr__(self, "poses", poses)
-        object.__setattr__(self, "lenses", lenses)
+        freeze(self, poses=(len(self.image_id), 6, None))
+        freeze(self, lenses=(None, LENS_SIZE, self.poses.shape[2]))
 
     def as_provenance(self) -> dict[str, Any]:
         """To be merged into a map's provenance: numbers as base64 of little-endian float32."""

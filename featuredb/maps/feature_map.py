@@ -18,7 +18,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import check_datum
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import zone_of
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze, frozen_array
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3
@@ -124,17 +124,11 @@ def check_points(points: PointColumns, coordinates: str) -> None:
     Args:
         coordinates: name of the field with the (n, 3) coordinates, which decides how many points there are.
     """
-    kind = type(points).__name__
-    xyz = frozen_array(f"{kind}.{coordinates}", getattr(points, coordinates), (None, 3))
-    n = len(xyz)
-    for name, value in (
-        (coordinates, xyz),
-        ("rgb", frozen_array(f"{kind}.rgb", points.rgb, (n, 3), np.uint8)),
-        ("track_length", frozen_array(f"{kind}.track_length", points.track_length, (n,), np.int32)),
-        ("error_px", frozen_array(f"{kind}.error_px", points.error_px, (n,), np.float32)),
-        ("covariance", frozen_array(f"{kind}.covariance", points.covariance, (n, 6), np.float32)),
-    ):
-        object.__setattr__(points, name, value)
+    freeze(points, **{coordinates: (None, 3)})
+    n = len(getattr(points, coordinates))
+    freeze(points, np.uint8, rgb=(n, 3))
+    freeze(points, np.int32, track_length=(n,))
+    freeze(points, np.float32, error_px=(n,), covariance=(n, 6))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,24 +175,12 @@ class MapObservations:
     descriptors: NDArray[np.uint8]
 
     def __post_init__(self) -> None:
-        index = frozen_array("MapObservations.point_index", self.point_index, (None,), np.int64)
-        m = len(index)
-        for name, value in (
-            ("point_index", index),
-            ("image_id", frozen_array("MapObservations.image_id", self.image_id, (m,), np.int32)),
-            ("xy", frozen_array("MapObservations.xy", self.xy, (m, 2), np.float32)),
-            ("scale", frozen_array("MapObservations.scale", self.scale, (m,), np.float32)),
-            ("angle", frozen_array("MapObservations.angle", self.angle, (m,), np.float32)),
-            (
-                "has_descriptor",
-                frozen_array("MapObservations.has_descriptor", self.has_descriptor, (m,), np.bool_),
-            ),
-            (
-                "descriptors",
-                frozen_array("MapObservations.descriptors", self.descriptors, (m, 128), np.uint8),
-            ),
-        ):
-            object.__setattr__(self, name, value)
+        freeze(self, np.int64, point_index=(None,))
+        m = len(self.point_index)
+        freeze(self, np.int32, image_id=(m,))
+        freeze(self, np.float32, xy=(m, 2), scale=(m,), angle=(m,))
+        freeze(self, np.bool_, has_descriptor=(m,))
+        freeze(self, np.uint8, descriptors=(m, 128))
 
     def __len__(self) -> int:
         return len(self.point_index)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import frozen_array
+from featuredb.geometry.arrays import freeze
 
 UNCLASSIFIED = 1  # ASPRS class of points that nobody classified
 
@@ -37,17 +37,9 @@ class CloudNodes:
 
     def __post_init__(self) -> None:
         k = len(self.start)
-        for name, shape, dtype in (
-            ("start", (k,), np.int64),
-            ("count", (k,), np.int64),
-            ("level", (k,), np.int16),
-            ("spacing_m", (k,), np.float32),
-            ("box_min", (k, 3), np.float32),
-            ("box_max", (k, 3), np.float32),
-        ):
-            object.__setattr__(
-                self, name, frozen_array(f"CloudNodes.{name}", getattr(self, name), shape, dtype)
-            )
+        freeze(self, np.int64, start=(k,), count=(k,))
+        freeze(self, np.int16, level=(k,))
+        freeze(self, np.float32, spacing_m=(k,), box_min=(k, 3), box_max=(k, 3))
         ends = np.concatenate([[0], self.start + self.count])
         if (self.count < 1).any() or not np.array_equal(ends[:-1], self.start):
             raise InvalidValueError("CloudNodes: expected non-empty runs that follow each other from row 0")

@@ -9,7 +9,7 @@ import numpy as np
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.shot import Shot
@@ -38,11 +38,9 @@ class TrueImage:
     gps_error_m: FloatArray | None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "utm", frozen_array("TrueImage.utm", self.utm, (3,)))
+        freeze(self, utm=(3,))
         if self.gps_error_m is not None:
-            object.__setattr__(
-                self, "gps_error_m", frozen_array("TrueImage.gps_error_m", self.gps_error_m, (3,))
-            )
+            freeze(self, gps_error_m=(3,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -155,7 +155,8 @@ def town_of(options: WorldOptions) -> Scene:
 
 
 @lru_cache(maxsize=2)
-def _other_town_of(options: WorldOptions) -> Scene:
+def other_town_of(options: WorldOptions) -> Scene:
+    """A town of another place, which no map of the world's town knows."""
     return make_town(
         options.seed + 1000, name="other town", size_m=options.town_size_m, place=OTHER_TOWN_PLACE
     )
@@ -163,7 +164,7 @@ def _other_town_of(options: WorldOptions) -> Scene:
 
 @lru_cache(maxsize=16)
 def _shots(options: WorldOptions, group: str, other: bool = False, seed_shift: int = 0) -> tuple[Shot, ...]:
-    scene = _other_town_of(options) if other else town_of(options)
+    scene = other_town_of(options) if other else town_of(options)
     seed = options.seed + seed_shift
     if group == "drone":
         return tuple(survey(scene, options.flight, seed))
@@ -227,7 +228,7 @@ def _negative(task: _Task) -> bytes:
     width = options.query_width
     if kind == "other_town":
         shot = replace(_shots(options, "queries", other=True, seed_shift=_VISITORS_SEED)[task.index])
-        return photo_bytes(_other_town_of(options), shot, options.sensor)
+        return photo_bytes(other_town_of(options), shot, options.sensor)
     if kind in ("mirrored", "blurred"):
         shot = _shots(options, "queries", seed_shift=_VISITORS_SEED)[task.index]
         photo = take_photo(town_of(options), shot, options.sensor)

@@ -18,7 +18,7 @@ import pyarrow.dataset as ds
 from featuredb.errors import CanaryNotFoundError, InvalidValueError, StoreError
 from featuredb.geo.datum import check_datum
 from featuredb.geo.utm import zone_of
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 from featuredb.store.commits import CHANGED, OPERATION, new_write_id
 from featuredb.store.database import Database
 from featuredb.store.delta import Table
@@ -58,9 +58,8 @@ class KnownPose:
     def __post_init__(self) -> None:
         zone_of(self.epsg)
         check_datum(self.height_datum)
-        object.__setattr__(self, "utm", frozen_array("KnownPose.utm", self.utm, (3,)))
-        quaternion = frozen_array("KnownPose.cam_from_utm_xyzw", self.cam_from_utm_xyzw, (4,))
-        object.__setattr__(self, "cam_from_utm_xyzw", quaternion)
+        freeze(self, utm=(3,), cam_from_utm_xyzw=(4,))
+        quaternion = self.cam_from_utm_xyzw
         if abs(float(np.linalg.norm(quaternion)) - 1.0) > _UNIT:
             raise InvalidValueError(
                 f"KnownPose.cam_from_utm_xyzw: expected a unit quaternion, found {quaternion.tolist()}"

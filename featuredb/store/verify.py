@@ -83,15 +83,15 @@ class VerifyReport:
             commit under way. No damage: nobody reads them, and `vacuum` removes them.
     """
 
-    version: int
-    maps: int
-    scans: int
-    candidates: int
-    canaries: int
-    files: int
-    rows: int
-    problems: tuple[DatabaseProblem, ...]
-    orphans: tuple[str, ...]
+    version: int = -1
+    maps: int = 0
+    scans: int = 0
+    candidates: int = 0
+    canaries: int = 0
+    files: int = 0
+    rows: int = 0
+    problems: tuple[DatabaseProblem, ...] = ()
+    orphans: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -113,7 +113,7 @@ def verify(database: Database) -> VerifyReport:
         if not problems:
             raise
         logger.debug("nothing but the logs can be checked: %s", error)
-        return _report_of_logs(problems)
+        return VerifyReport(problems=tuple(problems))
     files = rows = 0
     lidar = LIDAR_TABLES if has_scans(database) else ()
     for name in (*TABLES, *lidar, *growth_tables(database)):
@@ -149,20 +149,6 @@ def check_logs(database: Database) -> Iterator[DatabaseProblem]:
         for problem in log_problems(files):
             what = f"{problem.what}; `featuredb repair` says what can be done"
             yield DatabaseProblem(where=f"{name}/{LOG}/{problem.name}", what=what)
-
-
-def _report_of_logs(problems: list[DatabaseProblem]) -> VerifyReport:
-    return VerifyReport(
-        version=-1,
-        maps=0,
-        scans=0,
-        candidates=0,
-        canaries=0,
-        files=0,
-        rows=0,
-        problems=tuple(problems),
-        orphans=(),
-    )
 
 
 def check_files(table: Table) -> Iterator[DatabaseProblem]:

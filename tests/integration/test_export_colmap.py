@@ -4,6 +4,7 @@ import csv
 import hashlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -182,19 +183,50 @@ def test_colmap_finds_its_own_features_in_the_exported_database(
     truth = field.view(-5.0, 3.0, 43.0, 7.0, 15.0)
     photo = field.render(field.field_texture(1), truth, seed=78)
     cv2.imwrite(str(tmp_path / "new.png"), photo)
-    program = Path(__file__).resolve().parents[2] / "tools" / "colmap_localise.py"
-    done = subprocess.run(
-        [sys.executable, "-I", str(program), str(tmp_path / "out" / "field%2F1"), str(tmp_path / "new.png")],
-        capture_output=True, text=True, timeout=300, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    theirs = Rigid3.from_matrix(json.loads(done.stdout)["cam_from_world"])
+    theirs = sought_by_colmap(tmp_path / "out" / "field%2F1", tmp_path / "new.png")
     ours = localise(photo, LocaliseRequest(camera=field.CAMERA), [indexed(field_map)])
     assert ours.pose is not None
     map_from_area = field_map.frame.enu_from(ours.pose.frame)
     center = map_from_area.act(ours.pose.cam_from_local.center)
     assert np.linalg.norm(theirs.center - center) < 0.05
     assert np.linalg.norm(theirs.center - truth.center) < 0.05
+
+
+def sought_by_colmap(folder: Path, photo: Path) -> Rigid3:
+    """cam_from_world of a photo of the model's first camera, by COLMAP's own features, matches and pose."""
+    model, file = pycolmap.Reconstruction(str(folder / "sparse")), folder.with_name("with_photo.db")
+    shutil.copy(folder / "database.db", file)
+    reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+    reader.existing_camera_id, extraction.max_image_size = 1, 1600
+    pycolmap.extract_features(
+        str(file), str(photo.parent), image_names=[photo.name], camera_mode=pycolmap.CameraMode.AUTO,
+        reader_options=reader, extraction_options=extraction,
+    )  # fmt: skip
+    listed, pairing = folder.with_name("pairs.txt"), pycolmap.ImportedPairingOptions()
+    listed.write_text("".join(f"{photo.name} {image.name}\n" for image in model.images.values()))
+    pairing.match_list_path = str(listed)
+    pycolmap.match_image_pairs(str(file), pairing_options=pairing)
+    database = pycolmap.Database.open(str(file))
+    try:
+        query = database.read_image_with_name(photo.name).image_id
+        pixels = database.read_keypoints(query)[:, :2].astype(np.float64)
+        seen = {
+            (int(mine), int(image.points2D[int(theirs)].point3D_id))
+            for image_id, image in model.images.items()
+            if database.exists_two_view_geometry(query, image_id)
+            for mine, theirs in database.read_two_view_geometry(query, image_id).inlier_matches
+            if image.points2D[int(theirs)].has_point3D()
+        }
+    finally:
+        database.close()
+    rows, points = np.array(sorted(seen)).T
+    options = pycolmap.AbsolutePoseEstimationOptions()
+    options.ransac.max_error, options.ransac.random_seed = 4.0, 0
+    found = pycolmap.estimate_and_refine_absolute_pose(
+        pixels[rows], np.array([model.point3D(i).xyz for i in points]), model.camera(1), options
+    )
+    assert found is not None
+    return Rigid3.from_matrix(found["cam_from_world"].matrix())
 
 
 def localised_by_colmap(folder: Path, xy: np.ndarray, descriptors: np.ndarray, camera: Any) -> Rigid3:

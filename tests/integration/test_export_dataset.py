@@ -20,6 +20,7 @@ from featuredb.export.dataset import read_dataset, write_dataset
 from featuredb.export.job import size_of
 from featuredb.export.selection import Selection
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from featuredb.store.encode import content_digest
 from featuredb.store.snapshot import Snapshot
@@ -165,13 +166,13 @@ def test_one_map_is_in_memory_at_a_time(
         gc.collect()
         return sum(isinstance(thing, FeatureMap) for thing in gc.get_objects())
 
-    load, before, most = Snapshot.load_map, maps(), []
+    load, before, most = Snapshot.load_any, maps(), []
 
-    def counted(snapshot: Snapshot, map_id: str) -> FeatureMap:
+    def counted(snapshot: Snapshot, map_id: str) -> AnyMap:
         most.append(maps() - before)
         return load(snapshot, map_id)
 
-    monkeypatch.setattr(Snapshot, "load_map", counted)
+    monkeypatch.setattr(Snapshot, "load_any", counted)
     export(database, tmp_path / "out")
     assert most == [0] * 10  # nothing is left of one when the next is loaded
 
@@ -183,6 +184,7 @@ from dataclasses import replace
 from pathlib import Path
 from featuredb.export.dataset import write_dataset
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store import Database
 from tests.support.datasets import job_of
 job = job_of(Database.open(sys.argv[1]), Path(sys.argv[2]))

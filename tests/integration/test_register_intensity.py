@@ -1,4 +1,4 @@
-"""A photo against laser intensity whose contrast is another: search, refinement, confirmation, refusals."""
+"""A photo against laser intensity whose contrast is another: search, confirmation, refusals."""
 
 from functools import lru_cache
 
@@ -21,7 +21,6 @@ from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.register import register_frame
 from ingest.register.frame.views import FrameViews, first_look
 from ingest.register.frame_registration import FramePrior
-from tools.intensity_refinement import refine_by_intensity
 
 CAMERA = Camera(
     model="SIMPLE_RADIAL", width=320, height=240, params=(300.0, 163.0, 118.0, -0.06)
@@ -144,27 +143,3 @@ def test_a_pose_that_is_a_few_metres_off_is_not_confirmed() -> None:
 def test_an_empty_photo_confirms_nothing() -> None:
     flat = np.full((CAMERA.height, CAMERA.width), 90, np.uint8)
     assert not confirm_pose(flat, CAMERA, TRUTH, _ground(0)[0]).confirmed
-
-
-def test_refinement_brings_a_pose_that_is_pixels_off_home() -> None:
-    start = Rigid3.exp([0.004, -0.006, 0.01, 0.25, -0.2, 0.4]) @ TRUTH
-    refined = refine_by_intensity(_photo(0), CAMERA, start, _ground(0)[0])
-    assert refined.moved
-    assert refined.gradients > refined.gradients_before
-    assert refined.information > refined.information_before
-    before, after = _errors(start), _errors(refined.cam_from_local)
-    assert after[0] < 0.5 * before[0]
-    assert after[1] < 0.5 * before[1]
-    assert refined.covariance is not None
-    residual = (TRUTH @ refined.cam_from_local.inverse()).log()
-    # Within the ellipsoid that holds 999 of 1000 errors of an honest covariance of six parameters.
-    assert residual @ np.linalg.solve(refined.covariance, residual) < 22.5
-
-
-def test_refinement_keeps_the_start_where_there_is_nothing_to_compare() -> None:
-    away = Rigid3(rotation=TRUTH.rotation, translation=TRUTH.translation + np.array([500.0, 0.0, 0.0]))
-    refined = refine_by_intensity(_photo(0), CAMERA, away, _ground(0)[0])
-    assert not refined.moved
-    assert refined.covariance is None
-    assert refined.cam_from_local is away
-    assert "scan points" in refined.message

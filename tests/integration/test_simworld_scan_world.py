@@ -25,11 +25,12 @@ from featuredb.simworld.laser.scan_file import write_scan
 from featuredb.simworld.laser.scan_options import AirborneScanOptions
 from featuredb.simworld.ortho import Ortho, OrthoOptions, make_ortho
 from featuredb.simworld.scan_world import (
-    ScanWorld,
-    ScanWorldOptions,
+    ORTHO_FILE,
+    OTHER_ORTHO_FILE,
+    OTHER_SCAN_FILE,
+    SCAN_FILE,
     other_town_here,
     write_lidar,
-    write_scan_world,
 )
 from featuredb.simworld.town.days import DayOptions
 from featuredb.simworld.town.ground import paint_ground
@@ -37,31 +38,31 @@ from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import make_town
 from featuredb.simworld.world import WorldOptions, town_of
 
-OPTIONS = ScanWorldOptions(
-    world=WorldOptions(
-        seed=6,
-        town_size_m=(155.0, 150.0),
-        flight=FlightOptions(lines=1, per_line=1, oblique=0, width=160),
-        queries=1,
-        query_width=160,
-        street=0,
-        negatives_per_kind=0,
-        workers=1,
-    ),
-    scan=AirborneScanOptions(density_per_m2=1.0, margin_m=5.0),
-    ortho=OrthoOptions(pixel_m=0.5, margin_m=5.0),
+WORLD = WorldOptions(
+    seed=6,
+    town_size_m=(155.0, 150.0),
+    flight=FlightOptions(lines=1, per_line=1, oblique=0, width=160),
+    queries=1,
+    query_width=160,
+    street=0,
+    negatives_per_kind=0,
+    workers=1,
 )
+SCAN = AirborneScanOptions(density_per_m2=1.0, margin_m=5.0)
+ORTHO = OrthoOptions(pixel_m=0.5, margin_m=5.0)
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> ScanWorld:
-    return write_scan_world(tmp_path_factory.mktemp("world"), OPTIONS)
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("world")
+    write_lidar(folder, WORLD, scan=SCAN, ortho=ORTHO)
+    return folder
 
 
-def test_the_scan_reads_back(world: ScanWorld) -> None:
-    scene = town_of(OPTIONS.world)
-    scan = scan_town(scene, OPTIONS.scan)
-    las = laspy.read(world.scan)
+def test_the_scan_reads_back(folder: Path) -> None:
+    scene = town_of(WORLD)
+    scan = scan_town(scene, SCAN)
+    las = laspy.read(folder / SCAN_FILE)
     assert las.header.version == "1.4"
     assert las.header.point_format.id == 6
     np.testing.assert_allclose(las.xyz, scan.utm(), atol=0.00051)
@@ -75,9 +76,9 @@ def test_the_scan_reads_back(world: ScanWorld) -> None:
     np.testing.assert_allclose(back, scan.xyz[::997], atol=0.001)
 
 
-def test_the_scan_says_where_it_is(world: ScanWorld) -> None:
+def test_the_scan_says_where_it_is(folder: Path) -> None:
     """As the store reads it: UTM, ellipsoidal heights, metres."""
-    with laspy.open(world.scan) as file:
+    with laspy.open(folder / SCAN_FILE) as file:
         wkt = next(v.string for v in file.header.vlrs if type(v).__name__ == "WktCoordinateSystemVlr")
         assert file.header.global_encoding.wkt
         parsed = file.header.parse_crs()
@@ -91,28 +92,17 @@ def test_the_scan_says_where_it_is(world: ScanWorld) -> None:
         utm_wkt(25832, "egm96")
 
 
-def test_another_town_stands_at_the_same_place(world: ScanWorld) -> None:
-    here, there = laspy.read(world.scan), laspy.read(world.other_scan)
+def test_another_town_stands_at_the_same_place(folder: Path) -> None:
+    here, there = laspy.read(folder / SCAN_FILE), laspy.read(folder / OTHER_SCAN_FILE)
     np.testing.assert_allclose(here.header.mins[:2], there.header.mins[:2], atol=60)
     np.testing.assert_allclose(here.header.maxs[:2], there.header.maxs[:2], atol=60)
-    town, other = town_of(OPTIONS.world), other_town_here(OPTIONS.world)
+    town, other = town_of(WORLD), other_town_here(WORLD)
     assert other.frame == town.frame
     places = [np.array([[b.x, b.y] for b in s.plan.buildings]) for s in (town, other)]
     nearest = np.linalg.norm(places[0][:, None] - places[1][None], axis=2).min(axis=1)
     assert np.median(nearest) > 1.0
-    with rasterio.open(world.ortho) as a, rasterio.open(world.other_ortho) as b:
+    with rasterio.open(folder / ORTHO_FILE) as a, rasterio.open(folder / OTHER_ORTHO_FILE) as b:
         assert a.crs.to_epsg() == b.crs.to_epsg() == 32632
-
-
-def test_a_world_that_is_there_is_left_alone(world: ScanWorld) -> None:
-    before = {p: p.stat().st_mtime_ns for p in world.world.folder.rglob("*.*")}
-    again = write_scan_world(world.world.folder, OPTIONS)
-    assert again.scan == world.scan
-    assert {p: p.stat().st_mtime_ns for p in world.world.folder.rglob("*.*")} == before
-    denser = replace(OPTIONS, scan=replace(OPTIONS.scan, density_per_m2=2.0))
-    assert denser.fingerprint() != OPTIONS.fingerprint()
-    workers = replace(OPTIONS, world=replace(OPTIONS.world, workers=2))
-    assert workers.fingerprint() == OPTIONS.fingerprint()
 
 
 @pytest.fixture(scope="module")
@@ -210,7 +200,7 @@ def test_writers_refuse_what_they_cannot_write(tmp_path: Path, town: Scene) -> N
     with pytest.raises(InvalidValueError, match="an image"):
         write_geotiff(tmp_path / "a.tif", np.zeros((4, 4)), epsg=32632, west=0, north=0, pixel_m=1)
     assert not list(tmp_path.iterdir())
-    scan = scan_town(town, replace(OPTIONS.scan, density_per_m2=0.3))
+    scan = scan_town(town, replace(SCAN, density_per_m2=0.3))
     rgb = np.random.default_rng(0).integers(0, 256, (len(scan), 3), dtype=np.uint8)
     write_scan(tmp_path / "c.las", scan, rgb)
     las = laspy.read(tmp_path / "c.las")
@@ -222,7 +212,7 @@ def test_writers_refuse_what_they_cannot_write(tmp_path: Path, town: Scene) -> N
 def test_a_missing_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MissingExtraError, match=rf"{package}.*featuredb\[lidar\]"):
-        write_scan_world(tmp_path / "w", OPTIONS)
+        write_lidar(tmp_path / "w", WORLD)
     assert not (tmp_path / "w").exists()
 
 
@@ -232,13 +222,11 @@ def test_the_command_writes_scan_and_ortho(
     parser = argparse.ArgumentParser()
     command.register(parser.add_subparsers())
     args = parser.parse_args(["simworld", str(tmp_path / "w"), "--lidar", "--workers", "1"])
-    monkeypatch.setattr(
-        WorldOptions, "short", classmethod(lambda cls, seed: replace(OPTIONS.world, seed=seed))
-    )
+    monkeypatch.setattr(WorldOptions, "short", classmethod(lambda cls, seed: replace(WORLD, seed=seed)))
     monkeypatch.setattr(
         scan_world,
         "write_lidar",
-        lambda folder, options, note: write_lidar(folder, replace(OPTIONS, world=options.world), note),
+        lambda folder, world, note: write_lidar(folder, world, note, scan=SCAN, ortho=ORTHO),
     )
     assert args.run(args) == 0
     said = capsys.readouterr()

@@ -13,8 +13,8 @@ from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents, entry_of
 from featuredb.export.dataset.footprint import Footprint, footprint_of
 from featuredb.export.dataset.geoparquet import point_columns, wkb_of
-from featuredb.export.dataset.partitions import earth_covariance
 from featuredb.export.dataset.sums import check_sums, write_sums
+from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import geodetic_from_utm
@@ -152,9 +152,9 @@ def test_covariance_on_earth_is_that_of_many_drawn_poses() -> None:
         drawn.append([*true_from_local @ turn, *true_from_local @ (centre - pose.center)])
     expected = np.cov(np.array(drawn).T)
     sigma = np.sqrt(np.diag(expected))
-    found = earth_covariance(feature_map, image)
+    found = pose_covariance(feature_map, image)
     np.testing.assert_allclose(found / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=0.06)
-    alone = earth_covariance(feature_map, replace(image, covariance=None))
+    alone = pose_covariance(feature_map, replace(image, covariance=None))
     assert (np.diag(alone) < np.diag(found)).all()
 
 

@@ -8,7 +8,7 @@ import pytest
 from featuredb.errors import ExportError, MapNotFoundError, StoreError
 from featuredb.export.selection import (
     Selection,
-    exported_maps,
+    exported,
     licence_is,
     licensed,
     selected_maps,
@@ -117,6 +117,7 @@ def test_photos_of_other_licences_leave_nothing_behind() -> None:
 
 def test_maps_come_one_by_one_and_never_none_at_all(database: Database) -> None:
     snapshot = database.snapshot()
-    assert [m.map_id for m in exported_maps(database, snapshot, Selection())] == ["one", "two"]
+    maps = selected_maps(database, snapshot, Selection())
+    assert [m.map_id for m in exported(snapshot, maps, None)] == ["one", "two"]
     with pytest.raises(ExportError, match="expected photos with a licence of mit, found none"):
-        list(exported_maps(database, snapshot, Selection(licences=("mit",))))
+        list(exported(snapshot, maps, ("mit",)))

@@ -86,8 +86,9 @@ def test_the_page_tells_what_holds_what_failed_and_what_was_not_run() -> None:
 
 
 def test_a_row_that_cannot_be_judged_is_refused() -> None:
-    with pytest.raises(InvalidValueError, match="unknown: \\['gone'\\]"):
-        row(text="{gone} m")
+    with pytest.raises(InvalidValueError, match="expected a command and a limit"):
+        replace(row(), limits=())
+    assert row(text="{gone} m").words({}) == "- m"
     with pytest.raises(InvalidValueError, match="expected least, most or both"):
         Limit(figure="m")
     assert not Limit(figure="m", least=0.0).holds({"m": None})

@@ -7,7 +7,6 @@ from tools.scoreboard.words import ANSWERS, BRIGHTON, BRIGHTON_LENS, ERRORS, HEL
 
 _LENS_SETS = ("brighton/images", "seneca/images", "copr/images", "sacre_coeur/mapping")
 _CUTS = ("interleaved", "consecutive")
-_LENS_WIDTHS = ("focal_rel", "aspect_rel", "center_rel", "radial", "tangential")
 
 
 def _portions(photos: str, cut: str, minutes: float) -> Row:
@@ -22,7 +21,6 @@ def _portions(photos: str, cut: str, minutes: float) -> Row:
                 *("--work", "{work}/cache", *OUT),
             ),
         ),
-        figures=same("photos", "joint", "grown", "missing", "median_m", "largest_m"),
         text="{grown} of {joint}, median {median_m:.3f} m, largest {largest_m:.3f} m",
         limits=(Limit(figure="missing", most=0), Limit(figure="median_m", most=0.3)),
         needs=(photos,),
@@ -49,7 +47,6 @@ def _gates() -> Row:
             ),
             ("tools.growth_gates", *(f"{{work}}/{k}.jsonl" for k in range(len(_GATED))), *OUT),
         ),
-        figures=same("judged", "alone_right", "alone_wrong", "refine_right", "refine_wrong"),
         text="{judged} placements judged; {refine_right} right and {refine_wrong} wrong photos pass; gates "
         "that alone refuse a placement cost {alone_right} right photos and keep out {alone_wrong} wrong ones",
         limits=(Limit(figure="refine_wrong", most=0),),
@@ -66,7 +63,7 @@ def _sequence(photos: str, median_m: float, minutes: float) -> Row:
         form="full",
         claim=f"`{name}`: every second photo is a map, all are played as a film and tracked",
         commands=(("tools.real_sequence", "--photos", f"{{data}}/{photos}", "--work", "{work}/maps", *OUT),),
-        figures=same("frames", "lost", "median_m", "largest_m", "unknown"),
+        figures=same("unknown"),
         text="{lost} of {frames} lost, median {median_m:.3f} m, largest {largest_m:.3f} m",
         limits=(Limit(figure="median_m", most=median_m), Limit(figure="largest_m", most=1.0)),
         needs=(photos,),
@@ -81,7 +78,6 @@ def _made(name: str, claim: str, words: tuple[str, ...], need: str, least: int, 
         form="full",
         claim=claim,
         commands=(("tools.made_maps", *words, "--work", "{work}/maps", *OUT),),
-        figures=same("photos", "largest", "mapped", "maps", "placed"),
         text="{largest} in the largest of {maps} maps, {mapped} in all",
         limits=(Limit(figure="largest", least=least),),
         needs=(need,),
@@ -97,10 +93,7 @@ def _laser(name: str, photos: int, form: Form) -> Row:
         claim=f"`strecha/{name}`: {photos} photos with exact positions become a map, others are asked, their "
         "camera told and unknown; against a laser scan, beside COLMAP given the true lens",
         commands=(("tools.laser_truth", f"{{data}}/strecha/{name}", *OUT),),
-        figures=same(
-            *("map_found", "map_m", "told_m", "unknown_m", "map_colmap_m", "told_colmap_m", "map_deg"),
-            *("told_deg", "unknown_deg", "map_reported_deg", "told_reported_m", "worst", "lens_off"),
-        ),
+        figures=same("map_reported_deg", "told_reported_m"),
         text="{map_found} photos; map {map_m:.4f} m and {map_deg:.3f} degrees (COLMAP {map_colmap_m:.4f} m), "
         "told {told_m:.4f} m and {told_deg:.3f}, unknown {unknown_m:.4f} m and {unknown_deg:.3f} "
         "(COLMAP {told_colmap_m:.4f} m); worst ratio {worst:.1f}; lens off by {lens_off:.1f} of its sigmas",
@@ -131,7 +124,6 @@ REAL: tuple[Row, ...] = (
         claim="`brighton`: 14 of 18 photos become a map from a cold start; the 4 others over Zenoh, "
         "against a map of all 18",
         commands=(("tools.real_photos", "--photos", BRIGHTON, "--held-out", *HELD_OUT, *OUT),),
-        figures=ERRORS | same("usable", "registered", "ingest_s"),
         text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
         limits=(
             Limit(figure="registered", least=14),
@@ -155,9 +147,7 @@ REAL: tuple[Row, ...] = (
                 *("--poses", "{cache}/brighton-poses.json", "--held-out", *HELD_OUT, *OUT),
             ),
         ),
-        figures=ERRORS
-        | same("before_median_m", "gps_focal_px", "scan_focal_px", "gps_focal_sigma", "gps_focal_off")
-        | same("gps_shape_m"),
+        figures=ERRORS,
         text=ANSWERS + " (by GPS {before_median_m:.1f} m; its focal length {gps_focal_px:.0f} px, known to "
         "{gps_focal_sigma:.1%}, the scan's {scan_focal_px:.0f}; cameras {gps_shape_m:.3f} m off after a "
         "similarity)",
@@ -178,7 +168,7 @@ REAL: tuple[Row, ...] = (
         form="full",
         claim="`lewis`: every fifth of 55 oblique photos is held out, against a map of all",
         commands=(("tools.real_photos", "--photos", "{data}/lewis/images", *OUT),),
-        figures=ERRORS | same("usable", "registered", "ingest_s"),
+        figures=ERRORS,
         text="{registered} of {usable} in {ingest_s:.0f} s; " + ANSWERS,
         limits=(Limit(figure="registered", least=40), Limit(figure="median_m", most=1.0)),
         needs=("lewis/images",),
@@ -198,7 +188,6 @@ REAL: tuple[Row, ...] = (
                 *("--photos", BRIGHTON, "{data}/lewis/images", "--seed", "7", *OUT),
             ),
         ),
-        figures=same("structured", "close", "rate", "largest_m", "wrong", "foreign", "foreign_accepted"),
         text="{close} of {structured} within 1.5 m, largest of an accepted one {largest_m:.1f} m; "
         "{foreign_accepted} of {foreign} of other places accepted",
         limits=(
@@ -222,10 +211,7 @@ REAL: tuple[Row, ...] = (
                 *("--poses", "{cache}/brighton-poses.json", "--work", "{work}/draws", *OUT),
             ),
         ),
-        figures=same(
-            *("maps", "largest", "draws", "placed", "refused", "wrong"),
-            *("median_m", "worst_m", "median_deg", "worst_deg"),
-        ),
+        figures=same("worst_deg"),
         text="{placed} of {draws} placed, {wrong} wrong; median {median_m:.2f} m and "
         "{median_deg:.2f} degrees, worst draw {worst_m:.2f} m",
         limits=(
@@ -254,10 +240,7 @@ REAL: tuple[Row, ...] = (
                 *("--poses", "{cache}/brighton-poses.json", "--work", "{work}/maps", *OUT),
             ),
         ),
-        figures=same(
-            *("photos", "grown", "strange_placed", "placed_median_m", "loose_median_m", "loose_largest_m"),
-            *("loose_median_deg", "bound_m"),
-        ),
+        figures=same("bound_m"),
         text="{grown} of {photos} placed, median {loose_median_m:.2f} m and {loose_median_deg:.2f} degrees, "
         "largest {loose_largest_m:.2f} m; the map by GPS {placed_median_m:.2f} m",
         limits=(
@@ -275,19 +258,6 @@ REAL: tuple[Row, ...] = (
         claim="`karma.mp4`, 12 s by a drone straight ahead: placed by its telemetry; its track against its "
         "own GPS, inside the 95 % radius that it states",
         commands=(("tools.film_placed", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
-        figures=same(
-            *(
-                "keyframes",
-                "mapped",
-                "active",
-                "tracked",
-                "compared",
-                "radius_m",
-                "rms_m",
-                "largest_m",
-                "inside",
-            )
-        ),
         text="{mapped} of {keyframes} keyframes, {tracked} frames tracked; radius {radius_m:.1f} m, off by "
         "{rms_m:.1f} m (root mean square) and {largest_m:.1f} m at most; {inside:.1%} of {compared} inside",
         limits=(
@@ -311,7 +281,6 @@ REAL: tuple[Row, ...] = (
                 *("--work", "{work}/maps", *OUT),
             ),
         ),
-        figures=same("quarantined", "photos", "ingest_km", "anchor_km", "grow_km"),
         text="{photos} photos placed; said: {ingest_km:.1f} km from the other map by the ingest, "
         "{anchor_km:.1f} km from the scan, {grow_km:.1f} km where the photos are contributed",
         limits=(
@@ -328,10 +297,6 @@ REAL: tuple[Row, ...] = (
         claim="`karma.mp4`, 12 s by a drone, becomes a map without a place, and is followed in its frame; at "
         "keyframes the track agrees with the map's own cameras, relative to the distance of the points",
         commands=(("tools.film_in_map", "{data}/video/karma.mp4", "--work", "{work}", *OUT),),
-        figures=same(
-            *("keyframes", "mapped", "frames", "tracked", "center_rel", "angle_deg"),
-            *("mapped_share", "tracked_share"),
-        ),
         text="{mapped} of {keyframes} keyframes, {tracked} of {frames} frames; {center_rel:.2%} and "
         "{angle_deg:.2f} degrees",
         limits=(
@@ -354,17 +319,6 @@ REAL: tuple[Row, ...] = (
                 *("--work", "{cache}/reichstag", *OUT),
             ),
         ),
-        figures=same(
-            *(
-                "photos",
-                "colmap_largest",
-                "ours_largest",
-                "ours_of_colmap_largest",
-                "share",
-                "placed",
-                "times",
-            ),
-        ),
         text="{ours_of_colmap_largest} of {colmap_largest} ({share:.0%}), in {times:.1f} times COLMAP's time",
         limits=(Limit(figure="share", least=0.9), Limit(figure="placed", most=0)),
         needs=("reichstag/images",),
@@ -379,7 +333,6 @@ REAL: tuple[Row, ...] = (
         "of collections in the largest map (paper: 7 % and 22 %)",
         commands=(("tools.paper", "--out", "{work}", "--data", "{data}", "--only", "shares"),),
         json="{work}/paper.json",
-        figures=same("films", "films_mapped", "reichstag", "sacre_coeur"),
         text="{films_mapped} of {films} films; {reichstag} of 74 of `reichstag`, {sacre_coeur} of 10 of "
         "`sacre_coeur`",
         limits=(
@@ -404,7 +357,6 @@ REAL: tuple[Row, ...] = (
                 *(f"{{data}}/{folder}" for folder in _LENS_SETS),
             ),
         ),
-        figures=same("lenses", *_LENS_WIDTHS, "inside"),
         text="{lenses} lenses; focal length {focal_rel:.2%}, aspect {aspect_rel:.3%}, principal point "
         "{center_rel:.2%}, radial {radial:.3f}, tangential {tangential:.4f}; {inside} of 5 widths lie within",
         limits=(Limit(figure="inside", least=5),),
@@ -422,19 +374,6 @@ REAL: tuple[Row, ...] = (
                 *("tools.position_draws", "--work", "{work}/maps", "--draws", "40", *OUT, "--photos"),
                 *(f"{{data}}/{name}/images" for name in ("brighton", "lewis", "seneca")),
             ),
-        ),
-        figures=same(
-            *(
-                "flights",
-                "placed",
-                "answer",
-                "position_68",
-                "position_95",
-                "orientation_68",
-                "orientation_95",
-            ),
-            *("answering_position_95", "answering_orientation_95", "random", "random_answer"),
-            *("shuffled", "shuffled_answer", "other", "other_answer"),
         ),
         text="{placed:.1%} of {flights:.0f} placed, {answer:.1%} answer; inside 68 and 95 % bounds: position "
         "{position_68:.0%} and {position_95:.1%}, orientation {orientation_68:.0%} and {orientation_95:.1%} "
@@ -469,17 +408,6 @@ REAL: tuple[Row, ...] = (
                 *("--draws", "300", *OUT),
             ),
         ),
-        figures=same(
-            *(
-                f"{kind}_{name}"
-                for kind in ("real", "simulated")
-                for name in (
-                    *("strips", "answer", "turn_deg", "without_placed", "without_answer", "without_turn_deg"),
-                    *("position_68", "position_95", "orientation_68", "orientation_95"),
-                    *("without_position_95", "without_orientation_95"),
-                )
-            )
-        ),
         text="; ".join(_STRIPS.replace("KIND", kind) for kind in ("real", "simulated")),
         limits=(
             Limit(figure="real_answer", least=1),
@@ -506,7 +434,6 @@ REAL: tuple[Row, ...] = (
                 *("--work", "{work}/maps", *OUT),
             ),
         ),
-        figures=same("photos", "largest", "placed", "residual_m"),
         text="{largest} of {photos} in a map, {placed} placed, residual {residual_m:.2f} m",
         limits=(
             Limit(figure="largest", least=38),
@@ -528,7 +455,7 @@ REAL: tuple[Row, ...] = (
                 *("--photos", *HELD_OUT, *OUT),
             ),
         ),
-        figures=same("photos", "accepted", "largest_apart_m", "largest_apart_deg", "cpu_s"),
+        figures=same("cpu_s"),
         text="{accepted} of {photos}, both at one pose to {largest_apart_m:.2f} m and "
         "{largest_apart_deg:.2f} degrees",
         limits=(

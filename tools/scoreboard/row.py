@@ -2,7 +2,7 @@
 
 import string
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from featuredb.errors import InvalidValueError
@@ -49,9 +49,10 @@ class Row:
             sets, `{work}` an empty folder of the row, `{cache}` one that rows and commits share, for inputs
             that do not depend on the program. The first word is a module (`tools.x`, `featuredb.cli`).
         json: file with the figures, which the last command writes.
-        figures: name -> where it is in the file, keys joined by dots.
         text: the figures in words, a format string.
         limits: all must hold.
+        figures: name -> where it is in the file, keys joined by dots: of those that are kept beside what
+            `text` and `limits` name, and of what does not stand there under its own name.
         needs: paths under `{data}`; the row is skipped where one is absent.
         resumes: whether the command goes on with what it finds in `{work}` of the same commit.
         readme: whether README shows it. minutes: about how long it takes on two cores.
@@ -62,9 +63,9 @@ class Row:
     form: Form
     claim: str
     commands: tuple[tuple[str, ...], ...]
-    figures: Mapping[str, str]
     text: str
     limits: tuple[Limit, ...]
+    figures: Mapping[str, str] = field(default_factory=dict)
     json: str = "{work}/figures.json"
     needs: tuple[str, ...] = ()
     resumes: bool = False
@@ -72,18 +73,15 @@ class Row:
     minutes: float = 1.0
 
     def __post_init__(self) -> None:
-        named = {limit.figure for limit in self.limits} | {
-            field for _, field, _, _ in string.Formatter().parse(self.text) if field is not None
-        }
-        unknown = sorted(named - {*self.figures, "seconds"})
-        if unknown or not self.limits or not self.commands:
-            raise InvalidValueError(
-                f"row {self.name}: expected a command, a limit, and figures that are read; unknown: {unknown}"
-            )
+        if not self.limits or not self.commands:
+            raise InvalidValueError(f"row {self.name}: expected a command and a limit")
 
     def read(self, document: Mapping[str, Any]) -> dict[str, float | int | str | None]:
         """The row's figures of what the command has written; None for what is not there."""
-        return {name: _at(document, path) for name, path in self.figures.items()}
+        words = (name for _, name, _, _ in string.Formatter().parse(self.text) if name is not None)
+        named = {*words, *(limit.figure for limit in self.limits)} - {"seconds"}
+        paths = {name: name for name in sorted(named)} | dict(self.figures)
+        return {name: _at(document, path) for name, path in paths.items()}
 
     def holds(self, figures: Figures) -> bool:
         """Whether all limits hold."""

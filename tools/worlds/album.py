@@ -7,7 +7,7 @@ An album's photos lie in a folder per owner under names that give nothing away. 
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -80,15 +80,16 @@ class PlannedPhoto:
 def write_album(
     folder: Path,
     world: SceneSource,
-    home: Scene,
-    photos: Sequence[PlannedPhoto],
+    plan: Callable[[], list[PlannedPhoto]],
     workers: int = 0,
     progress: Progress | None = None,
 ) -> Path:
     """Write all photos, tables and truth into `folder`; files that are there already are kept.
 
+    Photos whose fact says `home` get a true pose in the frame of the scene "home/0/000".
+
     Args:
-        home: the scene of the truth's frame: photos whose fact says `home` get a true pose in it.
+        plan: gives the photos; it is not asked where the album is complete.
         workers: processes; 0 takes one per core.
         progress: called with (files done, files in all).
 
@@ -97,6 +98,9 @@ def write_album(
         InvalidValueError: two photos of one name.
     """
     folder = Path(folder)
+    if (folder / TRUTH_FILE).exists():  # it comes last
+        return folder
+    home, photos = world.scene("home/0/000"), plan()
     names = [photo.shot.name for photo in photos]
     if len(set(names)) < len(names):
         raise InvalidValueError("write_album: expected names that differ, found one twice")
@@ -113,11 +117,6 @@ def write_album(
     write_facts(folder, [p.fact for p in photos])
     write_truth(folder, Truth(seed=home.seed, epsg=home.epsg, frame=home.frame, images=truths))
     return folder
-
-
-def album_is_complete(folder: Path) -> bool:
-    """Whether `write_album` came to its end here."""
-    return (Path(folder) / TRUTH_FILE).exists()
 
 
 def photo_file(scene: Scene, photo: PlannedPhoto) -> bytes:

@@ -17,7 +17,7 @@ from featuredb.simworld.camera.shot import Shot, look_pose
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, Subject, album_is_complete, write_album
+from tools.worlds.album import PlannedPhoto, Progress, Subject, write_album
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -45,8 +45,7 @@ class CommunityOptions:
 
     Attributes:
         seed: of everything. town_size_m: width and height of the town.
-        flight: the anchored survey, of most of what people visit (`tools/growth_community.py` prints how much
-            of their photos it has mapped).
+        flight: the anchored survey, of most of what people visit.
         photos: of the town, by the twelve. other_town: photos of another town.
         copies, indoor, portraits: numbers of re-uploads, indoor shots, portraits.
         sights: places that people visit.
@@ -130,11 +129,12 @@ def write_community(
     Raises:
         OSError: the folder cannot be written.
     """
-    if album_is_complete(folder):
-        return Path(folder)
-    home = options.scene("home/0/000")
-    photos = survey_photos(home, options.flight, options.seed) + plan_community(options)
-    return write_album(folder, options, home, photos, workers, progress)
+
+    def plan() -> list[PlannedPhoto]:
+        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+        return survey + plan_community(options)
+
+    return write_album(folder, options, plan, workers, progress)
 
 
 def plan_community(options: CommunityOptions) -> list[PlannedPhoto]:

@@ -1,9 +1,13 @@
 """One frame of a film of a scene: cars drive, water glitters, and the camera moves while it is exposed."""
 
-from collections.abc import Callable
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +23,7 @@ from featuredb.simworld.town.texture import Image8
 
 _GLITTER_HZ = 5.0  # how often the water looks new
 _BANDS = 12  # of rows, where they are not exposed at once
+_CHUNK = 4  # frames that travel to a process at a time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +80,29 @@ def draw_frame(
     sensor = replace(exposure.sensor, exposure_sigma_ev=0.0, white_balance_sigma=0.0)
     rng = np.random.default_rng((seeds[0], 72, seeds[1]))
     return expose(np.clip(light, 0, 255).astype(np.uint8), rng, sensor)
+
+
+def in_order(draw: Callable[[int], Image8], count: int, workers: int = 0) -> Iterator[Image8]:
+    """`draw(i)` of all i below `count` in their order, from a pool of processes (or here, for one worker)."""
+    processes = min(workers or os.cpu_count() or 1, count)
+    if processes <= 1:
+        yield from map(draw, range(count))
+        return
+    # Spawned, not forked: the caller may have threads that a fork would cut off.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context, cv2.setNumThreads, (1,)) as pool:
+        # A few chunks ahead of the writer, so that a slow disk does not fill the memory.
+        chunks = [range(first, min(first + _CHUNK, count)) for first in range(0, count, _CHUNK)]
+        ahead = 4 * processes
+        waiting = [pool.submit(_drawn, draw, chunk) for chunk in chunks[:ahead]]
+        for k in range(len(chunks)):
+            yield from waiting.pop(0).result()
+            if k + ahead < len(chunks):
+                waiting.append(pool.submit(_drawn, draw, chunks[k + ahead]))
+
+
+def _drawn(draw: Callable[[int], Image8], frames: range) -> list[Image8]:
+    return [draw(frame) for frame in frames]
 
 
 def _shifted(camera: Camera, k: int, n: int) -> Camera:

@@ -7,17 +7,13 @@ moves. Beside `film.mp4` stand `film.srt`, as DJI's drones write it, and `film.j
 
 import hashlib
 import json
-import multiprocessing
-import os
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,19 +25,16 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.simworld.camera.sensor import SensorOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.texture import Image8
-from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.simworld.world import WorldOptions, other_town_of, town_of
 from featuredb.video.writer import VideoWriter, VideoWriterOptions
-from tools.worlds.film_frame import Exposure, draw_frame
+from tools.worlds.film_frame import Exposure, draw_frame, in_order
 from tools.worlds.flight_path import FlightPath, PathOptions
 
 Progress = Callable[[int, int], None]
 
 FILM_FILE, TRUTH_FILE, TELEMETRY_FILE = "film.mp4", "film.json", "film.srt"
 _FORMAT = 1  # raised when the same options give other files
-_OTHER_SEED = 1000
 _START = datetime(2025, 6, 21, 12, 40, 3, tzinfo=UTC)
-_CHUNK = 4  # frames that travel to a process at a time
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,7 +154,9 @@ def write_film(
         fps=options.rate_hz,
         options=VideoWriterOptions(preset="veryfast", tags=tags),
     ) as writer:
-        for done, picture in enumerate(_pictures(options, workers), start=1):
+        for done, picture in enumerate(
+            in_order(partial(film_frame, options), options.frames, workers), start=1
+        ):
             writer.write(picture)
             if progress is not None:
                 progress(done, options.frames)
@@ -221,43 +216,13 @@ def _exposure_ev(options: FilmOptions, time_s: float) -> float:
 def _scene(options: FilmOptions, home: bool) -> Scene:
     if home:
         return town_of(options.world)
-    world = options.world
-    return make_town(
-        world.seed + _OTHER_SEED, name="other town", size_m=world.town_size_m, place=OTHER_TOWN_PLACE
-    )
+    return other_town_of(options.world)
 
 
 @lru_cache(maxsize=2)
 def _path(options: FilmOptions, home: bool) -> FlightPath:
     path = replace(options.path, duration_s=options.frames / options.rate_hz)
     return FlightPath(_scene(options, home), path)
-
-
-def _pictures(options: FilmOptions, workers: int) -> Iterator[Image8]:
-    """All frames in their order, from a pool of processes (or here, for one worker)."""
-    count = min(workers or os.cpu_count() or 1, options.frames)
-    if count <= 1:
-        yield from (film_frame(options, i) for i in range(options.frames))
-        return
-    # Spawned, not forked: the caller may have threads that a fork would cut off.
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, mp_context=context, initializer=_one_thread) as pool:
-        # A few chunks ahead of the writer, so that a slow disk does not fill the memory.
-        chunks = range(0, options.frames, _CHUNK)
-        ahead = 4 * count
-        waiting = [pool.submit(_chunk, options, first) for first in chunks[:ahead]]
-        for k in range(len(chunks)):
-            yield from waiting.pop(0).result()
-            if k + ahead < len(chunks):
-                waiting.append(pool.submit(_chunk, options, chunks[k + ahead]))
-
-
-def _one_thread() -> None:
-    cv2.setNumThreads(1)
-
-
-def _chunk(options: FilmOptions, first: int) -> list[Image8]:
-    return [film_frame(options, i) for i in range(first, min(first + _CHUNK, options.frames))]
 
 
 def _truth_json(options: FilmOptions) -> dict[str, Any]:

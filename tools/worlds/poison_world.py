@@ -26,7 +26,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.simworld.flight import FlightOptions, survey_half_extent
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import OTHER_TOWN_PLACE, make_town
-from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
+from tools.worlds.album import PlannedPhoto, Progress, write_album
 from tools.worlds.album_files import Geotag
 from tools.worlds.edits import Edit
 from tools.worlds.gathering import named, plan_visits, tagged
@@ -195,11 +195,12 @@ def write_poison(
     Raises:
         OSError: the folder cannot be written.
     """
-    if album_is_complete(folder):
-        return Path(folder)
-    home = options.scene("home/0/000")
-    photos = survey_photos(home, options.flight, options.seed) + plan_poison(options)
-    return write_album(folder, options, home, photos, workers, progress)
+
+    def plan() -> list[PlannedPhoto]:
+        survey = survey_photos(options.scene("home/0/000"), options.flight, options.seed)
+        return survey + plan_poison(options)
+
+    return write_album(folder, options, plan, workers, progress)
 
 
 def plan_poison(options: PoisonOptions) -> list[PlannedPhoto]:

@@ -7,7 +7,7 @@ survey_far/. Kinds: survey, survey_far, walk, probe.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from featuredb.simworld.camera.shot import Shot
 from featuredb.simworld.flight import FlightOptions
 from featuredb.simworld.town.scene import Scene
 from featuredb.simworld.town.town import make_town
-from tools.worlds.album import PlannedPhoto, Progress, album_is_complete, write_album
+from tools.worlds.album import PlannedPhoto, Progress, write_album
 from tools.worlds.album_files import AlbumFact
 from tools.worlds.geotags import geotag_at
 from tools.worlds.people import Person, community
@@ -125,9 +125,7 @@ def write_walk(
     Raises:
         OSError: the folder cannot be written.
     """
-    if album_is_complete(folder):
-        return Path(folder)
-    return write_album(folder, options, options.scene("home/0/000"), plan_walk(options), workers, progress)
+    return write_album(folder, options, partial(plan_walk, options), workers, progress)
 
 
 def plan_walk(options: WalkOptions) -> list[PlannedPhoto]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import columns, layout
 from featuredb.export.dataset.contents import Contents
 from featuredb.export.dataset.own_frame import FOLDER
@@ -123,7 +124,7 @@ def _licences(contents: Contents) -> str:
         "## Licences\n"
         + _prose(
             "Of the photos that the maps were made of; owner, licence and capture time of each are in "
-            f"`{layout.ATTRIBUTION}`. The photos themselves are not part of the dataset."
+            f"`{ATTRIBUTION}`. The photos themselves are not part of the dataset."
         )
         + "\n"
         + _table(("licence", "photos"), rows)
@@ -168,7 +169,7 @@ def _files(folder: Path, contents: Contents) -> str:
         row(f"{layout.OBSERVATIONS}/*.parquet", "keypoints and descriptors; Parquet"),
         *([row(f"{layout.LIDAR}/**/*.laz", "LiDAR tiles; LAZ 1.4")] if contents.scans else []),
         *([row(f"{FOLDER}/*.parquet", "maps without a place, own frames; Parquet")] if own else []),
-        row(layout.ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
+        row(ATTRIBUTION, "every photo's owner, licence and capture time; CSV"),
     ]
     return (
         "## Files\n"

@@ -9,13 +9,12 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.dataset as ds
-import pyarrow.parquet as pq
 
-from featuredb.errors import ExportError, FeatureDbError
+from featuredb.errors import ExportError
 from featuredb.export.dataset.geoparquet import TableFile
+from featuredb.export.dataset.read import check_listed, decoded, read_table
 from featuredb.maps.unplaced_map import UnplacedMap
-from featuredb.store.decode import decode_map
-from featuredb.store.encode import content_digest, encode_map
+from featuredb.store.encode import encode_map
 from featuredb.store.snapshot import UnplacedSummary
 from featuredb.store.tables import IMAGES, MAPS, OBSERVATIONS, POINTS, SPECS
 
@@ -72,7 +71,7 @@ def own_rows(folder: Path, listed: frozenset[str]) -> list[dict[str, Any]]:
     """
     if table_path(MAPS) not in listed:
         return []
-    return list(_read(folder / table_path(MAPS)).to_pylist())
+    return list(read_table(folder / table_path(MAPS)).to_pylist())
 
 
 def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> UnplacedMap:
@@ -81,27 +80,14 @@ def load_own(folder: Path, row: Mapping[str, Any], listed: frozenset[str]) -> Un
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
-    map_id = row["map_id"]
-    missing = [table_path(table) for table in _CHILDREN if table_path(table) not in listed]
-    if missing:
-        raise ExportError(f"{folder}: SHA256SUMS does not list {missing[0]}, which has rows; copy it again")
-    only = ds.field("map_id") == map_id
-    try:
-        found = decode_map(
-            dict(row), {table: _read(folder / table_path(table), only).to_batches() for table in _CHILDREN}
-        )
-    except FeatureDbError as error:
-        raise ExportError(f"{folder}, map {map_id}: its files do not make a map ({error})") from error
-    if not isinstance(found, UnplacedMap) or content_digest(found) != row["content_digest"]:
-        raise ExportError(
-            f"{folder}, map {map_id}: the files hold another map than the one that was exported (its digest "
-            f"was {row['content_digest']}); get the dataset once more from its source"
-        )
+    for table in _CHILDREN:
+        check_listed(table_path(table), listed, folder)
+    only = ds.field("map_id") == row["map_id"]
+    found = decoded(
+        folder,
+        dict(row),
+        lambda: {t: read_table(folder / table_path(t), only=only).to_batches() for t in _CHILDREN},
+    )
+    if not isinstance(found, UnplacedMap):
+        raise ExportError(f"{folder}, map {found.map_id}: expected a map without a place, found one with")
     return found
-
-
-def _read(path: Path, only: ds.Expression | None = None) -> pa.Table:
-    try:
-        return pq.read_table(path, filters=only, use_threads=False, partitioning=None)
-    except (OSError, pa.ArrowException, KeyError) as error:
-        raise ExportError(f"{path}: expected a table of a dataset, cannot read it ({error})") from error

@@ -9,11 +9,10 @@ import pyarrow as pa
 from featuredb.export.dataset import columns
 from featuredb.export.dataset.geoparquet import GeoFile, TableFile, point_columns
 from featuredb.export.dataset.layout import IMAGES, OBSERVATIONS, POINTS, Partition
+from featuredb.export.shots import pose_covariance
 from featuredb.geo.crs.wkt import utm_projjson
 from featuredb.geo.geopose import geopose_from_camera
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import quaternion_from_matrix
-from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.encode import EncodedMap
 
@@ -108,25 +107,5 @@ def _image_on_earth(feature_map: FeatureMap, image: MapImage) -> dict[str, Any]:
         "yaw_deg": yaw,
         "pitch_deg": pitch,
         "roll_deg": roll,
-        "earth_covariance": earth_covariance(feature_map, image).ravel().tolist(),
+        "earth_covariance": pose_covariance(feature_map, image).ravel().tolist(),
     }
-
-
-def earth_covariance(feature_map: FeatureMap, image: MapImage) -> FloatArray:
-    """Covariance (6, 6) of a camera on Earth: rotations (rad) about true east, north, up, then metres along
-    them.
-
-    The pose's own, where it is known, plus that of the map's placement, which all its images share.
-    """
-    pose, frame = image.cam_from_local, feature_map.frame
-    by_placement = np.zeros((6, 7))
-    by_placement[:3, 1:4] = np.eye(3)
-    by_placement[3:, :] = point_jacobian(pose.center)
-    covariance = by_placement @ feature_map.placement.covariance @ by_placement.T
-    if image.covariance is not None:
-        # exp(xi) @ cam_from_local turns the camera by -R' omega and moves its centre by -R' nu.
-        turn = np.kron(np.eye(2), pose.rotation.T)
-        covariance = covariance + turn @ image.covariance @ turn.T
-    to_true = np.kron(np.eye(2), frame.true_enu_from_enu(pose.center))
-    covariance = to_true @ covariance @ to_true.T
-    return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)

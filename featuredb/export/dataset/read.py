@@ -1,7 +1,7 @@
 """The maps of a dataset, exactly as they were exported."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.partitions import COLUMNS
 from featuredb.export.dataset.sums import check_sums
 from featuredb.maps.feature_map import FeatureMap
+from featuredb.maps.unplaced_map import AnyMap
 from featuredb.store.decode import decode_map
 from featuredb.store.encode import content_digest
 
@@ -42,12 +43,12 @@ def open_dataset(folder: Path) -> tuple[list[Row], frozenset[str]]:
     """
     listed = check_sums(folder)
     for name in (layout.DESCRIPTION, layout.MAPS, layout.CAMERAS):
-        _vouched(name, listed, folder)
+        check_listed(name, listed, folder)
     layout.read_description(folder)
     wanted = [name for name in MAPS.schema.names if name not in ("created_at", "geometry", "bbox")]
-    rows = _read(folder / layout.MAPS, wanted).to_pylist()
+    rows = read_table(folder / layout.MAPS, wanted).to_pylist()
     cameras: dict[str, list[Row]] = defaultdict(list)
-    for camera in _read(folder / layout.CAMERAS, CAMERAS.schema.names).to_pylist():
+    for camera in read_table(folder / layout.CAMERAS, CAMERAS.schema.names).to_pylist():
         cameras[camera["map_id"]].append(camera)
     for row in rows:
         own = sorted(cameras[row["map_id"]], key=lambda camera: int(camera["camera_id"]))
@@ -62,20 +63,29 @@ def load_map(folder: Path, row: Row, listed: frozenset[str]) -> FeatureMap:
     Raises:
         ExportError: its rows cannot be read, or are not the map that was exported.
     """
+    found = decoded(folder, row, lambda: {table: _rows_of(folder, table, row, listed) for table in COLUMNS})
+    if not isinstance(found, FeatureMap):
+        raise ExportError(f"{folder}, map {found.map_id}: expected a map with a place, found one without")
+    return found
+
+
+def decoded(folder: Path, row: Row, children: Callable[[], dict[str, list[pa.RecordBatch]]]) -> AnyMap:
+    """The map of a row and of the rows of its tables.
+
+    Raises:
+        ExportError: its rows cannot be read, or are not the map that was exported.
+    """
     map_id = row["map_id"]
     try:
-        children = {table: _rows_of(folder, table, row, listed) for table in COLUMNS}
-        feature_map = decode_map(row, children)
+        found = decode_map(row, children())
     except FeatureDbError as error:
         raise ExportError(f"{folder}, map {map_id}: its files do not make a map ({error})") from error
-    if content_digest(feature_map) != row["content_digest"]:
+    if content_digest(found) != row["content_digest"]:
         raise ExportError(
             f"{folder}, map {map_id}: the files hold another map than the one that was exported "
             f"(its digest was {row['content_digest']}); get the dataset once more from its source"
         )
-    if not isinstance(feature_map, FeatureMap):
-        raise ExportError(f"{folder}, map {map_id}: expected a map with a place, found one without")
-    return feature_map
+    return found
 
 
 def _rows_of(
@@ -84,20 +94,26 @@ def _rows_of(
     name = row[f"{table}_file"]
     if name is None:
         return []
-    _vouched(name, listed, folder)
+    check_listed(name, listed, folder)
     wanted = [column for column in COLUMNS[table].schema.names if column not in ("geometry", "bbox")]
     only = ds.field("map_id") == row["map_id"]
-    return list(_read(folder / name, wanted, only).to_batches())
+    return list(read_table(folder / name, wanted, only).to_batches())
 
 
-def _read(path: Path, columns: list[str], only: ds.Expression | None = None) -> pa.Table:
+def read_table(path: Path, columns: list[str] | None = None, only: ds.Expression | None = None) -> pa.Table:
+    """Columns (None: all) of the rows of a table that fit.
+
+    Raises:
+        ExportError: it cannot be read.
+    """
     try:
         return pq.read_table(path, columns=columns, filters=only, use_threads=False, partitioning=None)
     except (OSError, pa.ArrowException, KeyError) as error:
         raise ExportError(f"{path}: expected a table of a dataset, cannot read it ({error})") from error
 
 
-def _vouched(name: str, listed: frozenset[str], folder: Path) -> None:
+def check_listed(name: str, listed: frozenset[str], folder: Path) -> None:
+    """Raise ExportError for a file that SHA256SUMS does not vouch for."""
     if name not in listed:
         raise ExportError(
             f"{folder}: SHA256SUMS does not list {name}, which is part of a dataset; copy it again"

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from featuredb.errors import MissingExtraError
+from featuredb.export.attribution import ATTRIBUTION
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.contents import Contents, MapEntry
 from featuredb.extras import require
@@ -56,7 +57,7 @@ def write_catalogue(contents: Contents, description: Mapping[str, Any], folder: 
     for name, title, kind in (
         (layout.MAPS, "the maps", _PARQUET),
         (layout.CAMERAS, "the cameras", _PARQUET),
-        (layout.ATTRIBUTION, "owner and licence of every photo", "text/csv"),
+        (ATTRIBUTION, "owner and licence of every photo", "text/csv"),
         (layout.DATASHEET, "datasheet", "text/markdown"),
         (layout.PICTURE, "coverage", "image/png"),
     ):

@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import AttributionFile
+from featuredb.export.attribution import Attribution, attribution_of, write_attribution
 from featuredb.export.dataset import layout
 from featuredb.export.dataset.columns import CAMERAS, MAPS
 from featuredb.export.dataset.contents import Contents, MapEntry, entry_of
@@ -82,15 +82,15 @@ def write_dataset(job: ExportJob, *, with_lidar: bool = False) -> Exported:
 def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
     """All tables and the attribution, with one map in memory at a time."""
     contents, lineages = Contents(), job.snapshot.lineages()
+    credits: list[Attribution] = []
     with (
         PartitionFiles(folder) as files,
         _RowFile(GeoFile(folder / layout.MAPS, MAPS.schema, MAPS.repeating, None), MAPS.schema) as maps,
         _RowFile(TableFile(folder / layout.CAMERAS, CAMERAS.schema, ()), CAMERAS.schema) as cameras,
-        AttributionFile(folder / layout.ATTRIBUTION) as attribution,
         OwnFrameFiles(folder) as own,
     ):
         for feature_map in job.any_maps():
-            attribution.add(feature_map)
+            credits += attribution_of(feature_map)
             if isinstance(feature_map, UnplacedMap):
                 own.add(feature_map, _unplaced(job, feature_map.map_id))
                 continue
@@ -102,6 +102,7 @@ def _write_maps(job: ExportJob, folder: Path) -> tuple[Contents, OwnFrameFiles]:
             for camera in _camera_rows(feature_map):
                 cameras.add(camera)
             del feature_map  # before the next one is loaded
+    write_attribution(folder, credits)
     if not contents.maps:
         job.summaries()  # names what has no place
         raise ExportError(

@@ -3,7 +3,7 @@
 from functools import partial
 from pathlib import Path
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
+from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap_model import (
     image_names,
     keypoint_rows,
@@ -12,7 +12,7 @@ from featuredb.export.formats.colmap_model import (
 )
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob
-from featuredb.export.tally import folder_for_any_map
+from featuredb.export.tally import folder_for_each
 from featuredb.maps.unplaced_map import AnyMap
 
 MODEL_FOLDER = "sparse"
@@ -28,7 +28,7 @@ def write_colmap(job: ExportJob, *, text: bool = False) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    return folder_for_any_map(job, partial(write_map, text=text))
+    return folder_for_each(job, job.any_maps(), partial(write_map, text=text))
 
 
 def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
@@ -43,4 +43,4 @@ def write_map(folder: Path, feature_map: AnyMap, *, text: bool = False) -> None:
         reconstruction.write_binary(str(model))
     write_colmap_database(folder / DATABASE, feature_map, keypoints, names)
     (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
-    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
+    write_attribution(folder, attribution_of(feature_map))

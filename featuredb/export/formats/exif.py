@@ -4,21 +4,13 @@ Photos are found by the SHA-256 of their bytes, whatever they are called. Origin
 its segments can be exchanged without touching the picture.
 """
 
-import csv
-from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from featuredb.errors import ExportError, FeatureDbError, ImageError
-from featuredb.export.attribution import (
-    ATTRIBUTION,
-    Attribution,
-    attribution_csv,
-    attribution_of,
-    folder_name,
-)
+from featuredb.export.attribution import Attribution, attribution_of, folder_name, write_attribution
 from featuredb.export.formats.colmap_model import image_names
-from featuredb.export.job import Exported, ExportJob, whole_or_nothing
+from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.export.tally import ExportTally
 from featuredb.features.exif.gps_write import GpsFields, with_gps
@@ -28,7 +20,6 @@ from featuredb.features.jpeg_segments import with_app1
 from featuredb.file_digest import file_sha256
 
 FILES_TABLE = "files.csv"
-_COLUMNS = ("map_id", "image", "sha256", "file", "reason")
 _RADIUS_68 = 1.5096  # of a circular normal distribution, in units of the deviation of one axis
 # What the receiver said of its own position no longer belongs to the position that is written.
 _STALE = (
@@ -38,8 +29,7 @@ _STALE = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _File:
+class _File(NamedTuple):
     """What became of one photo: its file in the export, or why there is none."""
 
     map_id: str
@@ -49,7 +39,7 @@ class _File:
     reason: str
 
 
-def write_exif(job: ExportJob, photos: Path) -> Exported:
+def write_exif(job: ExportJob, photos: Path | None) -> Exported:
     """Write copies to `job.out`/<map>/<photo>, with files.csv and attribution.csv.
 
     A photo that is not in the folder, or no JPEG, is named in files.csv with the reason, and not counted.
@@ -58,6 +48,8 @@ def write_exif(job: ExportJob, photos: Path) -> Exported:
         ExportError: nothing is selected, none of the photos can be written, no such folder, or there is
             something at `job.out`.
     """
+    if photos is None:
+        raise ExportError("--format exif: expected --photos FOLDER with the photos to be copied, found none")
     if not photos.is_dir():
         raise ExportError(f"--photos {photos}: expected the folder of the photos, found none")
     found = files_by_sha256(photos)
@@ -85,8 +77,8 @@ def write_exif(job: ExportJob, photos: Path) -> Exported:
                 if files
                 else "the selected maps have no photos"
             )
-        _write_table(part / FILES_TABLE, files)
-        (part / ATTRIBUTION).write_text(attribution_csv(attribution), encoding="utf-8")
+        write_csv(part / FILES_TABLE, _File._fields, files)
+        write_attribution(part, attribution)
         return tally.exported(part)
 
 
@@ -169,10 +161,3 @@ def _safe(name: str) -> Path:
     """The image's name as a path that stays below its folder."""
     parts = [part for part in PurePosixPath(name.replace("\\", "/")).parts if part not in ("/", ".")]
     return Path(*(folder_name(part) for part in parts))
-
-
-def _write_table(path: Path, files: Iterable[_File]) -> None:
-    with path.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(_COLUMNS)
-        writer.writerows([getattr(file, column) for column in _COLUMNS] for file in files)

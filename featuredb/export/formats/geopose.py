@@ -8,10 +8,10 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of, folder_name
+from featuredb.export.attribution import attribution_of, folder_name, write_attribution
 from featuredb.export.job import Exported, ExportJob, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.export.tally import folder_for_each_map
+from featuredb.export.tally import folder_for_each
 from featuredb.geo.geopose_documents import advanced, basic_ypr, irregular_series
 from featuredb.maps.feature_map import FeatureMap
 
@@ -25,7 +25,7 @@ def write_geopose(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    return folder_for_each_map(job, _write_map)
+    return folder_for_each(job, job.maps(), _write_map)
 
 
 def _write_map(folder: Path, feature_map: FeatureMap) -> None:
@@ -53,7 +53,7 @@ def _write_map(folder: Path, feature_map: FeatureMap) -> None:
         ],
     }
     write_json(folder / MANIFEST, manifest)
-    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
+    write_attribution(folder, attribution_of(feature_map))
 
 
 def _time(shot: PosedPhoto) -> int:

@@ -11,11 +11,11 @@ from urllib.parse import quote
 
 import numpy as np
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
+from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap_model import KeypointRows, colmap_keypoints, image_names, keypoint_rows
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob
-from featuredb.export.tally import folder_for_any_map
+from featuredb.export.tally import folder_for_each
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.rotation import quaternion_from_matrix
 from featuredb.maps.unplaced_map import AnyMap
@@ -32,7 +32,7 @@ def write_kapture(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, or there is something at `job.out`.
     """
-    return folder_for_any_map(job, write_map)
+    return folder_for_each(job, job.any_maps(), write_map)
 
 
 def write_map(folder: Path, feature_map: AnyMap) -> None:
@@ -44,7 +44,7 @@ def write_map(folder: Path, feature_map: AnyMap) -> None:
     _write_features(folder / RECONSTRUCTION, feature_map, keypoints, names)
     _write_points(folder / RECONSTRUCTION, feature_map, keypoints, names)
     (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
-    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
+    write_attribution(folder, attribution_of(feature_map))
 
 
 def kapture_names(feature_map: AnyMap) -> list[str]:

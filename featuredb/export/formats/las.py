@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from featuredb.export.attribution import attribution_of
 from featuredb.export.formats.point_files import MapList, sigma_m, zones_of
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.tally import ExportTally
@@ -35,9 +34,7 @@ def write_las_files(job: ExportJob, *, compressed: bool) -> Exported:
             streams: dict[tuple[int, str], LasStream] = {}
             for feature_map in job.maps():
                 key = feature_map.epsg, feature_map.height_datum
-                index = maps.add(
-                    feature_map, attribution_of(feature_map), zones[key].name + ending if key in zones else ""
-                )
+                index = maps.add(feature_map, zones[key].name + ending if key in zones else "")
                 tally.add(feature_map)
                 if not len(feature_map.points):
                     continue

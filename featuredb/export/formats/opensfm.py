@@ -11,13 +11,13 @@ from typing import IO, Any
 
 import numpy as np
 
-from featuredb.export.attribution import ATTRIBUTION, attribution_csv, attribution_of
+from featuredb.export.attribution import attribution_of, write_attribution
 from featuredb.export.formats.colmap_model import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob, write_json
 from featuredb.export.shots import PosedPhoto, shots_of
-from featuredb.export.tally import folder_for_each_map
+from featuredb.export.tally import folder_for_each
 from featuredb.geometry.rotation import so3_log
 from featuredb.maps.feature_map import FeatureMap, MapImage
 
@@ -30,7 +30,7 @@ def write_opensfm(job: ExportJob) -> Exported:
     Raises:
         ExportError: nothing is selected, there is something at `job.out`, or a lens that OpenSfM cannot have.
     """
-    return folder_for_each_map(job, write_map)
+    return folder_for_each(job, job.maps(), write_map)
 
 
 def write_map(folder: Path, feature_map: FeatureMap) -> None:
@@ -52,7 +52,7 @@ def write_map(folder: Path, feature_map: FeatureMap) -> None:
     }
     write_json(folder / "shots.geojson", shots)
     (folder / GEOREFERENCE).write_text(georeference_text(feature_map, names), encoding="utf-8")
-    (folder / ATTRIBUTION).write_text(attribution_csv(attribution_of(feature_map)), encoding="utf-8")
+    write_attribution(folder, attribution_of(feature_map))
 
 
 def _reference(feature_map: FeatureMap) -> dict[str, float]:

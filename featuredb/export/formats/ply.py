@@ -10,7 +10,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.export.attribution import attribution_of, folder_name
+from featuredb.export.attribution import folder_name
 from featuredb.export.formats.point_files import MapList, Zone, sigma_m, zones_of
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing
 from featuredb.export.tally import ExportTally
@@ -54,7 +54,7 @@ def write_ply_files(job: ExportJob) -> Exported:
                     continue
                 key = feature_map.epsg, feature_map.height_datum
                 file = f"{zones[key].name}.ply" if key in zones else ""
-                index = maps.add(feature_map, attribution_of(feature_map), file)
+                index = maps.add(feature_map, file)
                 tally.add(feature_map)
                 if not len(feature_map.points):
                     continue
@@ -78,7 +78,7 @@ def _body(folder: Path, zone: Zone) -> Path:
 def _write_own(folder: Path, unplaced: UnplacedMap, maps: MapList) -> None:
     """A map without a place, in its own frame."""
     file = f"own_frame_{folder_name(unplaced.map_id)}.ply"
-    index = maps.add(unplaced, attribution_of(unplaced), file)
+    index = maps.add(unplaced, file)
     if not len(unplaced.points):
         return
     body = folder / f"{file}.body"

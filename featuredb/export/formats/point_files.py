@@ -1,7 +1,5 @@
 """What files of points have in common: one for each zone and height datum, and a list of the maps."""
 
-import csv
-import io
 from collections import defaultdict
 from dataclasses import dataclass
 from datetime import UTC, date
@@ -11,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.errors import ExportError
-from featuredb.export.attribution import ATTRIBUTION, Attribution, attribution_csv
+from featuredb.export.attribution import Attribution, attribution_of, write_attribution
+from featuredb.export.job import write_csv
 from featuredb.geo.crs.wkt import utm_wkt
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap, PointColumns
@@ -91,9 +90,10 @@ class MapList:
         self._rows: list[tuple[object, ...]] = []
         self._photos: list[Attribution] = []
 
-    def add(self, feature_map: AnyMap, attribution: list[Attribution], file: str) -> int:
+    def add(self, feature_map: AnyMap, file: str) -> int:
         """The map's number, which its points carry."""
         index = len(self._rows)
+        attribution = attribution_of(feature_map)
         licences = "; ".join(sorted({row.licence for row in attribution if row.licence}))
         points = len(feature_map.points)
         place: tuple[object, object] = ("", "")
@@ -110,9 +110,5 @@ class MapList:
 
     def write(self, folder: Path) -> None:
         """Both tables as CSV."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(_MAP_COLUMNS)
-        writer.writerows(self._rows)
-        (folder / MAPS_TABLE).write_text(out.getvalue(), encoding="utf-8")
-        (folder / ATTRIBUTION).write_text(attribution_csv(self._photos), encoding="utf-8")
+        write_csv(folder / MAPS_TABLE, _MAP_COLUMNS, self._rows)
+        write_attribution(folder, self._photos)

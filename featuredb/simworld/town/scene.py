@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.arrays import FloatArray, freeze
 
 # Names of textures; a face holds the index. The painters in `materials` and `ground` know what they mean.
 TEXTURES = (
@@ -146,13 +146,8 @@ class Ellipsoids:
 
     def __post_init__(self) -> None:
         n = len(self.center)
-        for name, columns in (("center", 3), ("radii", 3), ("tint", 3), ("texture_uv", 2)):
-            object.__setattr__(
-                self, name, frozen_array(f"Ellipsoids.{name}", getattr(self, name), (n, columns))
-            )
-        object.__setattr__(
-            self, "object_id", frozen_array("Ellipsoids.object_id", self.object_id, (n,), np.int32)
-        )
+        freeze(self, center=(n, 3), radii=(n, 3), tint=(n, 3), texture_uv=(n, 2))
+        freeze(self, np.int32, object_id=(n,))
 
     def __len__(self) -> int:
         return len(self.center)
@@ -267,6 +262,4 @@ class Scene:
     pieces: int = 1
 
     def __post_init__(self) -> None:
-        object.__setattr__(
-            self, "enu_from_town", frozen_array("Scene.enu_from_town", self.enu_from_town, (3, 3))
-        )
+        freeze(self, enu_from_town=(3, 3))

@@ -1,0 +1,38 @@
+"""A world with what was seen of its town from the air, for programs that anchor and track."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from featuredb.simworld.scan_world import OTHER_SCAN_FILE, SCAN_FILE, write_lidar
+from featuredb.simworld.world import World, WorldOptions, open_world, write_world
+
+_DONE = "scan_world.done"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScanWorld:
+    """A world on disk.
+
+    Attributes:
+        world: photos and their truth.
+        scan: of the photos' town, LAZ with intensity only.
+        other_scan: of another town at the same place on Earth: nothing registers to it.
+    """
+
+    world: World
+    scan: Path
+    other_scan: Path
+
+
+def make_scan_world(folder: Path, seed: int, size: str, workers: int) -> ScanWorld:
+    """The world that `featuredb simworld FOLDER --lidar` writes, made unless it is there already.
+
+    Args:
+        size: short or full.
+    """
+    if not (folder / _DONE).exists():
+        options = WorldOptions.short(seed) if size == "short" else WorldOptions(seed=seed)
+        write_lidar(folder, options)
+        write_world(folder, replace(options, workers=workers))
+        (folder / _DONE).touch()
+    return ScanWorld(world=open_world(folder), scan=folder / SCAN_FILE, other_scan=folder / OTHER_SCAN_FILE)
