@@ -15,7 +15,7 @@ unlike derivatives in image axes they bear contrast that turns round, which betw
 is the rule.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -27,14 +27,15 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense.oriented_gradients import (
+from ingest.register.frame.dense.pictures import (
     FloatImage,
-    GradientOptions,
+    PinholeView,
+    finest_side_px,
     inner_part,
     oriented_gradients,
+    pinhole_view,
+    source_picture,
 )
-from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view
-from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture
 from ingest.register.frame_registration import RenderSource
 
 _BINS = 24  # some ten thousand samples fill 24 x 24 bins with about twenty each
@@ -75,7 +76,6 @@ class IntensityOptions:
     min_gain: float = 0.0
     sigma_px: float = 0.7
     max_evaluations: int = 250
-    gradients: GradientOptions = field(default_factory=GradientOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -211,11 +211,9 @@ def _octave(
 ) -> _Octave:
     rendering = render(cloud, view.camera, pose, RenderOptions(threads=1))
     picture = source_picture(rendering, source)
-    channels = oriented_gradients(picture, rendering.valid, options.gradients)
+    channels = oriented_gradients(picture, rendering.valid)
     smooth = cv2.GaussianBlur(view.image.astype(np.float32), (0, 0), 0.7)
-    photo = np.concatenate(
-        [_soft_bins(smooth)[None], oriented_gradients(view.image, view.valid, options.gradients)]
-    )
+    photo = np.concatenate([_soft_bins(smooth)[None], oriented_gradients(view.image, view.valid)])
     usable = inner_part(rendering.valid, 2) & view.valid
     rows, columns = np.nonzero(usable)
     if len(rows) > options.max_samples:

@@ -20,10 +20,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.dense.confirmation import ConfirmOptions
-from ingest.register.frame.dense.fit import DenseFitOptions
-from ingest.register.frame.near import NoNearFit, fit_near
-from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.register import register_frame
+from ingest.register.frame.options import DenseFitOptions, FrameOptions
+from ingest.register.frame.register import fit_near, register_frame
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import DepthFilterOptions, surface_at
 from ingest.track.keyframe_average import KeyframeAverage
@@ -128,9 +126,9 @@ class ScanGround:
             sigma_tilt_deg=own.track_sigma_deg,
         )
         found = fit_near(gray, camera, prior, self._cloud, self._source, own.near)
-        if isinstance(found, NoNearFit):
-            return Unmatched(reason=found.reason, detail=found.message)
-        averaged = self._average.add(pose, found.pose.cam_from_local, found.covariance)
+        if found.cam_from_local is None or found.covariance is None or found.source is None:
+            return Unmatched(reason=str(found.reason), detail=found.message)
+        averaged = self._average.add(pose, found.cam_from_local, found.covariance)
         return self._landmarks(gray, camera, averaged, found.covariance, found.source, options)
 
     def found(

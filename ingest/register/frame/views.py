@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,11 @@ from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.pool import Pool, pool_features
 from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.verdict import MIN_COVER
 from ingest.register.frame_registration import FramePrior, RenderSource
+
+SPACING_PX = 1.5  # renders are no finer than this many pixels between scan points: splats show nothing more
+MIN_SIDE_PX = 400  # and at least; smaller pictures show too little
 
 _LOOK_SIDE_PX = 200  # of the first look, which only measures distance and cover
 _LOOK_WIDER = 2.0  # and sees so many times as far to every side: the prior may look past the scan
@@ -76,7 +80,6 @@ class FrameViews:
         options: FrameOptions,
     ) -> None:
         self.gray, self.camera, self.cloud, self.look, self.options = gray, camera, cloud, look, options
-        self.points_drawn: list[int] = []
         self._features: dict[tuple[bool, int], Features] = {}
 
     @property
@@ -87,8 +90,8 @@ class FrameViews:
     def side_px(self, most_px: int) -> int:
         """Longer side of renders: no finer than the scan, no smaller than features need."""
         side = max(self.camera.width, self.camera.height)
-        by_scan = round(self.options.spacing_px * side / max(self.spacing_full_px, 1e-6))
-        return int(np.clip(by_scan, min(self.options.min_side_px, side), min(most_px, side)))
+        by_scan = round(SPACING_PX * side / max(self.spacing_full_px, 1e-6))
+        return int(np.clip(by_scan, min(MIN_SIDE_PX, side), min(most_px, side)))
 
     def render_camera(self, side_px: int) -> Camera:
         """The photo's camera, shrunk."""
@@ -105,8 +108,7 @@ class FrameViews:
         single = RenderOptions(threads=1)
         with ThreadPoolExecutor(self._threads()) as threads:
             made = list(threads.map(lambda pose: render(self.cloud, camera, pose, single), poses))
-        self.points_drawn += [r.points_drawn for r in made]
-        return [r for r in made if r.valid.mean() >= self.options.verdict.min_cover]
+        return [r for r in made if r.valid.mean() >= MIN_COVER]
 
     def photo_features(self, upright: bool, side_px: int, count: int) -> Features:
         """Features of the photo at about the size of the renders; kept for the next call."""
@@ -128,10 +130,8 @@ class FrameViews:
         self, renderings: Sequence[Rendering], source: RenderSource, upright: bool, count: int
     ) -> list[Pool]:
         """Features of each render with their scan points."""
-        options = self.options.pool
-        options = replace(options, extractor=replace(options.extractor, max_features=count))
         with ThreadPoolExecutor(self._threads()) as threads:
-            return list(threads.map(lambda r: pool_features([r], source, upright, options), renderings))
+            return list(threads.map(lambda r: pool_features(r, source, upright, count), renderings))
 
     def _threads(self) -> int:
         return self.options.threads or min(len(os.sched_getaffinity(0)), 4)

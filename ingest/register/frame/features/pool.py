@@ -1,7 +1,6 @@
 """Features of renders, pooled with the scan points that they show."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -9,67 +8,49 @@ from numpy.typing import NDArray
 
 from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions, extract
-from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.render.rendering import Rendering
 from featuredb.render.shading import shaded_relief
 from ingest.register.frame_registration import RenderSource
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoolOptions:
-    """Which features of renders count.
-
-    Attributes:
-        extractor: the product's, with a lower contrast threshold than photos get, since renders are smooth.
-        max_depth_step: a feature whose surroundings differ by more than this share in depth lies on a
-            silhouette: what it shows is two things, and its depth is a guess.
-        clear_of_void: a feature must keep so many of its radii away from where the render is empty.
-    """
-
-    extractor: ExtractorOptions = field(
-        default_factory=lambda: ExtractorOptions(
-            max_side_px=1600, max_features=5000, oversample=1.5, contrast_threshold=0.008
-        )
-    )
-    max_depth_step: float = 0.04
-    clear_of_void: float = 0.75
+# The product's, with a lower contrast threshold than photos get, since renders are smooth.
+_EXTRACTOR = ExtractorOptions(max_side_px=1600, oversample=1.5, contrast_threshold=0.008)
+# A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
+# two things, and its depth is a guess.
+_MAX_DEPTH_STEP = 0.04
+_CLEAR_OF_VOID = 0.75  # a feature must keep so many of its radii away from where the render is empty
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pool:
-    """Features of one or more renders with their scan points.
+    """Features of renders with their scan points.
 
     Attributes:
         points: (n, 3) local frame, metres.
         descriptors: (n, 128) uint8.
-        fingerprint: of the extractor.
     """
 
     points: FloatArray
     descriptors: NDArray[np.uint8]
-    fingerprint: str
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-def pool_features(
-    renderings: Sequence[Rendering], source: RenderSource, upright: bool, options: PoolOptions
-) -> Pool:
-    """Extract the features of every render and lift them to the scan by its depth.
+def pool_features(rendering: Rendering, source: RenderSource, upright: bool, most: int) -> Pool:
+    """At most so many features of a render, lifted to the scan by its depth.
 
     Raises:
-        InvalidValueError: no renders, or the scan does not have `source`.
+        InvalidValueError: the scan does not have `source`.
     """
-    if not renderings:
-        raise InvalidValueError("pool_features: expected at least one rendering, found none")
-    parts = [_of_one(rendering, source, upright, options) for rendering in renderings]
-    return Pool(
-        points=np.concatenate([points for points, _ in parts]),
-        descriptors=np.concatenate([features.descriptors for _, features in parts]),
-        fingerprint=parts[0][1].fingerprint,
-    )
+    image = filled(source_image(rendering, source), rendering.valid)
+    features = extract(image, replace(_EXTRACTOR, max_features=most, upright=upright))
+    points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
+    clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
+    row = np.clip(features.xy[:, 1].astype(np.int64), 0, image.shape[0] - 1)
+    good &= clear[row, column] >= _CLEAR_OF_VOID * 0.5 * features.scale
+    return Pool(points=points[good], descriptors=features.descriptors[good])
 
 
 def source_image(rendering: Rendering, source: RenderSource) -> NDArray[np.uint8]:
@@ -129,16 +110,3 @@ def lift(
     in_camera = np.where(good[:, None], rays * np.where(good, depth, 0.0)[:, None], 0.0)
     points = rendering.cam_from_local.inverse().act(in_camera)
     return np.where(good[:, None], points, 0.0), good
-
-
-def _of_one(
-    rendering: Rendering, source: RenderSource, upright: bool, options: PoolOptions
-) -> tuple[FloatArray, Features]:
-    image = filled(source_image(rendering, source), rendering.valid)
-    features = extract(image, replace(options.extractor, upright=upright))
-    points, good = lift(rendering, features.xy, options.max_depth_step)
-    clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
-    column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
-    row = np.clip(features.xy[:, 1].astype(np.int64), 0, image.shape[0] - 1)
-    good &= clear[row, column] >= options.clear_of_void * 0.5 * features.scale
-    return points[good], features.take(good)
