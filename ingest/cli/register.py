@@ -65,14 +65,9 @@ def add_control_arguments(parser: Any) -> None:
 
 def control_options(args: argparse.Namespace, *, keep_lens: bool = False) -> "GcpOptions":
     """Options of a placement by control points."""
-    from ingest.register.control.adjust import ControlAdjustOptions
-    from ingest.register.control.level import LevelGroundOptions
     from ingest.register.control.placement import GcpOptions
 
-    level = LevelGroundOptions()
-    if args.ground_height is not None:
-        level = LevelGroundOptions(ground_up_m=args.ground_height[0], sigma_ground_m=args.ground_height[1])
-    return GcpOptions(sigma_m=args.gcp_sigma, level=level, adjust=ControlAdjustOptions(keep_lens=keep_lens))
+    return GcpOptions(sigma_m=args.gcp_sigma, ground_m=args.ground_height, keep_lens=keep_lens)
 
 
 def run_register(args: argparse.Namespace) -> int:

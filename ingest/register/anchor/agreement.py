@@ -14,21 +14,12 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AgreementOptions:
-    """When two frames agree.
-
-    Attributes:
-        max_apart_share: median distance between the places of the same map points, as a share of the
-            distance from which they are seen. `featuredb anchor` prints how far apart right frames are: up to
-            0.27 m on brighton, from 40 to 50 m, 0.07 m in the simulated town; this allows five times that.
-            Wrong frames have not been measured: none has passed the verdict so far.
-        min_apart_m: and never less than this, for frames that are close to what they see.
-    """
-
-    max_apart_share: float = 0.03
-    min_apart_m: float = 0.3
+# Median distance between the places of the same map points, as a share of the distance from which they are
+# seen. `featuredb anchor` prints how far apart right frames are: up to 0.27 m on brighton, from 40 to 50 m,
+# 0.07 m in the simulated town; this allows five times that. Wrong frames have not been measured: none has
+# passed the verdict so far.
+_MAX_APART_SHARE = 0.03
+_MIN_APART_M = 0.3  # and never less than this, for frames that are close to what they see
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,7 +55,7 @@ class FrameAgreement:
     allowed_m: Mapping[tuple[int, int], float]
 
 
-def frames_that_agree(frames: Sequence[LoneFrame], options: AgreementOptions) -> FrameAgreement:
+def frames_that_agree(frames: Sequence[LoneFrame]) -> FrameAgreement:
     """The largest set of frames whose similarities agree."""
     apart: dict[tuple[int, int], float] = {}
     allowed: dict[tuple[int, int], float] = {}
@@ -73,7 +64,7 @@ def frames_that_agree(frames: Sequence[LoneFrame], options: AgreementOptions) ->
         points = np.vstack([a.points, b.points])
         difference = a.new_from_old.act(points) - b.new_from_old.act(points)
         apart[pair] = float(np.median(np.linalg.norm(difference, axis=1)))
-        allowed[pair] = max(options.max_apart_share * max(a.distance_m, b.distance_m), options.min_apart_m)
+        allowed[pair] = max(_MAX_APART_SHARE * max(a.distance_m, b.distance_m), _MIN_APART_M)
     ids = [frame.image_id for frame in frames]
     for size in range(len(ids), 0, -1):
         sets = [

@@ -17,34 +17,18 @@ from ingest.register.anchor.proposals import (
     FrameProposal,
     FrameScore,
     PhotoReader,
-    ProposalOptions,
     propose_frames,
 )
-from ingest.register.anchor.start.priors import HeightShift, StartOptions, height_shift, prior_from_map
-from ingest.register.frame.options import FrameOptions
+from ingest.register.anchor.start.priors import HeightShift, height_shift, prior_from_map
 from ingest.register.frame.register import register_frame
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FramesOptions:
-    """Which frames are registered, and how.
-
-    Attributes:
-        frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
-        max_tries: frames tried until the first one is registered, at most; a wrong scan costs all of them.
-        more_tries: frames tried at most once one is registered. Where one of three registers, as low films
-            over a scan without colours, 18 leave fewer than two registered once in 150 maps.
-    """
-
-    frames: int = 3
-    max_tries: int = 6
-    more_tries: int = 18
-    start: StartOptions = field(default_factory=StartOptions)
-    proposals: ProposalOptions = field(default_factory=ProposalOptions)
-    frame: FrameOptions = field(default_factory=FrameOptions)
+# Frames tried at most once one is registered. Where one of three registers, as low films over a scan without
+# colours, 18 leave fewer than two registered once in 150 maps.
+_MORE_TRIES = 18
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -109,7 +93,8 @@ def try_frames(
     feature_map: FeatureMap,
     cloud: PointCloud,
     read_gray: PhotoReader,
-    options: FramesOptions,
+    wanted: int,
+    max_tries: int,
     *,
     starts: Mapping[int, FramePrior] | None = None,
     readable: Sequence[int] | None = None,
@@ -122,31 +107,32 @@ def try_frames(
     Args:
         cloud: the scan around the map, in the map's local frame.
         read_gray: grey pixels (h, w) of an image of the map.
+        wanted: accepted frames. max_tries: until the first one is accepted.
         starts: priors by a person, by image id; these frames are tried first.
         readable: ids of images whose photos are there; None for all.
     """
     starts = starts or {}
-    shift = height_shift(feature_map, cloud, options.start)
+    shift = height_shift(feature_map, cloud)
     ids = {i.image_id for i in feature_map.images} if readable is None else set(readable)
     priors = {
-        image.image_id: starts.get(image.image_id, prior_from_map(feature_map, image, shift, options.start))
+        image.image_id: starts.get(image.image_id, prior_from_map(feature_map, image, shift))
         for image in feature_map.images
         if image.image_id in ids
     }
     reader = _Reader(read_gray)
-    ranking = propose_frames(feature_map, cloud, priors, reader.for_ranking, options.proposals)
-    wanted = [_started(feature_map, i, starts[i], ranking) for i in starts]
-    wanted += [p for p in ranking if p.image.image_id not in starts]
+    ranking = propose_frames(feature_map, cloud, priors, reader.for_ranking)
+    order = [_started(feature_map, i, starts[i], ranking) for i in starts]
+    order += [p for p in ranking if p.image.image_id not in starts]
     tried: list[TriedFrame] = []
-    least = max(options.max_tries, len(starts))
-    for number, proposal in enumerate(wanted[: max(least, options.more_tries)]):
+    least = max(max_tries, len(starts))
+    for number, proposal in enumerate(order[: max(least, _MORE_TRIES)]):
         accepted = sum(frame.registration.accepted for frame in tried)
-        if accepted >= options.frames or (number >= least and not accepted):
+        if accepted >= wanted or (number >= least and not accepted):
             break
-        frame = _try(feature_map, cloud, proposal, reader, options.frame)
+        frame = _try(feature_map, cloud, proposal, reader)
         if frame is not None:
             tried.append(frame)
-        progress("register", sum(f.registration.accepted for f in tried), options.frames)
+        progress("register", sum(f.registration.accepted for f in tried), wanted)
     return TriedFrames(shift=shift, ranking=tuple(ranking), tried=tuple(tried), unreadable=reader.unreadable)
 
 
@@ -185,14 +171,13 @@ def _try(
     cloud: PointCloud,
     proposal: FrameProposal,
     reader: "_Reader",
-    options: FrameOptions,
 ) -> TriedFrame | None:
     gray = reader.full(proposal.image)
     if gray is None:
         return None
     camera = camera_of_photo(feature_map.cameras[proposal.image.camera_id], gray)
     start, cpu = time.perf_counter(), time.process_time()
-    registration = register_frame(gray, camera, proposal.prior, cloud, options)
+    registration = register_frame(gray, camera, proposal.prior, cloud)
     seconds = time.perf_counter() - start
     _LOG.info(
         "%s: %s in %.1f s",
@@ -214,7 +199,6 @@ def register_again(
     frames: Sequence[TriedFrame],
     read_gray: PhotoReader,
     prior_sigma: tuple[float, float],
-    options: FrameOptions,
 ) -> list[TriedFrame]:
     """Register frames anew from where a placed map has them, with its lens.
 
@@ -234,7 +218,7 @@ def register_again(
             sigma_tilt_deg=prior_sigma[1],
         )
         proposal = replace(frame.proposal, image=image, prior=prior)
-        tried = _try(feature_map, cloud, proposal, reader, options)
+        tried = _try(feature_map, cloud, proposal, reader)
         if tried is not None:
             again.append(tried)
     return again

@@ -1,7 +1,7 @@
 """Proposed frames on disk, between the command that proposes them and the one that confirms them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,39 +17,18 @@ PROPOSALS = "proposals.json"
 _VERSION = 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SavedProposals:
-    """What was proposed for one state of one map.
-
-    Attributes:
-        map_id: of the map. write_id: of its state; another state has other poses.
-        scan_id: of the scan.
-        registrations: accepted ones, by image id.
-    """
-
-    map_id: str
-    write_id: str
-    scan_id: str
-    registrations: Mapping[int, FrameRegistration]
+State = tuple[str, str, str]
+"""Ids of a map, of its state (another one has other poses), and of the scan."""
 
 
-def save_proposals(folder: Path, proposals: SavedProposals) -> Path:
-    """Write folder/proposals.json, atomically."""
-    path = folder / PROPOSALS
-    write_json(
-        path,
-        {
-            "version": _VERSION,
-            "map_id": proposals.map_id,
-            "write_id": proposals.write_id,
-            "scan_id": proposals.scan_id,
-            "frames": {str(i): _plain(r) for i, r in proposals.registrations.items() if r.accepted},
-        },
-    )
-    return path
+def save_proposals(folder: Path, state: State, registrations: Mapping[int, FrameRegistration]) -> None:
+    """Write folder/proposals.json, atomically: accepted registrations by image id."""
+    names = dict(zip(("map_id", "write_id", "scan_id"), state, strict=True))
+    frames = {str(i): _plain(r) for i, r in registrations.items() if r.accepted}
+    write_json(folder / PROPOSALS, {"version": _VERSION, **names, "frames": frames})
 
 
-def load_proposals(folder: Path, map_id: str, write_id: str, scan_id: str) -> SavedProposals:
+def load_proposals(folder: Path, state: State) -> Mapping[int, FrameRegistration]:
     """Read them back for the same map, in the same state, and the same scan.
 
     Raises:
@@ -71,12 +50,12 @@ def load_proposals(folder: Path, map_id: str, write_id: str, scan_id: str) -> Sa
         frames = {int(i): _registration(entry) for i, entry in document["frames"].items()}
     except (IngestError, KeyError, TypeError, ValueError) as error:
         raise RegistrationError(f"{path}: cannot be read as proposals ({error!r}); propose anew") from error
-    if found != (map_id, write_id, scan_id):
+    if found != state:
         raise RegistrationError(
             f"{path}: proposed for map {found[0]}, state {found[1]}, scan {found[2]}; the map is now in "
-            f"state {write_id} with scan {scan_id}; run the command without --confirm again"
+            f"state {state[1]} with scan {state[2]}; run the command without --confirm again"
         )
-    return SavedProposals(map_id=map_id, write_id=write_id, scan_id=scan_id, registrations=frames)
+    return frames
 
 
 def _plain(registration: FrameRegistration) -> dict[str, Any]:
@@ -102,14 +81,7 @@ def _registration(entry: dict[str, Any]) -> FrameRegistration:
         covariance=np.array(entry["covariance"]),
         reason=None,
         message="",
-        camera=None
-        if camera is None
-        else Camera(
-            model=camera["model"],
-            width=camera["width"],
-            height=camera["height"],
-            params=tuple(camera["params"]),
-        ),
+        camera=None if camera is None else Camera(**camera | {"params": tuple(camera["params"])}),
         source=entry["source"],
         points_local=np.array(entry["points_local"]).reshape(-1, 3),
         pixels=np.array(entry["pixels"]).reshape(-1, 2),

@@ -15,10 +15,10 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.plain_json import plain
 from featuredb.render.cloud import PointCloud
 from ingest.html_parts import folded, note, page, picture, pill, table
+from ingest.register.anchor.anchor_map import AnchorResult
 from ingest.register.anchor.frames import TriedFrame, TriedFrames
 from ingest.register.anchor.page import FramePicture, flick_page
 from ingest.register.anchor.pictures import map_over_scan_png, overlay_rgb, png, residuals_png, scan_view
-from ingest.register.anchor.values import AnchorResult
 from ingest.workspace import atomic_file, write_json
 
 SCHEMA_ID = "featuredb/ingest/anchor/1"

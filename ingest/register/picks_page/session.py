@@ -22,9 +22,8 @@ from ingest.anchoring import Anchoring, AnchorRequest, anchor
 from ingest.register.anchor.photo_files import PhotoFiles, find_photos
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import chosen_scans
-from ingest.register.anchor.start.pick_fit import PickFit, PickFitOptions, fit_picks
+from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, least_picks, pose_from_picks
-from ingest.register.anchor.start.priors import StartOptions
 from ingest.register.picks_page.ground import GroundPicture, ground_of
 
 _PHOTO_PX = 4096
@@ -130,11 +129,7 @@ class PickSession:
                 "message": f"{len(spots)} of at least {least} picks",
                 "picks": [],
             }
-        options = StartOptions()
-        sigma_px = options.pick_sigma_px_rel * max(camera.width, camera.height)
-        fit = fit_picks(
-            pixels, points, camera, focal_rel, PickFitOptions(sigma_px=sigma_px, sigma_m=options.pick_sigma_m)
-        )
+        fit = fit_picks(pixels, points, camera, focal_rel)
         if fit is None:
             return {"ready": False, "pose": False, "message": "no pose explains these picks", "picks": []}
         self._fits[image_id] = fit
@@ -162,7 +157,6 @@ class PickSession:
                 points,
                 camera,
                 self._upright(image),
-                options,
                 focal_rel,
             )
         except FeatureDbError as error:
