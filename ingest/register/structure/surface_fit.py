@@ -27,13 +27,14 @@ class Surface:
         points: (k, 3) float64, less `middle`.
         normals: (k, 3) unit.
         spacing_m: typical distance of neighbours.
-        tree: small_gicp's, of `points`.
+        cloud, tree: small_gicp's, of `points`; normals and tree lie in the cloud's memory.
     """
 
     middle: FloatArray
     points: FloatArray
     normals: FloatArray
     spacing_m: float
+    cloud: Any
     tree: Any
 
 
@@ -57,6 +58,7 @@ def surface_near(cloud: PointCloud, points: FloatArray, most: int = _MAX_SURFACE
         points=xyz,
         normals=np.asarray(prepared.normals())[:, :3],
         spacing_m=float(np.median(np.sqrt(np.asarray(squared)[:, 1]))),
+        cloud=prepared,
         tree=tree,
     )
 
