@@ -24,9 +24,8 @@ from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
 from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
+from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
-from ingest.register.anchor.photo_files import PhotoFiles, find_photos
-from ingest.register.anchor.proposal_file import load_proposals, save_proposals
 from ingest.register.anchor.report import AnchorReport, write_anchor_report
 from ingest.register.anchor.start.first_place import (
     MARGIN_M,

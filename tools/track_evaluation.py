@@ -41,7 +41,7 @@ from featuredb.simworld.world import WorldOptions
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.register.frame_registration import FramePrior
-from ingest.track.map_over_scan import MapOverScanFinder
+from ingest.track.finders import MapOverScanFinder
 from ingest.track.scan_ground import ScanFinder
 from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder

@@ -15,8 +15,7 @@ from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
-from ingest.models_in.kapture_sensors import KaptureSensors, read_sensors
-from ingest.models_in.kapture_tables import floats, table, whole
+from ingest.models_in.kapture_sensors import KaptureSensors, floats, read_sensors, table, whole
 from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel, as_rootsift, scale_and_angle
 
 _TYPES = {"float32": "<f4", "float64": "<f8", "float": "<f8"}

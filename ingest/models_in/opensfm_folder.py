@@ -24,8 +24,7 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.models_in.json_values import mapping, member, number, numbers, read_json
-from ingest.models_in.opensfm_lens import camera_from_opensfm
-from ingest.models_in.opensfm_tracks import OpensfmTracks, read_tracks
+from ingest.models_in.opensfm_parts import OpensfmTracks, camera_from_opensfm, read_tracks
 from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel
 
 TRACKS, REFERENCE, CONFIG = "tracks.csv", "reference_lla.json", "config.yaml"

@@ -15,6 +15,7 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.candidates import available_sources
@@ -23,7 +24,6 @@ from ingest.register.frame.options import DenseFitOptions, FrameOptions
 from ingest.register.frame.register import fit_near, register_frame
 from ingest.register.frame_registration import FramePrior, RenderSource
 from ingest.register.structure.depth_filter import surface_at
-from ingest.track.keyframe_average import KeyframeAverage
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
 from reloc.tracking.options import TrackOptions
@@ -99,13 +99,7 @@ class ScanGround:
         self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """A frame (h, w) that the track knows, registered to the scan from there."""
-        prior = FramePrior(
-            cam_from_local=pose,
-            sigma_horizontal_m=_TRACK_SIGMA_M,
-            sigma_vertical_m=_TRACK_SIGMA_M,
-            sigma_heading_deg=_TRACK_SIGMA_DEG,
-            sigma_tilt_deg=_TRACK_SIGMA_DEG,
-        )
+        prior = FramePrior.around(pose, _TRACK_SIGMA_M, _TRACK_SIGMA_DEG)
         found = fit_near(gray, camera, prior, self._cloud, self._source, _NEAR)
         if found.cam_from_local is None or found.covariance is None or found.source is None:
             return Unmatched(reason=str(found.reason), detail=found.message)
@@ -242,3 +236,59 @@ def _corners(gray: NDArray[np.uint8]) -> FloatArray:
     scale = max(gray.shape) / 1280
     found = cv2.goodFeaturesToTrack(gray, _CORNERS, _CORNER_QUALITY, _CORNER_APART_PX * scale)
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + _HALF_PX
+
+
+# Registrations of a film's keyframes, averaged along its track, so that poses do not jump at each.
+#
+# A window of keyframes whose older ones fade: what is adjusted in one go over a sliding window is folded into
+# one normal distribution, as a Kalman filter does. The track says how the camera moved between keyframes, far
+# better than a registration says where it is.
+
+
+class KeyframeAverage:
+    """The fading average of the registrations of one uninterrupted track."""
+
+    def __init__(self, fade: float, max_chi2: float) -> None:
+        """
+        Args:
+            fade: what a keyframe counts at the next one, 0 to 1: about 1 / (1 - fade) of them take part.
+            max_chi2: squared normalised distance between the track and a registration; beyond it the track
+                has gone astray, and the average begins again.
+        """
+        self._fade, self._max_chi2 = fade, max_chi2
+        self._information: FloatArray | None = None
+        self._center = np.zeros(3)
+
+    def begin(self, pose: Rigid3, covariance: FloatArray) -> None:
+        """With the registration of a frame that was found."""
+        self._information = np.asarray(np.linalg.inv(of_camera(pose, covariance)), dtype=np.float64)
+        self._center = pose.center
+
+    def end(self) -> None:
+        """The track goes on by something else, or is lost."""
+        self._information = None
+
+    def add(self, tracked: Rigid3, registered: Rigid3, covariance: FloatArray) -> Rigid3:
+        """The pose of a keyframe by all of them.
+
+        Args:
+            tracked: where the track has it. registered: where the scan has it.
+            covariance: (6, 6) of the left perturbation of the registered pose.
+        """
+        if self._information is None:
+            self.begin(registered, covariance)
+            return registered
+        # An error of the older keyframes' rotation moves the camera by what it has gone since.
+        back = np.eye(6)
+        back[3:, :3] = skew(tracked.center - self._center)
+        older = self._fade * back.T @ self._information @ back
+        own = np.linalg.inv(of_camera(registered, covariance))
+        to_local = np.kron(np.eye(2), -tracked.rotation.T)
+        apart = to_local @ (registered @ tracked.inverse()).log()
+        if apart @ np.linalg.solve(np.linalg.inv(older) + np.linalg.inv(own), apart) > self._max_chi2:
+            self.begin(registered, covariance)
+            return registered
+        moved = np.linalg.solve(older + own, own @ apart)
+        fused = Rigid3.exp(to_local.T @ moved) @ tracked
+        self._information, self._center = older + own, fused.center
+        return fused

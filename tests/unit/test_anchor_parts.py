@@ -14,9 +14,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from ingest.register.anchor.page import FramePicture, flick_page
-from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
-from ingest.register.anchor.proposal_file import load_proposals, save_proposals
+from ingest.register.anchor.files import load_proposals, save_proposals
+from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
 from ingest.register.anchor.proposals import propose_frames, small_camera
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m

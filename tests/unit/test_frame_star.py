@@ -6,7 +6,7 @@ import pytest
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
-from ingest.register.frame.features.star import (
+from ingest.register.frame.views import (
     MAX_ARM_SHARE,
     MIN_ARM_SHARE,
     UPRIGHT_REACH_DEG,

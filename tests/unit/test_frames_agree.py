@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.anchor.agreement import LoneFrame, frames_that_agree
+from ingest.register.anchor.frames import LoneFrame, frames_that_agree
 
 
 def lone(image_id: int, east_m: float = 0.0, turn_rad: float = 0.0) -> LoneFrame:

@@ -7,9 +7,8 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.evidence import residual_table
+from ingest.register.control.maps import residual_table, vertical_of
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
-from ingest.register.control.registered_map import vertical_of
 from tests.support.control import LOCAL_FROM_BLOCK, SurveyedBlock, moved_mark, surveyed_block
 
 _OPTIONS = GcpOptions()

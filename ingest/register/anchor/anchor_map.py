@@ -15,8 +15,13 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.agreement import FrameAgreement, LoneFrame, frames_that_agree
-from ingest.register.anchor.frames import TriedFrame, TriedFrames
+from ingest.register.anchor.frames import (
+    FrameAgreement,
+    LoneFrame,
+    TriedFrame,
+    TriedFrames,
+    frames_that_agree,
+)
 from ingest.register.anchor.placing import PlaceRound, place_in_rounds, with_lens
 from ingest.register.anchor.proposals import PhotoReader
 from ingest.register.structure.map_move import (

@@ -32,9 +32,8 @@ from ingest.register.control.fit import (
     fit_similarity,
     hypotheses,
 )
-from ingest.register.control.gps_offset import gps_offset
 from ingest.register.control.marks import Control
-from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
+from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
 from ingest.register.control.snooping import Outcome, improve, initial_weights
 
 GcpReason = Literal[
@@ -103,12 +102,12 @@ class GcpPlacement:
 
     reason: GcpReason | None
     message: str
-    local_from_block: Sim3 | None
-    covariance: FloatArray | None
-    block: Block | None
-    points: tuple[PointResidual, ...]
-    marks: tuple[MarkResidual, ...]
-    notes: tuple[str, ...]
+    local_from_block: Sim3 | None = None
+    covariance: FloatArray | None = None
+    block: Block | None = None
+    points: tuple[PointResidual, ...] = ()
+    marks: tuple[MarkResidual, ...] = ()
+    notes: tuple[str, ...] = ()
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -143,11 +142,11 @@ def place_by_gcp(
     found = hypotheses(block, control)
     usable = sorted({h.point for h in found})
     if len(usable) < _MIN_POINTS:
-        return _refused(
-            "TOO_FEW",
-            f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
+        return GcpPlacement(
+            reason="TOO_FEW",
+            message=f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
             "needed; mark each point in two photos or more",
-            {"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
+            figures={"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
         )
     notes: list[str] = []
     needed = _vertical_is_needed(control, usable)
@@ -159,7 +158,7 @@ def place_by_gcp(
     fit = _fit(found, usable, control, vertical if needed else None)
     refused = _gate_fit(fit, control, usable)
     if refused is not None or fit is None:
-        return refused or _refused("DEGENERATE_LINE", "the control points coincide", {})
+        return refused or GcpPlacement(reason="DEGENERATE_LINE", message="the control points coincide")
     return _adjusted_placement(
         block, control, fit, vertical if needed else None, options, notes, gps_local, gps_sigma_m
     )
@@ -226,20 +225,21 @@ def _gate_fit(fit: ControlFit | None, control: Control, usable: list[int]) -> Gc
     extent = float(np.linalg.norm(np.ptp(surveyed, axis=0)))
     figures: dict[str, Any] = {"usable_points": len(usable), "extent_m": extent}
     if fit is None or extent <= 0:
-        return _refused(
-            "DEGENERATE_LINE",
-            "the control points, or their places in the photos, coincide or lie along a line",
-            figures,
+        return GcpPlacement(
+            reason="DEGENERATE_LINE",
+            message="the control points, or their places in the photos, coincide or lie along a line",
+            figures=figures,
         )
     share = float(fit.inliers.mean())
     figures |= {"agreeing_share": share, "fit_sigma_m": fit.sigma_m}
     if share < _MIN_SHARE or fit.inliers.sum() < _MIN_POINTS or fit.sigma_m > _MAX_SIGMA_OVER_EXTENT * extent:
-        return _refused(
-            "RESIDUALS",
-            f"the control points do not fit the photos: {int(fit.inliers.sum())} of {len(usable)} agree, to "
-            f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
-            "units, and that the marks are of these photos",
-            figures,
+        return GcpPlacement(
+            reason="RESIDUALS",
+            message="the control points do not fit the photos: "
+            f"{int(fit.inliers.sum())} of {len(usable)} agree, to {fit.sigma_m:.2f} m over {extent:.0f} m; "
+            "check the reference system, the order of x and y, the units, and that the marks are of these "
+            "photos",
+            figures=figures,
         )
     return None
 
@@ -371,17 +371,3 @@ def _gate(
                 figures=figures,
             )
     return replace(placement, figures=figures, notes=(*placement.notes, *notes))
-
-
-def _refused(reason: GcpReason, message: str, figures: dict[str, Any]) -> GcpPlacement:
-    return GcpPlacement(
-        reason=reason,
-        message=message,
-        local_from_block=None,
-        covariance=None,
-        block=None,
-        points=(),
-        marks=(),
-        notes=(),
-        figures=figures,
-    )

@@ -23,10 +23,9 @@ from ingest.register.frame.features.search import (
     search,
     star_groups,
 )
-from ingest.register.frame.features.star import FULL_CIRCLE_SIGMA_DEG
 from ingest.register.frame.prior_fit import loosened
 from ingest.register.frame.verdict import MIN_CONFIRMATION_PIECES, MIN_JOINT_LOG_NFA
-from ingest.register.frame.views import FrameViews
+from ingest.register.frame.views import FULL_CIRCLE_SIGMA_DEG, FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 _MIN_LOG_NFA = 2.0  # a pose with less evidence among the features' matches is not looked into

@@ -16,8 +16,7 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.frame.dense.confirmation import confirm_pose
 from ingest.register.frame.dense.search import REACH_SIGMA, register_dense
-from ingest.register.frame.features.star import turned_about_vertical
-from ingest.register.frame.views import FrameViews, first_look
+from ingest.register.frame.views import FrameViews, first_look, turned_about_vertical
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 _FINALISTS = 3  # as in the search at the photo's own place

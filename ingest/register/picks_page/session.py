@@ -19,7 +19,7 @@ from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from ingest.anchoring import Anchoring, AnchorRequest, anchor
-from ingest.register.anchor.photo_files import PhotoFiles, find_photos
+from ingest.register.anchor.files import PhotoFiles, find_photos
 from ingest.register.anchor.pictures import edge_layer, jpeg, png, scan_view
 from ingest.register.anchor.start.first_place import chosen_scans
 from ingest.register.anchor.start.pick_fit import PickFit, fit_picks

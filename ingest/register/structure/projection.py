@@ -69,10 +69,10 @@ class StructurePlacement:
 
     reason: StructureReason | None
     message: str
-    new_from_old: Sim3 | None
-    covariance: FloatArray | None
-    pairs: Pairs | None
-    inliers: NDArray[np.bool_]
+    new_from_old: Sim3 | None = None
+    covariance: FloatArray | None = None
+    pairs: Pairs | None = None
+    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -89,21 +89,23 @@ def project_structure(
         registered: frames with their poses in the cloud's local frame; one is enough.
     """
     if not registered:
-        return _refused("NO_FRAMES", "no frame is registered to the scan")
+        return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
     pairs = structure_pairs(feature_map, source, registered, cloud)
+    none = np.zeros(len(pairs), dtype=bool)
     if len(pairs) < _MIN_PAIRS:
         words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
-        return _refused("TOO_FEW_PAIRS", words, pairs)
+        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words, pairs=pairs, inliers=none)
     distances = _distances(pairs, registered)
     tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
     start = ransac_similarity(pairs, tolerance)
     if start is None:
-        return _refused("NO_SIMILARITY", "the pairs lie on a line or coincide", pairs)
+        words = "the pairs lie on a line or coincide"
+        return StructurePlacement(reason="NO_SIMILARITY", message=words, pairs=pairs, inliers=none)
     near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
     reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
-        return _refused(reason, message, pairs, figures)
+        return StructurePlacement(reason=reason, message=message, pairs=pairs, inliers=none, figures=figures)
     kept = _rows(pairs, near)
     fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
@@ -111,7 +113,9 @@ def project_structure(
     inliers = near.copy()
     inliers[near] = fit.inliers
     if reason is not None:
-        return _refused(reason, message, pairs, figures, inliers)
+        return StructurePlacement(
+            reason=reason, message=message, pairs=pairs, inliers=inliers, figures=figures
+        )
     figures |= _surface_figures(source, fit.target_from_source, cloud)
     return StructurePlacement(
         reason=None,
@@ -286,22 +290,3 @@ def _summary(distances: FloatArray) -> dict[str, float | int | None]:
         "rms_m": float(np.sqrt((near**2).mean())),
         "p90_m": float(np.percentile(near, 90)),
     }
-
-
-def _refused(
-    reason: StructureReason,
-    message: str,
-    pairs: Pairs | None = None,
-    figures: dict[str, Any] | None = None,
-    inliers: NDArray[np.bool_] | None = None,
-) -> StructurePlacement:
-    none = np.zeros(0 if pairs is None else len(pairs), dtype=bool)
-    return StructurePlacement(
-        reason=reason,
-        message=message,
-        new_from_old=None,
-        covariance=None,
-        pairs=pairs,
-        inliers=none if inliers is None else inliers,
-        figures=figures or {},
-    )

@@ -37,13 +37,11 @@ class HeightShift:
         sigma_m: robust standard deviation of one point's difference (roughness, slope times horizontal
             error, vegetation).
         points: map points that had a scan point near.
-        share: of the map's points.
     """
 
     shift_m: float
     sigma_m: float
     points: int
-    share: float
 
 
 def height_shift(feature_map: FeatureMap, cloud: PointCloud) -> HeightShift | None:
@@ -75,7 +73,6 @@ def height_shift(feature_map: FeatureMap, cloud: PointCloud) -> HeightShift | No
         shift_m=median,
         sigma_m=float(1.4826 * np.median(np.abs(difference - median))),
         points=int(found.sum()),
-        share=float(found.mean()),
     )
 
 

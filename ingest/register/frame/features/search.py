@@ -10,16 +10,15 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
 from ingest.register.frame.features.consistency import MAX_TURN_DEG, consistent_matches
-from ingest.register.frame.features.matching import FrameMatches, guided_matches, joined, pooled_matches
-from ingest.register.frame.features.pool import Pool
-from ingest.register.frame.features.star import (
+from ingest.register.frame.features.matching import FrameMatches, Pool, guided_matches, joined, pooled_matches
+from ingest.register.frame.prior_fit import fitted_under_prior
+from ingest.register.frame.views import (
     FULL_CIRCLE_SIGMA_DEG,
+    FrameViews,
     fan_headings_deg,
     star_poses,
     turned_about_vertical,
 )
-from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.views import FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.acceptance import independent_inliers, log_nfa
 from reloc.localise.lens_prior import LensPriors
