@@ -27,8 +27,8 @@ from ingest.models_in.place import (
     place_by_photos,
     place_of_georeference,
 )
-from ingest.models_in.source import NAMES, ModelSource, open_model
-from ingest.models_in.stored import DescribedAnew
+from ingest.models_in.source import NAMES, open_model
+from ingest.models_in.stored import DescribedAnew, ModelSource
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import PhotoFeatures

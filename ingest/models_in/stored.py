@@ -1,9 +1,11 @@
 """What every format of models gives: the model as arrays, and the keypoints and descriptors of its images."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +15,17 @@ from featuredb.features.decode import INGEST_LIMITS, decode_gray
 from featuredb.features.describe import describe_at
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
 from featuredb.features.orientation import orientations_at
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.sfm.extract import LazyFeatures, PhotoFeatures
 
 # RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
 # `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).
 _NORM_RANGE, _MEAN_RANGE = (500.0, 524.0), (33.0, 42.0)
+
+
+ModelFormat = Literal["colmap", "opensfm", "kapture"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -119,6 +126,34 @@ class StoredFeatures(LazyFeatures):
             ),
             rgb=self.stored.keypoint_colours(index),
         )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModelSource:
+    """A model that has been read.
+
+    Attributes:
+        place: the folder that it was found in.
+        files: what it was read from. feature_files: what its features will be.
+        open_features: given the fingerprint of their extractor.
+        has_descriptors: whether the format keeps descriptors that can be compared with ours.
+        photos: where the format has its photos, None where that is anywhere.
+        reference: the frame of the model's coordinates, without its accuracy; None: the files do not say.
+        gps: for each image, what the files say of its own position; empty: nothing.
+        choice: which of several models it is, "" where there is one.
+    """
+
+    format: ModelFormat
+    place: Path
+    stored: StoredModel
+    files: tuple[Path, ...]
+    open_features: Callable[[str], AbstractContextManager[StoredFeatures]]
+    feature_files: tuple[Path, ...] = ()
+    has_descriptors: bool = True
+    photos: Path | None = None
+    reference: LocalFrame | None = None
+    gps: tuple[GeoPrior | None, ...] = ()
+    choice: str = ""
 
 
 def scale_and_angle(rows: NDArray[np.float32], where: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
