@@ -6,7 +6,7 @@ as it was.
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,7 @@ class AnchorRequest:
         frames: how many to register, None for the default.
         auto: place the map without a person.
         confirm: names of proposed frames that a person has confirmed.
-        pose_file, picks_file, image: where a registration starts.
+        start: where a registration starts.
         storage_options: as the command line had them, for the command that confirms.
     """
 
@@ -64,9 +64,7 @@ class AnchorRequest:
     frames: int | None = None
     auto: bool = False
     confirm: tuple[str, ...] = ()
-    pose_file: Path | None = None
-    picks_file: Path | None = None
-    image: str | None = None
+    start: StartFiles = field(default_factory=StartFiles)
     storage_options: tuple[str, ...] = ()
 
 
@@ -151,7 +149,7 @@ def anchor(
     notes += _about_photos(job, tried)
     result: AnchorResult | None = None
     if request.auto or request.confirm:
-        supervised = bool(request.confirm or request.pose_file or request.picks_file)
+        supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
             job.feature_map, job.cloud, tried, job.gray, job.options,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
@@ -224,12 +222,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
     if isinstance(loaded, UnplacedMap):
-        first = first_place(
-            database,
-            loaded,
-            StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image),
-            request.scan_ids,
-        )
+        first = first_place(database, loaded, request.start, request.scan_ids)
         feature_map, cloud, scan_ids = first.feature_map, first.cloud, first.scan_ids
     else:
         assert isinstance(summary, MapSummary)
@@ -312,8 +305,7 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     if job.first is not None:
         starts, notes = dict(job.first.starts), list(job.first.notes)
     else:
-        files = StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image)
-        found = started_images(feature_map, files, feature_map.frame, feature_map.epsg)
+        found = started_images(feature_map, request.start, feature_map.frame, feature_map.epsg)
         starts = {f.image.image_id: f.prior for f in found}
         notes = [f.note for f in found]
     for image_id in starts:

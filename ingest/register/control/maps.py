@@ -2,7 +2,7 @@
 evidence and a table of what they leave.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -55,18 +55,16 @@ def register_by_gcp(
     file: ControlFile,
     options: GcpOptions,
     height_datum: str = "unknown",
-    other_photos: Mapping[str, str] | None = None,
 ) -> GcpRegistration:
     """Place a map by control points; nothing is written.
 
     Args:
         height_datum: of the surveyed heights, where the file's reference system does not say it.
-        other_photos: photos that are not in the map, by name, with the reason.
     """
     check_datum(height_datum)
     frame = _frame(feature_map, file)
     block = block_of_map(feature_map)
-    control = meet(file, block, frame, other_photos)
+    control = meet(file, block, frame)
     frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
     gps, sigma = gps_in(frame, [image.gps for image in feature_map.images])
     placement = place_by_gcp(

@@ -87,7 +87,7 @@ def register_dense(
     camera: Camera,
     prior: FramePrior,
     cloud: PointCloud,
-    source: RenderSource = "intensity",
+    source: RenderSource,
 ) -> list[DensePose]:
     """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
 
