@@ -6,7 +6,7 @@ as it was.
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +23,9 @@ from featuredb.render.cloud import PointCloud
 from featuredb.store import Database, MapSummary, Snapshot, UnplacedSummary
 from featuredb.store.scans import list_scans
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.anchor_map import place_map
+from ingest.register.anchor.anchor_map import AnchorOptions, AnchorResult, place_map
+from ingest.register.anchor.files import PhotoFiles, find_photos, load_proposals, save_proposals
 from ingest.register.anchor.frames import TriedFrames, try_frames
-from ingest.register.anchor.photo_files import PhotoFiles, find_photos
-from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
 from ingest.register.anchor.report import AnchorReport, write_anchor_report
 from ingest.register.anchor.start.first_place import (
     MARGIN_M,
@@ -37,7 +36,6 @@ from ingest.register.anchor.start.first_place import (
     started_images,
 )
 from ingest.register.anchor.start.priors import image_named
-from ingest.register.anchor.values import AnchorOptions, AnchorResult
 from ingest.register.frame_registration import FramePrior
 
 _CONFIRM = "--confirm"
@@ -55,7 +53,7 @@ class AnchorRequest:
         frames: how many to register, None for the default.
         auto: place the map without a person.
         confirm: names of proposed frames that a person has confirmed.
-        pose_file, picks_file, image: where a registration starts.
+        start: where a registration starts.
         storage_options: as the command line had them, for the command that confirms.
     """
 
@@ -66,9 +64,7 @@ class AnchorRequest:
     frames: int | None = None
     auto: bool = False
     confirm: tuple[str, ...] = ()
-    pose_file: Path | None = None
-    picks_file: Path | None = None
-    image: str | None = None
+    start: StartFiles = field(default_factory=StartFiles)
     storage_options: tuple[str, ...] = ()
 
 
@@ -145,6 +141,7 @@ def anchor(
             job.cloud,
             job.gray,
             job.options.frames,
+            job.options.max_tries,
             starts=starts,
             readable=list(job.files.paths),
             progress=progress,
@@ -152,7 +149,7 @@ def anchor(
     notes += _about_photos(job, tried)
     result: AnchorResult | None = None
     if request.auto or request.confirm:
-        supervised = bool(request.confirm or request.pose_file or request.picks_file)
+        supervised = bool(request.confirm or request.start.pose or request.start.picks)
         result = place_map(
             job.feature_map, job.cloud, tried, job.gray, job.options,
             confirmed=bool(request.confirm), supervised=supervised, progress=progress,
@@ -184,15 +181,8 @@ def _finished(
         report=report, map_id=job.summary.map_id, out=job.out, page=page, report_page=report_page
     )
     if result is None:
-        save_proposals(
-            job.out,
-            SavedProposals(
-                map_id=job.summary.map_id,
-                write_id=job.summary.write_id,
-                scan_id=" ".join(job.scan_ids),
-                registrations={f.image.image_id: f.registration for f in tried.accepted},
-            ),
-        )
+        saved = {f.image.image_id: f.registration for f in tried.accepted}
+        save_proposals(job.out, _state(job), saved)
         names = tuple(f.image.name for f in tried.accepted)
         command = _confirm_command(database, job).replace(
             "{image}", f" {_CONFIRM} ".join(shlex.quote(name) for name in names)
@@ -232,13 +222,7 @@ def _load(database: Database, request: AnchorRequest, options: AnchorOptions) ->
     files = find_photos(loaded, request.photos)
     first: FirstPlace | None = None
     if isinstance(loaded, UnplacedMap):
-        first = first_place(
-            database,
-            loaded,
-            StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image),
-            request.scan_ids,
-            options.frames.start,
-        )
+        first = first_place(database, loaded, request.start, request.scan_ids)
         feature_map, cloud, scan_ids = first.feature_map, first.cloud, first.scan_ids
     else:
         assert isinstance(summary, MapSummary)
@@ -321,10 +305,7 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
     if job.first is not None:
         starts, notes = dict(job.first.starts), list(job.first.notes)
     else:
-        files = StartFiles(pose=request.pose_file, picks=request.picks_file, image=request.image)
-        found = started_images(
-            feature_map, files, feature_map.frame, feature_map.epsg, job.options.frames.start
-        )
+        found = started_images(feature_map, request.start, feature_map.frame, feature_map.epsg)
         starts = {f.image.image_id: f.prior for f in found}
         notes = [f.note for f in found]
     for image_id in starts:
@@ -335,18 +316,23 @@ def _starts(job: _Job) -> tuple[dict[int, FramePrior], list[str]]:
 
 def _confirmed(job: _Job) -> TriedFrames:
     """The proposed frames that the person confirms, as if they had just been registered."""
-    saved = load_proposals(job.out, job.summary.map_id, job.summary.write_id, " ".join(job.scan_ids))
+    saved = load_proposals(job.out, _state(job))
     chosen = [image_named(job.feature_map, name) for name in job.request.confirm]
-    unknown = [image.name for image in chosen if image.image_id not in saved.registrations]
+    unknown = [image.name for image in chosen if image.image_id not in saved]
     if unknown:
         names = {i.image_id: i.name for i in job.feature_map.images}
         raise RegistrationError(
             f"{', '.join(unknown)}: not among the proposed frames: "
-            f"{', '.join(names[i] for i in saved.registrations) or 'none'}"
+            f"{', '.join(names[i] for i in saved) or 'none'}"
         )
     return TriedFrames.of_registrations(
-        job.feature_map, {image.image_id: saved.registrations[image.image_id] for image in chosen}
+        job.feature_map, {image.image_id: saved[image.image_id] for image in chosen}
     )
+
+
+def _state(job: _Job) -> tuple[str, str, str]:
+    """What proposals belong to: a map, its state, a scan."""
+    return job.summary.map_id, job.summary.write_id, " ".join(job.scan_ids)
 
 
 def _about_photos(job: _Job, tried: TriedFrames) -> list[str]:
@@ -365,6 +351,7 @@ def _with_frames(options: AnchorOptions, frames: int | None) -> AnchorOptions:
         return options
     return replace(
         options,
-        frames=replace(options.frames, frames=frames, max_tries=max(options.frames.max_tries, frames + 3)),
+        frames=frames,
+        max_tries=max(options.max_tries, frames + 3),
         min_agreeing=min(options.min_agreeing, frames),
     )

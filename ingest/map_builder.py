@@ -28,8 +28,7 @@ from ingest.colmap.precision import (
     upper_triangle,
 )
 from ingest.own_frame import own_frame_of
-from ingest.photos.photo import Photo
-from ingest.photos.positions import center_priors
+from ingest.photos.photo import Photo, center_priors
 from ingest.sfm.extract import PhotoFeatures
 
 _MOST_PHOTOS = 1000  # whose normal equations are inverted densely

@@ -26,7 +26,7 @@ from ingest.photos.scan import ScanOptions, ScanResult, require_usable, scan_fol
 from ingest.photos.table import is_table, read_table
 from ingest.placed_models import HINTS, Component, place_models
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage, reconstruct_photos
-from ingest.register.control.model import Survey
+from ingest.register.control.maps import Survey
 from ingest.report.outcomes import map_outcome, photo_outcomes, registered_photos
 from ingest.report.values import IngestReport, MapOutcome, PhotoOutcome, StageTiming
 from ingest.workspace import Workspace, default_root, remove_leftovers

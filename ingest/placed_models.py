@@ -12,18 +12,16 @@ from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.unplaced_map import NoPlace, UnplacedMap
 from ingest.colmap.bridge import Model
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
-from ingest.colmap.submodel import keep_photos, select_photos
 from ingest.map_builder import MapIdentity, build_map, build_unplaced_map
 from ingest.own_frame import WAYS_TO_A_PLACE, held_of
-from ingest.photos.photo import Photo
-from ingest.photos.positions import capture_seconds, gps_priors, local_frame_of
+from ingest.photos.photo import Photo, capture_seconds, gps_priors, local_frame_of
 from ingest.reconstruction import MapMakingOptions, Reconstructed
-from ingest.register.control.model import ControlledPlacement, Survey, place_by_survey
+from ingest.register.control.maps import ControlledPlacement, Survey, place_by_survey
 from ingest.register.gps import GpsOptions, GpsPlacement, place_by_gps
 from ingest.register.tagged_elsewhere import TaggedElsewhere, tagged_elsewhere
 from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.held_lens import impossible
-from ingest.sfm.links import tied_parts
+from ingest.sfm.links import keep_photos, select_photos, tied_parts
 
 _WEAKLY_TIED = (
     "fewer than {least} points tie them to any other photo of their reconstruction: buildings that look "

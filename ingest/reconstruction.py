@@ -23,17 +23,14 @@ from ingest.clusters.reconstruct import Reconstruction, reconstruct_clusters
 from ingest.executor import Executor, Lost, Progress, no_progress
 from ingest.fingerprint import options_fingerprint
 from ingest.map_builder import MapOptions
-from ingest.photos.cameras import CameraSharing, photo_cameras
 from ingest.photos.duplicates import copies_of
-from ingest.photos.photo import Photo
-from ingest.photos.positions import gps_priors, local_frame_of
+from ingest.photos.photo import CameraSharing, Photo, gps_priors, local_frame_of, photo_cameras
 from ingest.register.gps import GpsOptions
 from ingest.register.tagged_elsewhere import ElsewhereOptions
-from ingest.retrieval.aggregate import aggregate_photos
 from ingest.sfm.extract import FeatureFiles, extract_photos, features_key, read_keypoints
 from ingest.sfm.mapper import SfmOptions, SfmView
 from ingest.sfm.matching import Matched, MatchOptions, PhotoView, match_pairs
-from ingest.sfm.pairs import Pair, PairOptions, choose_pairs, more_pairs
+from ingest.sfm.pairs import Pair, PairOptions, aggregate_photos, choose_pairs, more_pairs
 from ingest.sfm.zoomed_lenses import zoomed_keys
 from ingest.workspace import Workspace
 
@@ -47,7 +44,7 @@ class MapMakingOptions:
     """Options of every step between photos and maps.
 
     Attributes:
-        cameras: which photos share intrinsics (ingest.photos.cameras).
+        cameras: which photos share intrinsics (ingest.photos.photo).
         min_tie: points that two photos have in common if they tie the map together; what hangs on others by
             fewer is a map of its own, or in none. In a simulated community of 5,000 photos 58 of 70 that hung
             by fewer than 30 were wrong, 44 of 126 that hung by 30 to 49, and 324 of 4,261 others.

@@ -48,9 +48,9 @@ from featuredb.lidar.add import add_scan
 from featuredb.lidar.load import load_cloud, scan_frame
 from featuredb.render.cloud import PointCloud
 from featuredb.store.database import Database
-from ingest.register.frame.dense.confirmation import ConfirmOptions
+from ingest.register.frame.dense.confirmation import MIN_LOG_NFA
 from ingest.register.frame.register import register_frame
-from ingest.register.frame.verdict import VerdictOptions
+from ingest.register.frame.verdict import MIN_CONFIRMATION_LOG_NFA
 from ingest.register.frame_registration import FramePrior
 from tools.figures import add_json_option, write_figures
 from tools.ortho_place import WINDOW_PX, Floats, OrthoOverScan, has_structure, measured_offset, place_of
@@ -239,8 +239,7 @@ def _draw(outcomes: Sequence[WindowOutcome], path: Path) -> None:
         )
         if len(some):
             axes.plot(some[:, 0], some[:, 1], marker, color=colour, ms=5, label=kind)
-    line = VerdictOptions()
-    for limit in (line.min_confirmation_log_nfa, ConfirmOptions().min_log_nfa):
+    for limit in (MIN_CONFIRMATION_LOG_NFA, MIN_LOG_NFA):
         axes.axhline(limit, color="#1b2733", lw=0.8, ls="--")
     axes.set(xscale="log", xlabel="error on the ground, m", ylabel="evidence, -log10(NFA)", ylim=(0, None))
     axes.legend(fontsize=8)

@@ -47,7 +47,7 @@ def move_map(
         return replace(feature_map, placement=moved)
     return replace(
         feature_map,
-        images=tuple(_moved_image(image, move) for image in feature_map.images),
+        images=tuple(moved_image(image, move) for image in feature_map.images),
         points=_moved_points(feature_map, move),
         placement=moved,
     )
@@ -74,7 +74,7 @@ def covariance_in_frame(covariance: FloatArray, frame: LocalFrame, other: LocalF
     return _symmetric(adjoint @ np.asarray(covariance, dtype=np.float64) @ adjoint.T)
 
 
-def _moved_image(image: MapImage, move: Sim3) -> MapImage:
+def moved_image(image: MapImage, move: Sim3) -> MapImage:
     """The camera frame grows with the map, so that a pose's shift counts in new metres: exp(omega, s nu)."""
     pose: Rigid3 = move.act_on_pose(image.cam_from_local)
     covariance = image.covariance
@@ -89,12 +89,13 @@ def _moved_points(feature_map: FeatureMap, move: Sim3) -> MapPoints:
     if not len(points):
         return points
     utm = feature_map.frame.utm_from_enu(move.act(feature_map.points_local()), feature_map.epsg)
-    turned = move.rotation @ full_covariances(points.covariance) @ move.rotation.T
-    return replace(
-        points,
-        utm=utm,
-        covariance=(move.scale**2 * turned)[:, _UPPER[0], _UPPER[1]].astype(np.float32),
-    )
+    return replace(points, utm=utm, covariance=moved_covariances(points.covariance, move))
+
+
+def moved_covariances(upper: NDArray[np.float32], move: Sim3) -> NDArray[np.float32]:
+    """Upper triangles (n, 6) of points that have moved."""
+    turned = move.rotation @ full_covariances(upper) @ move.rotation.T
+    return (move.scale**2 * turned)[:, _UPPER[0], _UPPER[1]].astype(np.float32)
 
 
 def full_covariances(upper: NDArray[np.float32]) -> FloatArray:

@@ -107,6 +107,7 @@ def _page(database: "Database", request: "AnchorRequest", args: argparse.Namespa
 def _request(args: argparse.Namespace) -> "AnchorRequest":
     from featuredb.errors import InvalidValueError
     from ingest.anchoring import AnchorRequest
+    from ingest.register.anchor.start.first_place import StartFiles
 
     if args.page and (args.auto or args.confirm or args.pose or args.picks):
         raise InvalidValueError("--page asks a person for everything; expected it alone")
@@ -124,9 +125,7 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         frames=args.frames,
         auto=args.auto,
         confirm=tuple(args.confirm),
-        pose_file=args.pose,
-        picks_file=args.picks,
-        image=args.image,
+        start=StartFiles(pose=args.pose, picks=args.picks, image=args.image),
         storage_options=tuple(args.storage_option),
     )
 

@@ -5,6 +5,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ingest.cli.register import sigmas_m
+
 if TYPE_CHECKING:
     from ingest.models_in.place import Stated
 
@@ -59,7 +61,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
     )
     place.add_argument(
         "--sigma",
-        type=_two,
+        type=sigmas_m,
         default=None,
         metavar="M[,M]",
         help="how well that is known, horizontally and vertically: one standard deviation in metres; alone: "
@@ -151,13 +153,3 @@ def _three(text: str) -> tuple[float, float, float]:
             f"expected easting,northing,height in metres, found {text!r}"
         ) from error
     return easting, northing, height
-
-
-def _two(text: str) -> tuple[float, float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"expected metres such as 0.1 or 0.1,0.2, found {text!r}") from error
-    if len(values) not in (1, 2) or not all(0 < v < 1e6 for v in values):
-        raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
-    return values[0], values[-1]

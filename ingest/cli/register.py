@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ingest.register.control.maps import GcpRegistration
     from ingest.register.control.placement import GcpOptions
-    from ingest.register.control.registered_map import GcpRegistration
 
 
 def register(subparsers: Any) -> None:
@@ -47,7 +47,7 @@ def add_control_arguments(parser: Any) -> None:
     )
     parser.add_argument(
         "--gcp-sigma",
-        type=_sigmas,
+        type=sigmas_m,
         default=None,
         metavar="M[,M]",
         help="standard deviation of surveyed coordinates in metres, horizontal and vertical; default: from "
@@ -65,14 +65,9 @@ def add_control_arguments(parser: Any) -> None:
 
 def control_options(args: argparse.Namespace, *, keep_lens: bool = False) -> "GcpOptions":
     """Options of a placement by control points."""
-    from ingest.register.control.adjust import ControlAdjustOptions
-    from ingest.register.control.level import LevelGroundOptions
     from ingest.register.control.placement import GcpOptions
 
-    level = LevelGroundOptions()
-    if args.ground_height is not None:
-        level = LevelGroundOptions(ground_up_m=args.ground_height[0], sigma_ground_m=args.ground_height[1])
-    return GcpOptions(sigma_m=args.gcp_sigma, level=level, adjust=ControlAdjustOptions(keep_lens=keep_lens))
+    return GcpOptions(sigma_m=args.gcp_sigma, ground_m=args.ground_height, keep_lens=keep_lens)
 
 
 def run_register(args: argparse.Namespace) -> int:
@@ -80,8 +75,12 @@ def run_register(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from featuredb.maps.unplaced_map import UnplacedMap
     from ingest.register.control.control_file import read_control_file
-    from ingest.register.control.evidence import gcp_evidence, residual_table
-    from ingest.register.control.registered_map import place_unplaced_by_gcp, register_by_gcp
+    from ingest.register.control.maps import (
+        gcp_evidence,
+        place_unplaced_by_gcp,
+        register_by_gcp,
+        residual_table,
+    )
     from ingest.register.control.report import write_control_report
 
     file = read_control_file(args.gcp, args.gcp_crs)
@@ -127,9 +126,10 @@ def _moved_words(result: "GcpRegistration") -> str:
     return f"the map moves by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up\n"
 
 
-def _sigmas(text: str) -> tuple[float, float]:
+def sigmas_m(text: str) -> tuple[float, float]:
+    """One or two lengths in metres: horizontal and vertical, or both."""
     values = _numbers(text)
-    if not all(0 < v < 1e4 for v in values):
+    if not all(0 < v < 1e6 for v in values):
         raise argparse.ArgumentTypeError(f"expected one or two lengths > 0 m, found {text!r}")
     return values[0], values[-1]
 

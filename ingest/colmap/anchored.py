@@ -19,7 +19,15 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.colmap.adjust import AdjustOptions, block_variance_px2, lens_prior_of, longest_side
-from ingest.colmap.bridge import Model, SfmPhoto, TwoView, quiet, read_model, write_database
+from ingest.colmap.bridge import (
+    Model,
+    SfmPhoto,
+    TwoView,
+    quiet,
+    read_model,
+    with_observations,
+    write_database,
+)
 
 _FUNCTION_TOLERANCE = 1e-6  # relative
 
@@ -252,18 +260,6 @@ def _in_tracks(model: Model, observation: NDArray[np.bool_]) -> NDArray[np.bool_
     """Observations of points that at least two of them hold."""
     counts = np.bincount(model.point_of[observation], minlength=len(model.xyz))
     return np.asarray(counts[model.point_of] >= 2)
-
-
-def with_observations(model: Model, observation: NDArray[np.bool_]) -> Model:
-    """The model with the chosen observations (m,) and the points that they see."""
-    points, point_of = np.unique(model.point_of[observation], return_inverse=True)
-    return replace(
-        model,
-        xyz=model.xyz[points],
-        point_of=point_of.reshape(-1),
-        photo_of=model.photo_of[observation],
-        keypoint_of=model.keypoint_of[observation],
-    )
 
 
 def triangulate_posed(

@@ -340,14 +340,19 @@ def without_impossible(model: Model) -> Model:
     if seen.all():
         return model
     seen &= np.bincount(model.point_of[seen], minlength=len(model.xyz))[model.point_of] >= 2
-    points, point_of = np.unique(model.point_of[seen], return_inverse=True)
     _LOG.warning("%d of %d observations are of points that their camera cannot see", (~seen).sum(), len(seen))
+    return with_observations(model, seen)
+
+
+def with_observations(model: Model, observation: NDArray[np.bool_]) -> Model:
+    """The model with the chosen observations (m,) and the points that they see."""
+    points, point_of = np.unique(model.point_of[observation], return_inverse=True)
     return replace(
         model,
         xyz=model.xyz[points],
-        point_of=point_of.reshape(-1).astype(np.int64),
-        photo_of=model.photo_of[seen],
-        keypoint_of=model.keypoint_of[seen],
+        point_of=point_of.reshape(-1),
+        photo_of=model.photo_of[observation],
+        keypoint_of=model.keypoint_of[observation],
     )
 
 

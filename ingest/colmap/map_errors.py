@@ -40,18 +40,13 @@ class MapErrors:
     shear: PictureShear
 
 
-def map_errors(
-    block: Block,
-    focal_px: Mapping[int, float],
-    centers: CenterPriors | None = None,
-    options: AdjustOptions | None = None,
-) -> MapErrors:
+def map_errors(block: Block, focal_px: Mapping[int, float], centers: CenterPriors | None = None) -> MapErrors:
     """Of a block that its photos, what is known of lenses, and positions hold.
 
     Args:
         focal_px: of EXIF, by camera. centers: positions in the block's frame, if it is placed by them.
     """
-    options = options or AdjustOptions()
+    options = AdjustOptions()
     block = whole_lens(block)
     terms = terms_of_map(block, focal_px, centers, options)
     found, weighted = Problem(block, terms, options.threads).honest_marginals()

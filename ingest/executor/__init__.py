@@ -10,7 +10,6 @@ from ingest.executor.interface import (
     Lost,
     Progress,
     no_progress,
-    raise_lost,
 )
 from ingest.executor.pool import PoolExecutor
 
@@ -21,5 +20,4 @@ __all__ = [
     "PoolExecutor",
     "Progress",
     "no_progress",
-    "raise_lost",
 ]

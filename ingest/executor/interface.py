@@ -68,20 +68,3 @@ class InProcessExecutor:
             results.append(function(item))
             progress(stage, len(results), len(items))
         return results
-
-
-def raise_lost(stage: str, results: Sequence[Result | Lost]) -> list[Result]:
-    """The results of a stage that cannot do without any of them.
-
-    Raises:
-        IngestError: some are lost; names them.
-    """
-    from featuredb.errors import IngestError
-
-    lost = [r for r in results if isinstance(r, Lost)]
-    if lost:
-        names = ", ".join(item.task for item in lost[:3])
-        raise IngestError(
-            f"{stage}: {len(lost)} of {len(results)} tasks are lost ({names}): {lost[0].reason}"
-        )
-    return [r for r in results if not isinstance(r, Lost)]

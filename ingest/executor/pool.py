@@ -47,11 +47,6 @@ class PoolExecutor:
             worker.stop()
         self._workers = []
 
-    @property
-    def pids(self) -> list[int]:
-        """Process ids of the workers that run."""
-        return [w.pid for w in self._workers]
-
     def map(
         self,
         stage: str,

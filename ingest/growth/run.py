@@ -16,7 +16,6 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database, Snapshot
 from featuredb.store.candidates.photos import mark_used
 from ingest.colmap.bridge import Model
-from ingest.colmap.submodel import keep_photos
 from ingest.fingerprint import digest
 from ingest.growth.graph.budget import grow_within_budget
 from ingest.growth.graph.map_graph import placed_maps
@@ -40,8 +39,8 @@ from ingest.growth.trust.scan_check import ScanCheckOptions, scan_gate, with_gat
 from ingest.growth.unplaced import PlaceUnplacedOptions, place_unplaced_maps
 from ingest.growth.values import GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity
-from ingest.photos.cameras import shared_key
-from ingest.photos.photo import Photo
+from ingest.photos.photo import Photo, shared_key
+from ingest.sfm.links import keep_photos
 from reloc.localise.candidates import IndexedArea
 from reloc.localiser import Localiser
 

@@ -1,6 +1,9 @@
 """A COLMAP model on disk, as arrays: poses, points and keypoints, whatever version wrote it."""
 
+import struct
+from collections.abc import Callable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +11,6 @@ import pycolmap
 
 from featuredb.errors import IngestError, InvalidValueError
 from ingest.colmap.bridge import Model, model_of
-from ingest.models_in.colmap_whole import check_whole
 from ingest.models_in.stored import StoredModel
 
 
@@ -64,3 +66,96 @@ def read_colmap(folder: Path) -> StoredModel:
 def _numbered(model: Model) -> Model:
     """Rows are those of this model alone: ids of COLMAP may have gaps."""
     return replace(model, rows=np.arange(len(model.rows), dtype=np.int64))
+
+
+# Whether the binary files of a COLMAP model are whole: their records end where the file does.
+#
+# COLMAP believes a file's counts: from one that was cut off it goes on to read records that are not there,
+# for as long as there is memory. So the records are walked before it is asked. Formats:
+# `reconstruction_io.cc` of COLMAP (`cameras`, `images`, `points3D` of all versions, `rigs` and `frames`
+# since 3.12); little endian, no padding.
+
+_COUNT = struct.Struct("<Q")
+_SENSOR = 8  # type int32, id uint32
+_POSE = 7 * 8  # quaternion, translation
+_CAMERA, _IMAGE, _POINT = 4 + 4 + 8 + 8, 4 + _POSE + 4, 8 + 3 * 8 + 3 + 8
+_KEYPOINT, _TRACK_ELEMENT = 2 * 8 + 8, 4 + 4
+
+
+def check_whole(folder: Path) -> None:
+    """Walk the records of each binary file of a model.
+
+    Raises:
+        IngestError: a file ends within a record, or goes on after the last, or names a lens that is unknown.
+    """
+    for name, after in _AFTER.items():
+        file = folder / f"{name}.bin"
+        if not file.is_file():
+            continue
+        data = file.read_bytes()
+        count = 0
+        try:
+            (wanted,) = _COUNT.unpack_from(data)
+            at = _COUNT.size
+            while count < wanted:
+                at = after(data, at)
+                if at > len(data):
+                    raise IndexError
+                count += 1
+        except (struct.error, IndexError, ValueError):
+            raise IngestError(
+                f"{file}: expected a whole file of COLMAP, found {len(data)} bytes that break off after "
+                f"{count} records; copy or export the model again"
+            ) from None
+        if at != len(data):
+            raise IngestError(
+                f"{file}: expected a whole file of COLMAP, found {len(data) - at} bytes after its {count} "
+                "records; copy or export the model again"
+            )
+
+
+def _after_camera(data: bytes, at: int) -> int:
+    (model,) = struct.unpack_from("<i", data, at + 4)
+    return at + _CAMERA + 8 * _parameters(model)
+
+
+@lru_cache(maxsize=64)
+def _parameters(model: int) -> int:
+    """Number of parameters of a lens; ValueError for a number that is none."""
+    named = pycolmap.CameraModelId(model)
+    if named == pycolmap.CameraModelId.INVALID:
+        raise ValueError(model)
+    return len(pycolmap.Camera.create_from_model_id(1, named, 1.0, 1, 1).params)
+
+
+def _after_image(data: bytes, at: int) -> int:
+    end = data.index(b"\0", at + _IMAGE) + 1  # of the name
+    (keypoints,) = _COUNT.unpack_from(data, end)
+    return int(end + _COUNT.size + keypoints * _KEYPOINT)
+
+
+def _after_point(data: bytes, at: int) -> int:
+    (track,) = _COUNT.unpack_from(data, at + _POINT)
+    return int(at + _POINT + _COUNT.size + track * _TRACK_ELEMENT)
+
+
+def _after_rig(data: bytes, at: int) -> int:
+    (sensors,) = struct.unpack_from("<I", data, at + 4)
+    at += 8 + (_SENSOR if sensors else 0)
+    for _ in range(1, sensors):
+        at += _SENSOR + 1 + (_POSE if data[at + _SENSOR] else 0)
+    return at
+
+
+def _after_frame(data: bytes, at: int) -> int:
+    (seen,) = struct.unpack_from("<I", data, at + 8 + _POSE)
+    return int(at + 8 + _POSE + 4 + seen * (_SENSOR + 8))
+
+
+_AFTER: dict[str, Callable[[bytes, int], int]] = {
+    "cameras": _after_camera,
+    "rigs": _after_rig,
+    "frames": _after_frame,
+    "images": _after_image,
+    "points3D": _after_point,
+}

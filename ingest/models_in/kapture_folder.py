@@ -4,6 +4,7 @@ Its poses, lenses and pixels are COLMAP's. Reference: naver/kapture, kapture_for
 """
 
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,34 +14,19 @@ from numpy.typing import NDArray
 from featuredb.errors import IngestError
 from featuredb.features.features import DESCRIPTOR_SIZE
 from featuredb.geometry.arrays import FloatArray
-from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
-from ingest.models_in.kapture_sensors import KaptureSensors, read_sensors
-from ingest.models_in.kapture_tables import floats, table, whole
-from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel, as_rootsift, scale_and_angle
+from ingest.models_in.kapture_sensors import KaptureSensors, floats, read_sensors, table, whole
+from ingest.models_in.stored import (
+    Keypoints,
+    ModelSource,
+    StoredFeatures,
+    StoredModel,
+    as_rootsift,
+    scale_and_angle,
+)
 
 _TYPES = {"float32": "<f4", "float64": "<f8", "float": "<f8"}
 _GREY = 128  # of points without a colour
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class KaptureModel:
-    """What the folder holds.
-
-    Attributes:
-        stored: the images with a pose.
-        kind: of keypoints; the name of their folder.
-        descriptors: the folder of descriptors of these keypoints that are SIFT in 8 bits, or None.
-        gps: for each image, of a receiver beside its camera, or None.
-        files: that it was read from. feature_files: that its keypoints and descriptors are in.
-    """
-
-    stored: StoredModel
-    kind: "KeypointKind"
-    descriptors: Path | None
-    gps: tuple[GeoPrior | None, ...]
-    files: tuple[Path, ...]
-    feature_files: tuple[Path, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,9 +54,15 @@ class KeypointKind:
 class KaptureFeatures(StoredFeatures):
     """Features of the model's images from their `.kpt` and `.desc` files."""
 
-    def __init__(self, kapture: KaptureModel, fingerprint: str) -> None:
-        super().__init__(kapture.stored, fingerprint)
-        self._kind, self._descriptors = kapture.kind, kapture.descriptors
+    def __init__(
+        self, stored: StoredModel, kind: KeypointKind, descriptors: Path | None, fingerprint: str
+    ) -> None:
+        """
+        Args:
+            descriptors: the folder of descriptors of these keypoints that are SIFT in 8 bits, or None.
+        """
+        super().__init__(stored, fingerprint)
+        self._kind, self._descriptors = kind, descriptors
 
     def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
         """See the base class."""
@@ -90,7 +82,7 @@ def is_kapture(folder: Path) -> bool:
     return (folder / "sensors" / "sensors.txt").is_file()
 
 
-def read_kapture(folder: Path) -> KaptureModel:
+def read_kapture(folder: Path) -> ModelSource:
     """The reconstruction in a folder.
 
     Raises:
@@ -109,16 +101,17 @@ def read_kapture(folder: Path) -> KaptureModel:
     descriptors = _descriptors(place, kind.folder.name)
     features = [kind.folder / f"{name}.kpt" for name in names]
     features += [] if descriptors is None else [descriptors / f"{name}.desc" for name in names]
-    return KaptureModel(
-        stored=StoredModel(
-            model=model,
-            names=names,
-            camera_ids=sensors.camera_ids,
-            xy=keypoints,
-            rgb=rgb[used],
+    stored = StoredModel(model=model, names=names, camera_ids=sensors.camera_ids, xy=keypoints, rgb=rgb[used])
+    photos = folder / "sensors" / "records_data"
+    return ModelSource(
+        format="kapture",
+        place=folder,
+        stored=stored,
+        open_features=lambda fingerprint: nullcontext(
+            KaptureFeatures(stored, kind, descriptors, fingerprint)
         ),
-        kind=kind,
-        descriptors=descriptors,
+        has_descriptors=descriptors is not None,
+        photos=photos if photos.is_dir() else None,
         gps=tuple(image.gps for image in sensors.images),
         files=(*sensors.files, place / "points3d.txt", path),
         feature_files=tuple(features),

@@ -18,7 +18,6 @@ from featuredb.maps.unplaced_map import AnyMap, MapKind, NoPlace
 from ingest.colmap.bridge import Model
 from ingest.fingerprint import digest
 from ingest.map_builder import MapIdentity, MapOptions, build_map, build_unplaced_map
-from ingest.models_in.anew import DescribedAnew
 from ingest.models_in.json_values import read_json
 from ingest.models_in.place import (
     Place,
@@ -28,7 +27,8 @@ from ingest.models_in.place import (
     place_by_photos,
     place_of_georeference,
 )
-from ingest.models_in.source import NAMES, ModelSource, open_model
+from ingest.models_in.source import NAMES, open_model
+from ingest.models_in.stored import DescribedAnew, ModelSource
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, scan_folder
 from ingest.sfm.extract import PhotoFeatures

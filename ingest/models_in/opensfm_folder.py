@@ -6,7 +6,8 @@ leaves them out by their residual whenever it reads them; so does this.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,9 +25,8 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.models_in.json_values import mapping, member, number, numbers, read_json
-from ingest.models_in.opensfm_lens import camera_from_opensfm
-from ingest.models_in.opensfm_tracks import OpensfmTracks, read_tracks
-from ingest.models_in.stored import Keypoints, StoredFeatures, StoredModel
+from ingest.models_in.opensfm_parts import OpensfmTracks, camera_from_opensfm, read_tracks
+from ingest.models_in.stored import Keypoints, ModelSource, StoredFeatures, StoredModel
 
 TRACKS, REFERENCE, CONFIG = "tracks.csv", "reference_lla.json", "config.yaml"
 # OpenDroneMap writes projected coordinates over reconstruction.json, and keeps what it was as the first.
@@ -39,31 +39,18 @@ _UNKNOWN_DOP = 15.0  # what OpenSfM writes where a photo does not say
 _SAME_DEG, _SAME_M = 1e-9, 1e-3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class OpensfmModel:
-    """What the folder holds.
-
-    Attributes:
-        stored: without shots that see no point.
-        diameters: for each image, (k,) of its keypoints in pixels.
-        reference: the frame of the coordinates, or None where the files do not say.
-        gps: for each image, what its shot says of its own position, or None.
-        files: that it was read from.
-    """
-
-    stored: StoredModel
-    diameters: tuple[NDArray[np.float32], ...]
-    reference: LocalFrame | None
-    gps: tuple[GeoPrior | None, ...]
-    files: tuple[Path, ...]
-
-
 class OpensfmFeatures(StoredFeatures):
     """Keypoints of the tracks; without orientations and descriptors, which OpenSfM keeps in its own way."""
 
-    def __init__(self, opensfm: OpensfmModel, fingerprint: str) -> None:
-        super().__init__(opensfm.stored, fingerprint)
-        self._diameters = opensfm.diameters
+    def __init__(
+        self, stored: StoredModel, diameters: Sequence[NDArray[np.float32]], fingerprint: str
+    ) -> None:
+        """
+        Args:
+            diameters: for each image, (k,) of its keypoints in pixels.
+        """
+        super().__init__(stored, fingerprint)
+        self._diameters = diameters
 
     def keypoints(self, index: int, *, with_descriptors: bool = True) -> Keypoints:
         """See the base class."""
@@ -79,8 +66,8 @@ def opensfm_folder(folder: Path) -> Path | None:
     return None
 
 
-def read_opensfm(place: Path, chosen: int | None = None) -> OpensfmModel:
-    """The reconstruction in one of the places of `opensfm_folder`.
+def read_opensfm(place: Path, chosen: int | None = None) -> ModelSource:
+    """The reconstruction in one of the places of `opensfm_folder`, without shots that see no point.
 
     Args:
         chosen: which of several, counted from 0.
@@ -119,9 +106,13 @@ def read_opensfm(place: Path, chosen: int | None = None) -> OpensfmModel:
     size = _sizes(parts)[tracks.image] * _diameter_over_size(place / CONFIG)
     reference = _reference(document, place, path)
     told = list(shots.items())
-    return OpensfmModel(
+    diameters = [(tracks.scale * size)[r].astype(np.float32) for r in rows]
+    return ModelSource(
+        format="opensfm",
+        place=place,
         stored=stored,
-        diameters=tuple((tracks.scale * size)[r].astype(np.float32) for r in rows),
+        open_features=lambda fingerprint: nullcontext(OpensfmFeatures(stored, diameters, fingerprint)),
+        has_descriptors=False,
         reference=reference,
         gps=tuple(_gps(told[i][1], reference, f"{path}: shot {told[i][0]!r}") for i in images),
         files=tuple(p for p in (path, place / TRACKS, place / REFERENCE, place / CONFIG) if p.is_file()),

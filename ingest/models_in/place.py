@@ -16,10 +16,10 @@ from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import MAP_METHODS, MapStatus, Placement
 from featuredb.maps.unplaced_map import NoPlace
 from ingest.colmap.bridge import Model
-from ingest.own_frame import WAYS_TO_A_PLACE, held_of
+from ingest.own_frame import WAYS_TO_A_PLACE
 from ingest.photos.photo import Photo
-from ingest.photos.positions import capture_seconds, gps_priors, local_frame_of
-from ingest.register.gps import GpsOptions, place_by_gps
+from ingest.placed_models import placed_by_gps
+from ingest.register.gps import GpsOptions
 
 Axes = Literal["enu", "utm", "ecef"]
 # A model in UTM is not a similarity of the place: heights are unscaled, the plane by up to 0.04 %. What the
@@ -166,14 +166,7 @@ def place_at_reference(model: Model, reference: LocalFrame, sigma_m: tuple[float
 
 def place_by_photos(model: Model, photos: Sequence[Photo]) -> Place | NoPlace:
     """By the GPS of the photos, with the gates of an ordinary ingest; or why they refuse it."""
-    frame = local_frame_of(photos)
-    positions, sigmas = gps_priors(photos, frame)
-    known = np.flatnonzero(np.isfinite(positions).all(axis=1))
-    times_s = capture_seconds([photos[i] for i in known.tolist()])
-    held = held_of(model.cam_from_sfm, [photo.angles for photo in photos])
-    placed = place_by_gps(
-        model.centers()[known], positions[known], sigmas[known], GpsOptions(), times_s, held
-    )
+    frame, _, placed = placed_by_gps(model, photos, GpsOptions())
     if (
         placed.reason is not None
         or placed.local_from_sfm is None

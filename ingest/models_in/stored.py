@@ -1,19 +1,31 @@
 """What every format of models gives: the model as arrays, and the keypoints and descriptors of its images."""
 
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IngestError
+from featuredb.errors import ImageError, IngestError
+from featuredb.features.decode import INGEST_LIMITS, decode_gray
+from featuredb.features.describe import describe_at
 from featuredb.features.features import DESCRIPTOR_SIZE, Features
+from featuredb.features.orientation import orientations_at
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model
 from ingest.sfm.extract import LazyFeatures, PhotoFeatures
 
 # RootSIFT in 8 bits has length 512. Its mean value tells it from SIFT that was normalised by L2: on photos of
 # `brighton` 37.3 (this extractor), 37.0 (COLMAP's, L1_ROOT) and 29.1 (COLMAP's, L2).
 _NORM_RANGE, _MEAN_RANGE = (500.0, 524.0), (33.0, 42.0)
+
+
+ModelFormat = Literal["colmap", "opensfm", "kapture"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -116,6 +128,34 @@ class StoredFeatures(LazyFeatures):
         )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ModelSource:
+    """A model that has been read.
+
+    Attributes:
+        place: the folder that it was found in.
+        files: what it was read from. feature_files: what its features will be.
+        open_features: given the fingerprint of their extractor.
+        has_descriptors: whether the format keeps descriptors that can be compared with ours.
+        photos: where the format has its photos, None where that is anywhere.
+        reference: the frame of the model's coordinates, without its accuracy; None: the files do not say.
+        gps: for each image, what the files say of its own position; empty: nothing.
+        choice: which of several models it is, "" where there is one.
+    """
+
+    format: ModelFormat
+    place: Path
+    stored: StoredModel
+    files: tuple[Path, ...]
+    open_features: Callable[[str], AbstractContextManager[StoredFeatures]]
+    feature_files: tuple[Path, ...] = ()
+    has_descriptors: bool = True
+    photos: Path | None = None
+    reference: LocalFrame | None = None
+    gps: tuple[GeoPrior | None, ...] = ()
+    choice: str = ""
+
+
 def scale_and_angle(rows: NDArray[np.float32], where: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Diameter in pixels and degrees of keypoints (k, 4 or 6): x, y and COLMAP's scale and radians, or x, y
     and an affine shape.
@@ -157,3 +197,31 @@ def as_rootsift(data: NDArray[np.generic], name: str, count: int) -> NDArray[np.
                 f"found length {norm:.0f}, mean {mean:.1f}; give --photos and --descriptors photos"
             )
     return data.astype(np.uint8)
+
+
+class DescribedAnew(LazyFeatures):
+    """Features of the model's images with this extractor's own descriptors, and its own orientations where
+    the model's files have none; one photo in memory at a time."""
+
+    def __init__(self, stored: StoredFeatures, photos: Sequence[Path]) -> None:
+        self._stored, self._photos = stored, tuple(photos)
+
+    def read(self, index: int) -> PhotoFeatures:
+        keypoints = self._stored.keypoints(index, with_descriptors=False)
+        if not (keypoints.scale > 0).all():
+            raise IngestError(
+                f"{self._stored.stored.names[index]}: expected keypoints with scales > 0, found "
+                f"{keypoints.scale.min()}; give a model of features that have scales"
+            )
+        try:
+            gray = decode_gray(self._photos[index].read_bytes(), INGEST_LIMITS)
+            angle = keypoints.angle
+            if angle is None:
+                angle = orientations_at(gray, keypoints.xy, keypoints.scale)
+            descriptors = describe_at(gray, keypoints.xy, keypoints.scale, angle)
+        except (ImageError, OSError) as error:
+            raise IngestError(f"{self._photos[index]}: cannot be described anew: {error}") from error
+        return self._stored.features(index, keypoints, angle, descriptors, gray.shape)
+
+    def __len__(self) -> int:
+        return len(self._stored)

@@ -16,7 +16,6 @@ A threshold of 24 bits lies between 18 and 44. `tests/integration/test_scan_real
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import cv2
@@ -33,21 +32,10 @@ _SAMPLED_SIDE = 64
 _EARTH_RADIUS_M = 6_371_000.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DuplicateOptions:
-    """When two photos count as copies of one.
-
-    Attributes:
-        max_bits: of the 256 of the picture hash; between copies (18) and true neighbours (44).
-        max_time_s: capture times are copied with the EXIF; two are for writers that round to even seconds.
-        max_distance_m: positions are copied too; one metre allows for rounded digits.
-        max_aspect: relative difference of the shapes; resizing rounds to whole pixels.
-    """
-
-    max_bits: int = 24
-    max_time_s: float = 2.0
-    max_distance_m: float = 1.0
-    max_aspect: float = 0.01
+MAX_BITS = 24  # of the 256 of the picture hash; between copies (18) and true neighbours (44)
+_MAX_TIME_S = 2.0  # capture times are copied with the EXIF; two are for writers that round to even seconds
+_MAX_DISTANCE_M = 1.0  # positions are copied too; one metre allows for rounded digits
+_MAX_ASPECT = 0.01  # relative difference of the shapes; resizing rounds to whole pixels
 
 
 def picture_hash(gray: NDArray[np.uint8]) -> str:
@@ -83,9 +71,7 @@ def exact_duplicates(photos: Sequence[Photo]) -> dict[str, str]:
     return copies
 
 
-def near_duplicates(
-    photos: Sequence[Photo], hashes: Sequence[str], options: DuplicateOptions
-) -> dict[str, tuple[str, int]]:
+def near_duplicates(photos: Sequence[Photo], hashes: Sequence[str]) -> dict[str, tuple[str, int]]:
     """Names of photos that show the picture of another, with that one's name and the differing bits.
 
     The copy with most pixels is kept, then one with a position, then the first by name. Photos that both
@@ -100,15 +86,15 @@ def near_duplicates(
     if not photos:
         return {}
     bits = hash_bits(hashes)
-    buckets = _Buckets(bits, options.max_bits)
+    buckets = _Buckets(bits, MAX_BITS)
     copies: dict[str, tuple[str, int]] = {}
     for i in sorted(range(len(photos)), key=lambda i: _preference(photos[i])):
         candidates = buckets.near(i)
         distances = hash_distances(bits[i], bits[candidates])
         near = [
             (int(distances[k]), int(candidates[k]))
-            for k in np.flatnonzero(distances <= options.max_bits)
-            if _agree(photos[i], photos[int(candidates[k])], options)
+            for k in np.flatnonzero(distances <= MAX_BITS)
+            if _agree(photos[i], photos[int(candidates[k])])
         ]
         if near:
             distance, best = min(near)
@@ -165,9 +151,9 @@ def _preference(photo: Photo) -> tuple[int, bool, str]:
     return -photo.width * photo.height, photo.gps is None, photo.name
 
 
-def _agree(a: Photo, b: Photo, options: DuplicateOptions) -> bool:
+def _agree(a: Photo, b: Photo) -> bool:
     """Whether nothing that both photos say of themselves speaks against their being copies."""
-    if abs(a.width * b.height / (a.height * b.width) - 1.0) > options.max_aspect:
+    if abs(a.width * b.height / (a.height * b.width) - 1.0) > _MAX_ASPECT:
         return False
     if a.film and a.film == b.film:
         return False  # keyframes are chosen to differ, by little where the camera comes slowly nearer
@@ -179,9 +165,9 @@ def _agree(a: Photo, b: Photo, options: DuplicateOptions) -> bool:
     if a.capture_time and b.capture_time:
         # An offset that one copy lost says nothing, so local times are compared.
         apart = a.capture_time.replace(tzinfo=None) - b.capture_time.replace(tzinfo=None)
-        if abs(apart.total_seconds()) > options.max_time_s:
+        if abs(apart.total_seconds()) > _MAX_TIME_S:
             return False
-    return not (a.gps and b.gps) or _distance_m(a, b) <= options.max_distance_m
+    return not (a.gps and b.gps) or _distance_m(a, b) <= _MAX_DISTANCE_M
 
 
 def _distance_m(a: Photo, b: Photo) -> float:

@@ -1,11 +1,18 @@
-"""What is known of one file of an ingest."""
+"""What is known of one file of an ingest; which photos share intrinsics; where they say they were taken."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
+from featuredb.adjust.terms import CenterPriors
 from featuredb.features.exif.gps import AltitudeReference
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
 from featuredb.geometry.camera_angles import CameraAngles
 from featuredb.maps.feature_map import GeoPrior
 
@@ -27,7 +34,7 @@ class Photo:
             orientation is kept for display only.
         make, model: camera maker and model from EXIF, "" where absent.
         camera_key: photos with equal keys share one set of intrinsics (see featuredb.features.exif.read); ""
-            where the photo names no camera (who it shares with then: ingest.photos.cameras).
+            where the photo names no camera (who it shares with then: ingest.photos.photo).
         focal_px: focal length from EXIF in pixels of the stored image, or None.
         capture_time: EXIF time (timezone-aware only where EXIF gives the offset), or None.
         gps: position prior from EXIF or a table, or None.
@@ -71,3 +78,119 @@ class Photo:
     film: str = ""
     duplicate_of: str = ""
     warnings: tuple[str, ...] = ()
+
+
+CameraSharing = Literal["shared", "per-image"]
+
+# 1.2 times the longer side is a field of view of 45 degrees, COLMAP's guess without EXIF.
+_DEFAULT_FOCAL_OVER_SIDE = 1.2
+
+
+def photo_cameras(
+    photos: Sequence[Photo], sharing: CameraSharing, camera_model: str
+) -> tuple[list[tuple[Camera, bool]], list[int]]:
+    """Cameras (with whether EXIF gives the focal length) and the camera's row of each photo."""
+    rows: dict[str, int] = {}
+    cameras: list[tuple[Camera, bool]] = []
+    of_photo: list[int] = []
+    for photo in photos:
+        key = shared_key(photo, sharing)
+        if key not in rows:
+            rows[key] = len(cameras)
+            known = photo.focal_px is not None
+            focal = photo.focal_px or _DEFAULT_FOCAL_OVER_SIDE * max(photo.width, photo.height)
+            cameras.append((Camera.from_focal(photo.width, photo.height, focal, camera_model), known))
+        of_photo.append(rows[key])
+    return cameras, of_photo
+
+
+def shared_key(photo: Photo, sharing: CameraSharing) -> str:
+    """Photos with equal keys share intrinsics.
+
+    Those of one make, model, size and focal length do. A photo that names no camera shares with those of the
+    same owner (by the same contributor), day and size: left alone, a view straight down finds a focal length
+    a quarter off and a height to go with it. Where no day is known, which is so for most contributions
+    without EXIF, owner and size must do; without an owner it is alone.
+    """
+    if sharing == "per-image":
+        return photo.name
+    if photo.camera_key:
+        return photo.camera_key
+    if not photo.owner:
+        return photo.name
+    time = photo.capture_time
+    day = "some day" if time is None else str((time.astimezone(UTC) if time.tzinfo else time).date())
+    whose = f"{photo.owner} by {photo.contributor}" if photo.contributor else photo.owner
+    focal = "" if photo.focal_px is None else f", {photo.focal_px:.1f} px"
+    return f"unnamed camera of {whose}, {day}, {photo.width} x {photo.height}{focal}"
+
+
+def local_frame_of(photos: Sequence[Photo]) -> LocalFrame | None:
+    """A frame at the photos' median position, rounded so that it does not hang on the last digit."""
+    gps = np.array(
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
+    )
+    if not len(gps):
+        return None
+    latitude, longitude, height = np.median(gps, axis=0)
+    return LocalFrame(
+        latitude_deg=round(float(latitude), 5),
+        longitude_deg=round(float(longitude), 5),
+        height_m=round(float(height)),
+    )
+
+
+def gps_positions(photos: Sequence[Photo], frame: LocalFrame | None = None) -> FloatArray:
+    """East, north, up (n, 3) in metres of photos with GPS; height 0 where the photo has none."""
+    geodetic = np.array(
+        [
+            [p.gps.latitude_deg, p.gps.longitude_deg, p.gps.height_m or 0.0]
+            for p in photos
+            if p.gps is not None
+        ]
+    )
+    if frame is None:
+        frame = LocalFrame(latitude_deg=geodetic[0, 0], longitude_deg=geodetic[0, 1], height_m=0.0)
+    return frame.enu_from_geodetic(geodetic)
+
+
+def gps_priors(photos: Sequence[Photo], frame: LocalFrame | None) -> tuple[FloatArray, FloatArray]:
+    """Positions and sigmas (n, 3) in the frame: NaN for photos without GPS, infinite without height."""
+    positions = np.full((len(photos), 3), np.nan)
+    sigmas = np.full((len(photos), 3), np.nan)
+    rows = [i for i, p in enumerate(photos) if p.gps is not None]
+    if frame is not None and rows:
+        positions[rows] = gps_positions([photos[i] for i in rows], frame)
+        for i in rows:
+            gps = photos[i].gps
+            assert gps is not None
+            vertical = gps.sigma_vertical_m if gps.height_m is not None else np.inf
+            sigmas[i] = (gps.sigma_horizontal_m, gps.sigma_horizontal_m, vertical)
+    return positions, sigmas
+
+
+def capture_seconds(photos: Sequence[Photo]) -> FloatArray | None:
+    """Times (n,) of capture; None where some photo does not say, or some do not say in which zone."""
+    times = [photo.capture_time for photo in photos if photo.capture_time is not None]
+    if len(times) < len(photos) or len({time.tzinfo is None for time in times}) != 1:
+        return None
+    return np.array([(time - times[0]).total_seconds() for time in times])
+
+
+def center_priors(photos: Sequence[Photo], frame: LocalFrame) -> CenterPriors | None:
+    """Measured centres for an adjustment in the frame: of positions that somebody answers for.
+
+    Returns:
+        None where fewer than three photos have one: they do not tell a similarity.
+    """
+    xyz, sigmas = gps_priors(photos, frame)
+    hints = np.array([photo.gps_is_hint for photo in photos], dtype=np.bool_)
+    rows = np.flatnonzero(np.isfinite(sigmas).all(axis=1) & ~hints)
+    if len(rows) < 3:
+        return None
+    covariance = np.array([np.diag(sigma**2) for sigma in sigmas[rows]])
+    return CenterPriors(photo_of=rows, xyz=xyz[rows], covariance=covariance)

@@ -9,7 +9,7 @@ import os
 import stat
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -22,16 +22,25 @@ from featuredb.maps.exif_prior import prior_from_exif
 from featuredb.maps.feature_map import GeoPrior
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import options_fingerprint
-from ingest.photos.duplicates import DuplicateOptions, exact_duplicates, near_duplicates, picture_hash
+from ingest.photos.duplicates import (
+    MAX_BITS,
+    exact_duplicates,
+    near_duplicates,
+    picture_hash,
+)
 from ingest.photos.photo import Photo
-from ingest.photos.scan_cache import ExaminedFile, read_cache, write_cache
 from ingest.photos.table import PhotoTable, TableRow, missing_reason, summary_of
-from ingest.photos.walk import FoundFile, walk
+from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, walk, write_cache
 
 # Raised when the same file would be judged differently, so that old caches are not used.
 _VERSION = 2
 # The cache is written after so many files, or a quarter of those that it has: writing it stays linear.
 _SAVE_EVERY = 200
+
+
+# Standard deviation of a table's position that does not say its own. Geotags of photo sites are tens of
+# metres off, where they are not wrong altogether.
+_GEOTAG_SIGMA_M = 30.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,25 +49,20 @@ class ScanOptions:
 
     Attributes:
         limits: sizes that are refused.
-        duplicates: when two photos are copies.
         recursive: folders in the folder are entered.
         exclude: shell patterns; a file whose name, with or without its folder, fits one is left out.
         workers: threads; 0 for one per core, at most 8 (decoding is limited by memory bandwidth then).
         owner, licence: attribution of photos that do not name their own.
-        geotag_sigma_m: standard deviation of a table's position that does not say its own. Geotags of
-            photo sites are tens of metres off, where they are not wrong altogether.
         trust_geotags: positions of a table place maps as those of a folder do.
         films: the photos are keyframes, those of each film in a folder of its own.
     """
 
     limits: DecodeLimits = INGEST_LIMITS
-    duplicates: DuplicateOptions = field(default_factory=DuplicateOptions)
     recursive: bool = True
     exclude: tuple[str, ...] = ()
     workers: int = 0
     owner: str = ""
     licence: str = ""
-    geotag_sigma_m: float = 30.0
     trust_geotags: bool = False
     films: bool = False
 
@@ -165,7 +169,7 @@ def _scan_files(
     photos = [_as_photo(file, examined.get(file.name), options) for file in files]
     photos = [_with_row(p, rows[p.name], options) if p.name in rows else p for p in photos]
     photos = _mark_exact(photos)
-    photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()}, options.duplicates)
+    photos = _mark_near(photos, {name: e.picture_hash for name, e in examined.items()})
     return ScanResult(photos=tuple(photos), read=read)
 
 
@@ -292,8 +296,8 @@ def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
             latitude_deg=row.latitude_deg,
             longitude_deg=row.longitude_deg,
             height_m=row.height_m if row.height_m is not None or gps is None else gps.height_m,
-            sigma_horizontal_m=row.accuracy_m or options.geotag_sigma_m,
-            sigma_vertical_m=_sigma_of_height(row, photo, options),
+            sigma_horizontal_m=row.accuracy_m or _GEOTAG_SIGMA_M,
+            sigma_vertical_m=_sigma_of_height(row, photo),
         )
     elif gps is not None:
         gps = replace(
@@ -315,14 +319,14 @@ def _with_row(photo: Photo, row: TableRow, options: ScanOptions) -> Photo:
     )
 
 
-def _sigma_of_height(row: TableRow, photo: Photo, options: ScanOptions) -> float:
+def _sigma_of_height(row: TableRow, photo: Photo) -> float:
     """As the table says; a height of its own is worse than its position by as much as a plain receiver's."""
     if row.accuracy_height_m is not None:
         return row.accuracy_height_m
     if row.height_m is not None:
         ratio = DEFAULT_SIGMA_VERTICAL_M / DEFAULT_SIGMA_HORIZONTAL_M
-        return ratio * (row.accuracy_m or options.geotag_sigma_m)
-    return options.geotag_sigma_m if photo.gps is None else photo.gps.sigma_vertical_m
+        return ratio * (row.accuracy_m or _GEOTAG_SIGMA_M)
+    return _GEOTAG_SIGMA_M if photo.gps is None else photo.gps.sigma_vertical_m
 
 
 def _mark_exact(photos: list[Photo]) -> list[Photo]:
@@ -335,16 +339,14 @@ def _mark_exact(photos: list[Photo]) -> list[Photo]:
     ]
 
 
-def _mark_near(photos: list[Photo], hashes: dict[str, str], options: DuplicateOptions) -> list[Photo]:
+def _mark_near(photos: list[Photo], hashes: dict[str, str]) -> list[Photo]:
     usable = [photo for photo in photos if photo.status == "ok"]
-    copies = near_duplicates(usable, [hashes[photo.name] for photo in usable], options)
+    copies = near_duplicates(usable, [hashes[photo.name] for photo in usable])
     marked = []
     for photo in photos:
         if photo.name in copies:
             kept, bits = copies[photo.name]
-            reason = (
-                f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {options.max_bits})"
-            )
+            reason = f"the same picture as {kept} ({bits} of 256 bits differ, the limit is {MAX_BITS})"
             photo = _skipped(photo, "near_duplicate", reason, kept)
         marked.append(photo)
     return marked

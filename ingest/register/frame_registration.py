@@ -37,6 +37,17 @@ class FramePrior:
     sigma_heading_deg: float
     sigma_tilt_deg: float
 
+    @classmethod
+    def around(cls, pose: Rigid3, sigma_m: float, sigma_deg: float) -> "FramePrior":
+        """Of a pose that is known as well along and about all axes."""
+        return cls(
+            cam_from_local=pose,
+            sigma_horizontal_m=sigma_m,
+            sigma_vertical_m=sigma_m,
+            sigma_heading_deg=sigma_deg,
+            sigma_tilt_deg=sigma_deg,
+        )
+
     def __post_init__(self) -> None:
         for name in ("sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg"):
             value = getattr(self, name)

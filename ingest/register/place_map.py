@@ -1,7 +1,5 @@
 """A map without a place comes to one: moved by a similarity, or put where one photo's pose says."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from featuredb.errors import RegistrationError
@@ -12,14 +10,13 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage, MapPoints, Placement
-from featuredb.maps.move import full_covariances
+from featuredb.maps.move import moved_covariances, moved_image
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.anchor.proposals import small_camera
 from ingest.register.frame_registration import FramePrior
 
-_UPPER = (np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2]))
 _VIEW_PX = 800  # of the depth image that tells the scale
 _MIN_POINTS = (
     20  # of the photo's map points that must meet the scan; their median then has a fifth of its spread
@@ -38,7 +35,6 @@ def placed_map(
     move = placement.local_from_sfm
     epsg = utm_epsg(frame.latitude_deg, frame.longitude_deg)
     points = unplaced.points
-    turned = move.rotation @ full_covariances(points.covariance) @ move.rotation.T
     return FeatureMap(
         map_id=unplaced.map_id,
         name=unplaced.name,
@@ -47,13 +43,13 @@ def placed_map(
         frame=frame,
         cameras=unplaced.cameras,
         camera_keys=unplaced.camera_keys,
-        images=tuple(_placed_image(image, move) for image in unplaced.images),
+        images=tuple(moved_image(image, move) for image in unplaced.images),
         points=MapPoints(
             utm=frame.utm_from_enu(move.act(points.xyz), epsg),
             rgb=points.rgb,
             track_length=points.track_length,
             error_px=points.error_px,
-            covariance=(move.scale**2 * turned)[:, _UPPER[0], _UPPER[1]].astype(np.float32),
+            covariance=moved_covariances(points.covariance, move),
         ),
         observations=unplaced.observations,
         placement=placement,
@@ -142,11 +138,3 @@ def _about(center: FloatArray, sigmas: FloatArray) -> FloatArray:
     at_center[4:, 0] = -center
     at_center[4:, 1:4] = skew(center)
     return np.asarray(at_center @ np.diag(sigmas**2) @ at_center.T)
-
-
-def _placed_image(image: MapImage, move: Sim3) -> MapImage:
-    covariance = image.covariance
-    if covariance is not None:
-        growth = np.repeat([1.0, move.scale], 3)
-        covariance = covariance * np.outer(growth, growth)
-    return replace(image, cam_from_local=move.act_on_pose(image.cam_from_local), covariance=covariance)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -79,31 +79,7 @@ class FilmOutcome:
 
 def films_json(films: Sequence[FilmOutcome]) -> list[dict[str, Any]]:
     """For the report's JSON; what became of the keyframes is with the photos of their names."""
-    return [
-        {
-            "name": film.name,
-            "path": film.path,
-            "status": film.status,
-            "reason": film.reason,
-            "frames": film.frames,
-            "telemetry": film.telemetry,
-            "notes": film.notes,
-            "shots": [
-                {
-                    "start_s": shot.start_s,
-                    "end_s": shot.end_s,
-                    "frames": shot.frames,
-                    "step": shot.step,
-                    "keyframes": shot.keyframes,
-                    "dropped": shot.dropped,
-                    "bars": shot.bars,
-                    "overlay_share": shot.overlay_share,
-                }
-                for shot in film.shots
-            ],
-        }
-        for film in films
-    ]
+    return [asdict(film) | {"frames": film.frames} for film in films]
 
 
 def films_text(films: Sequence[FilmOutcome], photos: Sequence["PhotoOutcome"]) -> list[str]:

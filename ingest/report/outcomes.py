@@ -1,6 +1,8 @@
 """What happened to every file and every component, as the report's values."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +13,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.unplaced_map import AnyMap, UnplacedMap
-from ingest.photos.cameras import shared_key
-from ingest.photos.photo import Photo
+from ingest.photos.photo import Photo, shared_key
 from ingest.placed_models import Component
 from ingest.reconstruction import MapMakingOptions, Reconstructed, Stage
 from ingest.report.values import CameraOutcome, MapOutcome, PhotoOutcome, PlanView
@@ -24,11 +25,14 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
     Args:
         created: of committed maps, whether this ingest made them visible.
     """
-    placement, feature_map = component.placement, component.feature_map
-    figures = component.control.evidence if component.control is not None else placement.figures
-    if component.unplaced is not None:
-        return _unplaced_outcome(component, component.unplaced, options)
-    if feature_map is None:
+    control = component.control
+    shared: dict[str, Any] = {
+        "gates": component.placement.figures if control is None else control.evidence,
+        "cameras": _cameras(component, options),
+        "control": control,
+    }
+    made = _map_of(component)
+    if made is None:
         return MapOutcome(
             map_id="",
             name=f"{len(component.photos)} photos from {component.photos[0].name}",
@@ -38,32 +42,38 @@ def map_outcome(component: Component, created: Mapping[str, bool], options: MapM
             photos=len(component.photos),
             points=len(component.model.xyz),
             observations=len(component.model.point_of),
-            gates=figures,
-            cameras=_cameras(component, options),
             track_lengths=component.model.track_lengths().astype(np.int32),
-            control=component.control,
+            **shared,
         )
-    return MapOutcome(
-        map_id=feature_map.map_id,
-        name=feature_map.name,
-        status="committed" if created.get(feature_map.map_id) else "already_there",
-        photos=len(feature_map.images),
-        points=len(feature_map.points),
-        observations=len(feature_map.observations),
-        descriptors=int(feature_map.observations.has_descriptor.sum()),
-        epsg=feature_map.epsg,
-        height_datum=feature_map.height_datum,
-        scale=feature_map.placement.local_from_sfm.scale,
-        residual_rms_m=feature_map.placement.residual_rms_m,
-        radius_m=_radius_m(feature_map),
-        picture_shear=float(feature_map.provenance.get("picture_shear", 0.0)),
-        gates=figures,
-        cameras=_cameras(component, options),
-        errors_px=feature_map.points.error_px,
-        track_lengths=feature_map.points.track_length,
-        plan=_plan(component, feature_map),
-        control=component.control,
+    outcome = MapOutcome(
+        map_id=made.map_id,
+        name=made.name,
+        status="committed" if created.get(made.map_id) else "already_there",
+        photos=len(made.images),
+        points=len(made.points),
+        observations=len(made.observations),
+        descriptors=int(made.observations.has_descriptor.sum()),
+        picture_shear=float(made.provenance.get("picture_shear", 0.0)),
+        errors_px=made.points.error_px,
+        track_lengths=made.points.track_length,
+        **shared,
     )
+    if isinstance(made, UnplacedMap):
+        why = made.no_place
+        return replace(outcome, status="unplaced", reason_code=why.reason_code, reason=why.reason)
+    return replace(
+        outcome,
+        epsg=made.epsg,
+        height_datum=made.height_datum,
+        scale=made.placement.local_from_sfm.scale,
+        residual_rms_m=made.placement.residual_rms_m,
+        radius_m=_radius_m(made),
+        plan=_plan(component, made),
+    )
+
+
+def _map_of(component: Component) -> AnyMap | None:
+    return component.feature_map if component.unplaced is None else component.unplaced
 
 
 def _radius_m(feature_map: FeatureMap) -> float:
@@ -71,27 +81,6 @@ def _radius_m(feature_map: FeatureMap) -> float:
     at = point_jacobian(np.array([image.cam_from_local.center for image in feature_map.images]))[:, :2]
     spread = at @ feature_map.placement.covariance @ at.transpose(0, 2, 1)
     return float(np.median(np.sqrt(chi2.ppf(0.95, 2) * np.linalg.eigvalsh(spread)[:, -1])))
-
-
-def _unplaced_outcome(component: Component, unplaced: UnplacedMap, options: MapMakingOptions) -> MapOutcome:
-    control = component.control
-    return MapOutcome(
-        map_id=unplaced.map_id,
-        name=unplaced.name,
-        status="unplaced",
-        reason_code=unplaced.no_place.reason_code,
-        reason=unplaced.no_place.reason,
-        photos=len(unplaced.images),
-        points=len(unplaced.points),
-        observations=len(unplaced.observations),
-        descriptors=int(unplaced.observations.has_descriptor.sum()),
-        picture_shear=float(unplaced.provenance.get("picture_shear", 0.0)),
-        gates=control.evidence if control is not None else component.placement.figures,
-        cameras=_cameras(component, options),
-        errors_px=unplaced.points.error_px,
-        track_lengths=unplaced.points.track_length,
-        control=control,
-    )
 
 
 def photo_outcomes(
@@ -134,52 +123,34 @@ def _left_out(photo: Photo, result: Reconstructed, stop_after: Stage | None) -> 
 
 def registered_photos(component: Component, result: Reconstructed) -> dict[str, PhotoOutcome]:
     """The photos of one component; those of a refused one are in no map, and have its reason."""
-    feature_map = component.feature_map
-    if component.unplaced is not None:
-        return _in_unplaced_map(component, component.unplaced, result)
-    if feature_map is None:
-        return {
-            p.name: _outcome(
-                p,
-                result,
-                status="not_registered",
-                code=component.reason_code.lower(),
-                reason=component.reason,
-            )
-            for p in component.photos
-        }
-    counts, errors = _counts_and_errors(feature_map)
-    _, gps, residuals = _centers_and_gps(component, feature_map)
-    used = _gps_used(component)
-    return {
+    made = _map_of(component)
+    why = {"code": component.reason_code.lower(), "reason": component.reason}
+    if made is None:
+        return {p.name: _outcome(p, result, status="not_registered", **why) for p in component.photos}
+    counts, errors = _counts_and_errors(made)
+    outcomes = {
         photo.name: _outcome(
             photo,
             result,
             status="registered",
             observations=int(counts[k]),
-            map_id=feature_map.map_id,
+            map_id=made.map_id,
             reprojection_px=float(errors[k]),
-            gps_residual_m=None if np.isnan(gps[k, 0]) else tuple(float(v) for v in residuals[k]),
-            gps_used=used.get(k, False) if photo.gps is not None else None,
         )
         for k, photo in enumerate(component.photos)
     }
-
-
-def _in_unplaced_map(
-    component: Component, unplaced: UnplacedMap, result: Reconstructed
-) -> dict[str, PhotoOutcome]:
-    counts, errors = _counts_and_errors(unplaced)
+    if isinstance(made, UnplacedMap):
+        return {
+            name: replace(o, status="unplaced", reason_code=why["code"], reason=why["reason"])
+            for name, o in outcomes.items()
+        }
+    _, gps, residuals = _centers_and_gps(component, made)
+    used = _gps_used(component)
     return {
-        photo.name: _outcome(
-            photo,
-            result,
-            status="unplaced",
-            code=component.reason_code.lower(),
-            reason=component.reason,
-            observations=int(counts[k]),
-            map_id=unplaced.map_id,
-            reprojection_px=float(errors[k]),
+        photo.name: replace(
+            outcomes[photo.name],
+            gps_residual_m=None if np.isnan(gps[k, 0]) else tuple(residuals[k].tolist()),
+            gps_used=used.get(k, False) if photo.gps is not None else None,
         )
         for k, photo in enumerate(component.photos)
     }

@@ -1,7 +1,7 @@
 """What an ingest did: one value, and its JSON for programs; `ingest.report.page` writes it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.plain_json import plain
 from ingest.colmap.picture_shear import IMPOSSIBLE, UNUSUAL, shear_words
-from ingest.register.control.model import ControlledPlacement
+from ingest.register.control.maps import ControlledPlacement
 from ingest.report.films import FilmOutcome, films_json
 
 FileStatus = Literal["registered", "unplaced", "not_registered", "skipped"]
@@ -25,6 +25,7 @@ FOCAL_CHANGE_TO_WARN = 0.08
 
 _TRACK_BINS = (2, 3, 4, 5, 6, 8, 10, 15, 20, 50)
 _PERCENTILES = (50, 90, 99)
+_DRAWN = ("errors_px", "track_lengths", "plan", "control")  # what the page shows of a map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,75 +260,26 @@ def report_json(report: IngestReport) -> dict[str, Any]:
                 "not_registered": report.count("not_registered"),
                 "skipped": report.count("skipped"),
             },
-            "stages": [
-                {"name": s.name, "seconds": s.seconds, "reused": s.reused, "total": s.total}
-                for s in report.stages
-            ],
+            "stages": [asdict(stage) for stage in report.stages],
             "maps": [_map_json(outcome) for outcome in report.maps],
             "films": films_json(report.films),
-            "photos": [_photo_json(photo) for photo in report.photos],
+            "photos": [
+                asdict(photo) | {"capture_time": photo.capture_time and photo.capture_time.isoformat()}
+                for photo in report.photos
+            ],
         }
     )
     return document
 
 
-def _photo_json(photo: PhotoOutcome) -> dict[str, Any]:
-    return {
-        "name": photo.name,
-        "status": photo.status,
-        "reason_code": photo.reason_code,
-        "reason": photo.reason,
-        "width": photo.width,
-        "height": photo.height,
-        "camera_key": photo.camera_key,
-        "capture_time": photo.capture_time.isoformat() if photo.capture_time else None,
-        "has_gps": photo.has_gps,
-        "features": photo.features,
-        "matches": photo.matches,
-        "observations": photo.observations,
-        "map_id": photo.map_id,
-        "reprojection_px": photo.reprojection_px,
-        "gps_residual_m": photo.gps_residual_m,
-        "gps_used": photo.gps_used,
-        "warnings": photo.warnings,
-    }
-
-
 def _map_json(outcome: MapOutcome) -> dict[str, Any]:
-    errors, tracks = outcome.errors_px, outcome.track_lengths
+    tracks = outcome.track_lengths
     edges = [*_TRACK_BINS, 1 << 30]
     counts: list[int] = np.histogram(tracks, bins=edges)[0].tolist() if len(tracks) else []
-    return {
-        "map_id": outcome.map_id,
-        "name": outcome.name,
-        "status": outcome.status,
-        "reason_code": outcome.reason_code,
-        "reason": outcome.reason,
-        "photos": outcome.photos,
-        "points": outcome.points,
-        "observations": outcome.observations,
-        "descriptors": outcome.descriptors,
-        "epsg": outcome.epsg,
-        "height_datum": outcome.height_datum,
-        "scale": outcome.scale,
-        "residual_rms_m": outcome.residual_rms_m,
-        "radius_m": outcome.radius_m,
-        "picture_shear": outcome.picture_shear,
+    return {name: getattr(outcome, name) for name in MapOutcome.__slots__ if name not in _DRAWN} | {
         "warnings": outcome.warnings,
-        "gates": outcome.gates,
-        "cameras": [
-            {
-                "name": c.name,
-                "model": c.model,
-                "width": c.width,
-                "height": c.height,
-                "photos": c.photos,
-                "focal_before_px": c.focal_before_px,
-                "focal_after_px": c.focal_after_px,
-            }
-            for c in outcome.cameras
-        ],
-        "reprojection_px": _percentiles(errors),
+        "cameras": [asdict(camera) for camera in outcome.cameras],
+        "reprojection_px": _percentiles(outcome.errors_px),
         "track_lengths": [{"from": low, "points": n} for low, n in zip(_TRACK_BINS, counts, strict=False)],
     }
 

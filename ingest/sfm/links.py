@@ -1,11 +1,12 @@
-"""How firmly the photos of a reconstruction hang together.
+"""How firmly the photos of a reconstruction hang together, and a reconstruction cut down to some of them.
 
 Look-alike buildings join reconstructions at the wrong place: a few dozen points of one facade tie photos that
 share thousands among themselves. Nothing in the residuals shows it, and covariances take the tie for true.
 """
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, with_observations
 
 
 def points_in_common(model: Model) -> sparse.csr_array:
@@ -74,3 +75,42 @@ def _parts(model: Model, tied: sparse.csr_array) -> list[list[int]]:
     count, label = connected_components(tied.astype(np.int8), directed=False)
     parts = [model.rows[label == part].tolist() for part in range(count)]
     return sorted(parts, key=lambda rows: (-len(rows), rows))
+
+
+_LEAST_SHARED = 15  # points that hold two photos together; as many as an accepted pose needs
+
+
+def keep_photos(model: Model, rows: Collection[int], least: int = 2) -> Model | None:
+    """The largest part of the model that hangs together among the given rows; None if it is under `least`."""
+    wanted = np.isin(model.rows, np.array(sorted(rows), dtype=np.int64))
+    if wanted.all():
+        return model if len(model.rows) >= least else None
+    tied = (points_in_common(model).toarray() >= _LEAST_SHARED) & np.outer(wanted, wanted)
+    _, label = connected_components(sparse.csr_array(tied.astype(np.int8)), directed=False)
+    sizes = np.bincount(label[wanted], minlength=int(label.max()) + 1)
+    kept = wanted & (label == int(sizes.argmax()))
+    if int(kept.sum()) < least:
+        return None
+    return _cut(model, kept)
+
+
+def select_photos(model: Model, rows: Collection[int]) -> Model:
+    """The model with these photos, whether they hang together or not."""
+    wanted = np.isin(model.rows, np.array(sorted(rows), dtype=np.int64))
+    return model if wanted.all() else _cut(model, wanted)
+
+
+def _cut(model: Model, kept: "np.ndarray") -> Model:
+    """The model with the photos of the mask (k,) and the points that two of them still see."""
+    here = kept[model.photo_of]
+    here &= np.bincount(model.point_of[here], minlength=len(model.xyz))[model.point_of] >= 2
+    cameras, camera_of = np.unique(model.camera_of[kept], return_inverse=True)
+    seen = with_observations(model, here)
+    return replace(
+        seen,
+        cameras=tuple(model.cameras[int(c)] for c in cameras),
+        rows=model.rows[kept],
+        camera_of=camera_of.reshape(-1).astype(np.int64),
+        cam_from_sfm=tuple(p for p, yes in zip(model.cam_from_sfm, kept.tolist(), strict=True) if yes),
+        photo_of=(np.cumsum(kept) - 1)[seen.photo_of].astype(np.int64),
+    )

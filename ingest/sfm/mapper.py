@@ -14,12 +14,16 @@ import numpy as np
 from featuredb.geometry.camera import Camera
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, write_database
-from ingest.colmap.submodel import keep_photos
 from ingest.sfm.extract import read_keypoints
-from ingest.sfm.global_start import map_globally, registered_with_usual_lens
 from ingest.sfm.held_lens import better_supported, mostly_impossible
+from ingest.sfm.links import keep_photos
 from ingest.sfm.matching import read_two_view
-from ingest.sfm.view_graph_focals import calibrate_focals, start_from
+from ingest.sfm.view_graph_focals import (
+    calibrate_focals,
+    map_globally,
+    registered_with_usual_lens,
+    start_from,
+)
 from ingest.workspace import atomic_folder
 
 logger = logging.getLogger(__name__)

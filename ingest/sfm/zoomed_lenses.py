@@ -73,7 +73,7 @@ def _may_zoom(photo: Photo) -> bool:
     return bool(photo.film) and photo.focal_px is None
 
 
-def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) -> NDArray[np.int64] | None:
+def focal_runs(block: Block, camera: int) -> NDArray[np.int64] | None:
     """(k,) number of the focal length of each photo of a camera, from 0, in the order of their names.
 
     Photos that follow each other keep one while no difference is significant. None: one for all.
@@ -84,7 +84,7 @@ def focal_runs(block: Block, camera: int, options: AdjustOptions | None = None) 
     Args:
         camera: its row in the block, of a shot whose photos' names are in the order of time.
     """
-    options = options or AdjustOptions()
+    options = AdjustOptions()
     rows = np.flatnonzero(block.camera_of == camera)
     if len(rows) < _LEAST_PHOTOS:
         return None

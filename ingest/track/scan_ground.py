@@ -6,7 +6,6 @@ the error of its pose; the next keyframe is registered anew, so that none of it 
 """
 
 from collections import deque
-from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -16,17 +15,15 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import skew
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame.candidates import available_sources
 from ingest.register.frame.dense.confirmation import ConfirmOptions
-from ingest.register.frame.dense.fit import DenseFitOptions
-from ingest.register.frame.near import NoNearFit, fit_near
-from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.register import register_frame
+from ingest.register.frame.options import DenseFitOptions, FrameOptions
+from ingest.register.frame.register import fit_near, register_frame
 from ingest.register.frame_registration import FramePrior, RenderSource
-from ingest.register.structure.depth_filter import DepthFilterOptions, surface_at
-from ingest.track.keyframe_average import KeyframeAverage
+from ingest.register.structure.depth_filter import surface_at
 from reloc.localise.result import LocaliseRequest
 from reloc.tracking.ground import Ground, Keyframe, Standing, Unmatched
 from reloc.tracking.options import TrackOptions
@@ -46,48 +43,31 @@ _SHOWN_KEYFRAMES = 4
 # one was believed.
 _CONFIRM_FIRST = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.45)
 _CONFIRM_NEAR = ConfirmOptions(finest_spacing=0.5, min_agreeing=0.33)
-
-
-def _first_options() -> FrameOptions:
-    return FrameOptions(confirm=_CONFIRM_FIRST, threads=1)
-
-
-def _near_options() -> FrameOptions:
-    # From some pixels off the last round of the dense fit is enough, as often as it moves the pose.
-    fit = DenseFitOptions(spacing_px=(3.75,), piece_px=(40,), near_px=(6,), more_rounds=4)
-    return FrameOptions(confirm=_CONFIRM_NEAR, dense_fit=fit, threads=1)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanTrackOptions:
-    """How a film is followed on a scan.
-
-    Attributes:
-        corners: at most, that are looked for in a keyframe; the depth filter leaves out some. corner_quality:
-            least strength, as a share of the strongest one's. corner_apart_px: between them, at 1280 px.
-        track_sigma_m, track_sigma_deg: how far the pose of a frame that is followed may be off, generously:
-            the prior of its fit.
-        lost_sigma_m, lost_sigma_heading_deg, lost_sigma_tilt_deg: how far a lost camera may be from where it
-            was last seen: a second of a drone's flight. From so near a frame of another town is refused
-            in 7 s; from three times as far the dense search had not ended after four minutes.
-        fade, max_chi2: see `KeyframeAverage`.
-        first, near: how a frame is registered from a prior, and from the track.
-        depth: which depths are believed.
-    """
-
-    corners: int = 600
-    corner_quality: float = 0.005
-    corner_apart_px: float = 12.0
-    track_sigma_m: float = 1.0
-    track_sigma_deg: float = 1.0
-    lost_sigma_m: float = 5.0
-    lost_sigma_heading_deg: float = 8.0
-    lost_sigma_tilt_deg: float = 3.0
-    fade: float = 0.75
-    max_chi2: float = 20.1
-    first: FrameOptions = field(default_factory=_first_options)
-    near: FrameOptions = field(default_factory=_near_options)
-    depth: DepthFilterOptions = field(default_factory=DepthFilterOptions)
+# How a frame is registered from a prior, and from the track: from some pixels off the last round of the dense
+# fit is enough, as often as it moves the pose.
+_FIRST = FrameOptions(confirm=_CONFIRM_FIRST, threads=1)
+_NEAR = FrameOptions(
+    confirm=_CONFIRM_NEAR,
+    dense_fit=DenseFitOptions(spacing_px=(3.75,), piece_px=(40,), near_px=(6,), more_rounds=4),
+    threads=1,
+)
+# At most, that are looked for in a keyframe; the depth filter leaves out some. _CORNER_QUALITY: least
+# strength, as a share of the strongest one's. _CORNER_APART_PX: between them, at 1280 px.
+_CORNERS = 600
+_CORNER_QUALITY = 0.005
+_CORNER_APART_PX = 12.0
+# How far the pose of a frame that is followed may be off, generously: the prior of its fit.
+_TRACK_SIGMA_M = 1.0
+_TRACK_SIGMA_DEG = 1.0
+# How far a lost camera may be from where it was last seen: a second of a drone's flight. From so near a frame
+# of another town is refused in 7 s; from three times as far the dense search had not ended after four
+# minutes.
+_LOST_SIGMA_M = 5.0
+_LOST_SIGMA_HEADING_DEG = 8.0
+_LOST_SIGMA_TILT_DEG = 3.0
+# See `KeyframeAverage`.
+_FADE = 0.75
+_MAX_CHI2 = 20.1
 
 
 class ScanGround:
@@ -98,15 +78,15 @@ class ScanGround:
             is looked for from there.
     """
 
-    def __init__(self, cloud: PointCloud, scan_id: str, epsg: int, options: ScanTrackOptions) -> None:
+    def __init__(self, cloud: PointCloud, scan_id: str, epsg: int) -> None:
         """
         Args:
             scan_id: what poses are said to stand on. epsg: UTM zone of answers.
         """
-        self._cloud, self._scan_id, self._epsg, self._options = cloud, scan_id, epsg, options
+        self._cloud, self._scan_id, self._epsg = cloud, scan_id, epsg
         self._source: RenderSource = available_sources(cloud)[0]
         self._covariances: list[FloatArray] = []  # by number of the keyframe, local axes
-        self._average = KeyframeAverage(options.fade, options.max_chi2)
+        self._average = KeyframeAverage(_FADE, _MAX_CHI2)
         self._shown: deque[FloatArray] = deque(maxlen=_SHOWN_KEYFRAMES)
         self.last: Rigid3 | None = None
 
@@ -119,18 +99,11 @@ class ScanGround:
         self, gray: NDArray[np.uint8], camera: Camera, pose: Rigid3, options: TrackOptions
     ) -> Keyframe | Unmatched:
         """A frame (h, w) that the track knows, registered to the scan from there."""
-        own = self._options
-        prior = FramePrior(
-            cam_from_local=pose,
-            sigma_horizontal_m=own.track_sigma_m,
-            sigma_vertical_m=own.track_sigma_m,
-            sigma_heading_deg=own.track_sigma_deg,
-            sigma_tilt_deg=own.track_sigma_deg,
-        )
-        found = fit_near(gray, camera, prior, self._cloud, self._source, own.near)
-        if isinstance(found, NoNearFit):
-            return Unmatched(reason=found.reason, detail=found.message)
-        averaged = self._average.add(pose, found.pose.cam_from_local, found.covariance)
+        prior = FramePrior.around(pose, _TRACK_SIGMA_M, _TRACK_SIGMA_DEG)
+        found = fit_near(gray, camera, prior, self._cloud, self._source, _NEAR)
+        if found.cam_from_local is None or found.covariance is None or found.source is None:
+            return Unmatched(reason=str(found.reason), detail=found.message)
+        averaged = self._average.add(pose, found.cam_from_local, found.covariance)
         return self._landmarks(gray, camera, averaged, found.covariance, found.source, options)
 
     def found(
@@ -166,9 +139,9 @@ class ScanGround:
     ) -> Keyframe | Unmatched:
         """The frame's corners, on the scan's surface."""
         self._source = source
-        pixels = _corners(gray, self._options)
+        pixels = _corners(gray)
         rendering = render(self._cloud, camera, pose, RenderOptions(attributes=False, threads=1))
-        hits = surface_at(rendering, self._cloud, pixels, self._options.depth)
+        hits = surface_at(rendering, self._cloud, pixels)
         pixels, points = pixels[hits.valid], hits.points[hits.valid]
         if len(points) < options.min_matches:
             return Unmatched(
@@ -214,22 +187,15 @@ class ScanGround:
 class ScanFinder:
     """Finds frames on a scan: the first from a coarse pose, later ones from where the camera was last."""
 
-    def __init__(
-        self,
-        cloud: PointCloud,
-        scan_id: str,
-        epsg: int,
-        first: FramePrior | None,
-        options: ScanTrackOptions | None = None,
-    ) -> None:
+    def __init__(self, cloud: PointCloud, scan_id: str, epsg: int, first: FramePrior | None) -> None:
         """
         Args:
             cloud: the scan around the flight.
             first: coarse pose of the first frame, in the cloud's frame; None: nothing is found until
                 something else has found a frame.
         """
-        self._cloud, self._options = cloud, options or ScanTrackOptions()
-        self.ground = ScanGround(cloud, scan_id, epsg, self._options)
+        self._cloud = cloud
+        self.ground = ScanGround(cloud, scan_id, epsg)
         self._first = first
 
     def find(
@@ -241,7 +207,7 @@ class ScanFinder:
         prior = self._prior()
         if prior is None:
             return Unmatched(reason="NO_POSE", detail="a scan is not searched without a coarse pose")
-        found = register_frame(gray, request.camera, prior, self._cloud, self._options.first)
+        found = register_frame(gray, request.camera, prior, self._cloud, _FIRST)
         if found.cam_from_local is None or found.covariance is None or found.source is None:
             return Unmatched(reason=str(found.reason), detail=found.message)
         return self.ground.found(
@@ -254,22 +220,75 @@ class ScanFinder:
 
     def _prior(self) -> FramePrior | None:
         """The coarse pose; once the camera was seen, from there as far as it may have gone."""
-        own = self._options
         if self.ground.last is None:
             return self._first
         return FramePrior(
             cam_from_local=self.ground.last,
-            sigma_horizontal_m=own.lost_sigma_m,
-            sigma_vertical_m=own.lost_sigma_m,
-            sigma_heading_deg=own.lost_sigma_heading_deg,
-            sigma_tilt_deg=own.lost_sigma_tilt_deg,
+            sigma_horizontal_m=_LOST_SIGMA_M,
+            sigma_vertical_m=_LOST_SIGMA_M,
+            sigma_heading_deg=_LOST_SIGMA_HEADING_DEG,
+            sigma_tilt_deg=_LOST_SIGMA_TILT_DEG,
         )
 
 
-def _corners(gray: NDArray[np.uint8], options: ScanTrackOptions) -> FloatArray:
+def _corners(gray: NDArray[np.uint8]) -> FloatArray:
     """Pixels (n, 2) that the flow can hold on to, the strongest first."""
     scale = max(gray.shape) / 1280
-    found = cv2.goodFeaturesToTrack(
-        gray, options.corners, options.corner_quality, options.corner_apart_px * scale
-    )
+    found = cv2.goodFeaturesToTrack(gray, _CORNERS, _CORNER_QUALITY, _CORNER_APART_PX * scale)
     return np.empty((0, 2)) if found is None else found.reshape(-1, 2).astype(np.float64) + _HALF_PX
+
+
+# Registrations of a film's keyframes, averaged along its track, so that poses do not jump at each.
+#
+# A window of keyframes whose older ones fade: what is adjusted in one go over a sliding window is folded into
+# one normal distribution, as a Kalman filter does. The track says how the camera moved between keyframes, far
+# better than a registration says where it is.
+
+
+class KeyframeAverage:
+    """The fading average of the registrations of one uninterrupted track."""
+
+    def __init__(self, fade: float, max_chi2: float) -> None:
+        """
+        Args:
+            fade: what a keyframe counts at the next one, 0 to 1: about 1 / (1 - fade) of them take part.
+            max_chi2: squared normalised distance between the track and a registration; beyond it the track
+                has gone astray, and the average begins again.
+        """
+        self._fade, self._max_chi2 = fade, max_chi2
+        self._information: FloatArray | None = None
+        self._center = np.zeros(3)
+
+    def begin(self, pose: Rigid3, covariance: FloatArray) -> None:
+        """With the registration of a frame that was found."""
+        self._information = np.asarray(np.linalg.inv(of_camera(pose, covariance)), dtype=np.float64)
+        self._center = pose.center
+
+    def end(self) -> None:
+        """The track goes on by something else, or is lost."""
+        self._information = None
+
+    def add(self, tracked: Rigid3, registered: Rigid3, covariance: FloatArray) -> Rigid3:
+        """The pose of a keyframe by all of them.
+
+        Args:
+            tracked: where the track has it. registered: where the scan has it.
+            covariance: (6, 6) of the left perturbation of the registered pose.
+        """
+        if self._information is None:
+            self.begin(registered, covariance)
+            return registered
+        # An error of the older keyframes' rotation moves the camera by what it has gone since.
+        back = np.eye(6)
+        back[3:, :3] = skew(tracked.center - self._center)
+        older = self._fade * back.T @ self._information @ back
+        own = np.linalg.inv(of_camera(registered, covariance))
+        to_local = np.kron(np.eye(2), -tracked.rotation.T)
+        apart = to_local @ (registered @ tracked.inverse()).log()
+        if apart @ np.linalg.solve(np.linalg.inv(older) + np.linalg.inv(own), apart) > self._max_chi2:
+            self.begin(registered, covariance)
+            return registered
+        moved = np.linalg.solve(older + own, own @ apart)
+        fused = Rigid3.exp(to_local.T @ moved) @ tracked
+        self._information, self._center = older + own, fused.center
+        return fused

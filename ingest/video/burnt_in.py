@@ -7,7 +7,7 @@ road straight ahead), so that only the slope along the motion counts; and where 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,46 +17,30 @@ from scipy.spatial import cKDTree
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
-from ingest.video.same_scene import SameSceneOptions, matched
+from ingest.video.motion import MAX_RATIO, SCENE_FEATURES, matched
 
 Mask = NDArray[np.bool_]
 Gray = NDArray[np.uint8]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BurntInOptions:
-    """How it is found, in pictures of about 640 pixels.
-
-    Attributes:
-        moved_px: the surroundings of what is burnt in have moved by at least so much from one picture to
-            the next; slopes of a scene are no longer alike then. still_px: what moves less may be burnt in
-            itself, and says nothing about its surroundings.
-        nearest: matches around a pixel that tell how its surroundings move.
-        least: pairs of pictures between which they moved.
-        least_likeness: correlation of the slopes of two pictures at the same pixels, over all pairs. That of
-            the scene is about 0, of what is burnt in 1.
-        window: side of the squares of pixels that are looked at together.
-        least_slope: grey values a pixel, root mean square, of an edge.
-        least_area: pixels; smaller specks are chance.
-        around_px: so much is masked around it: keypoints look at their surroundings.
-        steady_levels: deviation of grey values that compression leaves in a bar.
-        bar_levels: bars are no brighter. bar_share: of a bar's row that is of one grey value; writing may be
-            on it.
-    """
-
-    moved_px: float = 6.0
-    still_px: float = 0.5
-    nearest: int = 8
-    least: int = 4
-    least_likeness: float = 0.5
-    window: int = 7
-    least_slope: float = 6.0
-    least_area: int = 40
-    around_px: int = 6
-    steady_levels: float = 3.0
-    bar_levels: float = 32.0
-    bar_share: float = 0.7
-    scene: SameSceneOptions = field(default_factory=SameSceneOptions)
+# The surroundings of what is burnt in have moved by at least so much from one picture to the next; slopes of
+# a scene are no longer alike then. _STILL_PX: what moves less may be burnt in itself, and says nothing about
+# its surroundings.
+_MOVED_PX = 6.0
+_STILL_PX = 0.5
+_NEAREST = 8  # matches around a pixel that tell how its surroundings move
+_LEAST = 4  # pairs of pictures between which they moved
+# Correlation of the slopes of two pictures at the same pixels, over all pairs. That of the scene is about 0,
+# of what is burnt in 1.
+_LEAST_LIKENESS = 0.5
+_WINDOW = 7  # side of the squares of pixels that are looked at together
+_LEAST_SLOPE = 6.0  # grey values a pixel, root mean square, of an edge
+_LEAST_AREA = 40  # pixels; smaller specks are chance
+_AROUND_PX = 6  # so much is masked around it: keypoints look at their surroundings
+_STEADY_LEVELS = 3.0  # deviation of grey values that compression leaves in a bar
+# Bars are no brighter. _BAR_SHARE: of a bar's row that is of one grey value; writing may be on it.
+_BAR_LEVELS = 32.0
+_BAR_SHARE = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,9 +71,7 @@ class BurntIn:
         return float(inside.mean()) if inside.size else 0.0
 
 
-def find_burnt_in(
-    pictures: Sequence[Gray], shots: Sequence[int], options: BurntInOptions | None = None
-) -> dict[int, BurntIn]:
+def find_burnt_in(pictures: Sequence[Gray], shots: Sequence[int]) -> dict[int, BurntIn]:
     """What is burnt into each shot of a film.
 
     Args:
@@ -99,19 +81,18 @@ def find_burnt_in(
     Where a shot says nothing, since it is too short or hardly moves there, the whole film does: across a cut
     all of the scene is another.
     """
-    options = options or BurntInOptions()
     rows = {shot: [k for k, s in enumerate(shots) if s == shot] for shot in sorted(set(shots))}
-    film_bars = _bars(pictures, options)
-    sums, film = _Sums.of_pairs(pictures, shots, options)
+    film_bars = _bars(pictures)
+    sums, film = _Sums.of_pairs(pictures, shots)
     found = {}
     for shot, mine in rows.items():
-        bars = film_bars if len(mine) < options.least else _bars([pictures[k] for k in mine], options)
+        bars = film_bars if len(mine) < _LEAST else _bars([pictures[k] for k in mine])
         own = sums.get(shot)
-        edges = film.burnt_in(options)
+        edges = film.burnt_in()
         if own is not None:
-            edges = np.where(own.count >= options.least, own.burnt_in(options), edges)
+            edges = np.where(own.count >= _LEAST, own.burnt_in(), edges)
         # A bar's own edge is none of the picture's.
-        mask = _areas(edges & _within(bars, edges.shape, options.window), options)
+        mask = _areas(edges & _within(bars, edges.shape, _WINDOW))
         found[shot] = BurntIn(mask=mask | ~_within(bars, mask.shape, 0), bars=bars)
     return found
 
@@ -129,21 +110,19 @@ class _Sums:
     count: FloatArray
 
     @classmethod
-    def of_pairs(
-        cls, pictures: Sequence[Gray], shots: Sequence[int], options: BurntInOptions
-    ) -> tuple[dict[int, "_Sums"], "_Sums"]:
+    def of_pairs(cls, pictures: Sequence[Gray], shots: Sequence[int]) -> tuple[dict[int, "_Sums"], "_Sums"]:
         """Sums of each shot and of the film."""
         shape = pictures[0].shape
         film = cls(both=np.zeros(shape), each=np.zeros(shape), count=np.zeros(shape))
         of_shot: dict[int, _Sums] = {}
-        features, slopes = extract(pictures[0], options.scene.features), _slopes(pictures[0])
+        features, slopes = extract(pictures[0], SCENE_FEATURES), _slopes(pictures[0])
         for k in range(1, len(pictures)):
             before, steep = features, slopes
-            features, slopes = extract(pictures[k], options.scene.features), _slopes(pictures[k])
+            features, slopes = extract(pictures[k], SCENE_FEATURES), _slopes(pictures[k])
             if shots[k] != shots[k - 1]:
                 film.add(steep, slopes, np.ones(shape, dtype=np.bool_))
                 continue
-            flow = _flow(before, features, shape, options)
+            flow = _flow(before, features, shape)
             if flow is None:
                 continue
             moves = np.linalg.norm(flow, axis=0)
@@ -153,7 +132,7 @@ class _Sums:
                 shots[k], cls(both=np.zeros(shape), each=np.zeros(shape), count=np.zeros(shape))
             )
             for sums in (own, film):
-                sums.add(one, other, moves >= options.moved_px)
+                sums.add(one, other, moves >= _MOVED_PX)
         return of_shot, film
 
     def add(self, one: FloatArray, other: FloatArray, tested: Mask) -> None:
@@ -162,12 +141,12 @@ class _Sums:
         self.each += 0.5 * (one**2 + other**2).sum(axis=0) * tested
         self.count += tested
 
-    def burnt_in(self, options: BurntInOptions) -> Mask:
+    def burnt_in(self) -> Mask:
         """Edges that stay where they are."""
-        side = (options.window, options.window)
+        side = (_WINDOW, _WINDOW)
         both, each = cv2.blur(self.both, side), cv2.blur(self.each, side)
-        found = (self.count >= options.least) & (both >= options.least_likeness * each)
-        return np.asarray(found & (each >= options.least_slope**2 * np.maximum(self.count, 1)))
+        found = (self.count >= _LEAST) & (both >= _LEAST_LIKENESS * each)
+        return np.asarray(found & (each >= _LEAST_SLOPE**2 * np.maximum(self.count, 1)))
 
 
 def _within(bars: tuple[int, int, int, int], shape: tuple[int, ...], more: int) -> Mask:
@@ -178,11 +157,11 @@ def _within(bars: tuple[int, int, int, int], shape: tuple[int, ...], more: int) 
     return inside
 
 
-def _areas(edges: Mask, options: BurntInOptions) -> Mask:
+def _areas(edges: Mask) -> Mask:
     """What edges enclose and what is around them, without specks."""
     labels, names, stats, _ = cv2.connectedComponentsWithStats(edges.astype(np.uint8))
-    large = [n for n in range(1, labels) if stats[n, cv2.CC_STAT_AREA] >= options.least_area]
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * options.around_px + 1,) * 2)
+    large = [n for n in range(1, labels) if stats[n, cv2.CC_STAT_AREA] >= _LEAST_AREA]
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _AROUND_PX + 1,) * 2)
     closed = cv2.morphologyEx(np.isin(names, large).astype(np.uint8), cv2.MORPH_CLOSE, kernel)
     return np.asarray(cv2.dilate(closed, kernel), dtype=np.bool_)
 
@@ -192,32 +171,30 @@ def _slopes(picture: Gray) -> FloatArray:
     return np.stack([cv2.Sobel(picture, cv2.CV_64F, *way) for way in ((1, 0), (0, 1))]) / 8.0
 
 
-def _flow(
-    one: Features, other: Features, shape: tuple[int, ...], options: BurntInOptions
-) -> FloatArray | None:
+def _flow(one: Features, other: Features, shape: tuple[int, ...]) -> FloatArray | None:
     """(2, h, w) pixels by which the surroundings of each pixel move, the shorter ones of those around.
 
     None where too little is matched.
     """
-    start, end = matched(one, other, options.scene.max_ratio)
+    start, end = matched(one, other, MAX_RATIO)
     moves = end - start
-    moving = np.linalg.norm(moves, axis=1) >= options.still_px
+    moving = np.linalg.norm(moves, axis=1) >= _STILL_PX
     start, moves = start[moving], moves[moving]
-    if len(start) < 3 * options.nearest:
+    if len(start) < 3 * _NEAREST:
         return None
     cell = 16
     rows, columns = -(-shape[0] // cell), -(-shape[1] // cell)
     y, x = np.mgrid[:rows, :columns] * cell + 0.5 * cell
-    found = cKDTree(start).query(np.stack([x.ravel(), y.ravel()], axis=1), k=options.nearest)
+    found = cKDTree(start).query(np.stack([x.ravel(), y.ravel()], axis=1), k=_NEAREST)
     near: NDArray[np.int64] = np.asarray(found[1], dtype=np.int64)
     lengths = np.linalg.norm(moves[near], axis=2)
-    shorter = np.argsort(lengths, axis=1)[:, options.nearest // 4]
+    shorter = np.argsort(lengths, axis=1)[:, _NEAREST // 4]
     grid = moves[near[np.arange(len(near)), shorter]].reshape(rows, columns, 2)
     full = np.repeat(np.repeat(grid, cell, axis=0), cell, axis=1)[: shape[0], : shape[1]]
     return np.moveaxis(full, 2, 0)
 
 
-def _bars(pictures: Sequence[Gray], options: BurntInOptions) -> tuple[int, int, int, int]:
+def _bars(pictures: Sequence[Gray]) -> tuple[int, int, int, int]:
     """Widths of the rows and columns of one grey value at the edges: left, top, right, bottom."""
     stack = np.stack(pictures).astype(np.float32)
     widths = []
@@ -225,8 +202,8 @@ def _bars(pictures: Sequence[Gray], options: BurntInOptions) -> tuple[int, int, 
         lines = np.moveaxis(stack, axis, 0)  # (lines, pictures, pixels)
         lines = lines[::-1] if flip else lines
         level = float(np.median(lines[0]))
-        steady = (np.abs(lines - level) <= options.steady_levels).mean(axis=(1, 2)) >= options.bar_share
-        ends = np.flatnonzero(~steady | (level > options.bar_levels))
+        steady = (np.abs(lines - level) <= _STEADY_LEVELS).mean(axis=(1, 2)) >= _BAR_SHARE
+        ends = np.flatnonzero(~steady | (level > _BAR_LEVELS))
         widths.append(int(ends[0]) if len(ends) else 0)
     # Resampling mixes a bar's last row with the picture.
     left, top, right, bottom = (width + 2 if width else 0 for width in widths)

@@ -6,7 +6,7 @@ log: the film is laid where they agree if they agree nowhere else, and if its ow
 else is refused, as positions that belong to other moments bend a map or put it beside its place.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,50 +24,35 @@ from ingest.video.film_time import (
     utc_text,
 )
 from ingest.video.lag import Lag
-from ingest.video.match import CurveMatchOptions, Match, match_movement
+from ingest.video.match import Match, match_movement
 from ingest.video.motion import Motion
 
 _HALF_DAY_S = 43_200.0
 _OVERRIDE = "give --film-start with when it begins, --gcp, or --no-telemetry"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClockOptions:
-    """When a film's place on a log's clock is believed.
-
-    Attributes:
-        drift_s: how wrong a camera's clock may be beside its zone: one that is set by hand once a month.
-        told_s: how far from what a person says the speeds may move it, as for telemetry in the film's time.
-        margin: every other beginning must be so much less likely, as a natural logarithm (`Match.evidence`),
-            and farther away than `repeat_s`, where a flight may repeat itself, beyond so many deviations of
-            what chance does to that (`Match.luck`).
-        deviations, repeat_s: see margin.
-        spread_s: beginnings that are not, beside the best, are within so many seconds of it: at 10 m/s an
-            error of a second is that of a poor receiver.
-        min_correlation: of the speeds, or of the turns: cameras that tilt and turn all the time have no more.
-        max_search_s: of log to be searched; longer ones are no flight.
-        match: how movements are compared. Films shorter than its `least_s` have one bend or one stop, and
-            those of other flights are like it.
-    """
-
-    drift_s: float = 120.0
-    told_s: float = 3.0
-    margin: float = 7.0
-    deviations: float = 2.0
-    repeat_s: float = 10.0
-    spread_s: float = 1.0
-    min_correlation: float = 0.5
-    match: CurveMatchOptions = field(default_factory=lambda: CurveMatchOptions(least_s=40.0))
-    max_search_s: float = 172_800.0
+_DRIFT_S = 120.0  # how wrong a camera's clock may be beside its zone: one that is set by hand once a month
+_TOLD_S = 3.0  # how far from what a person says the speeds may move it, as for telemetry in the film's time
+# Every other beginning must be so much less likely, as a natural logarithm (`Match.evidence`), and farther
+# away than _REPEAT_S, where a flight may repeat itself, beyond so many deviations of what chance does to that
+# (`Match.luck`).
+_MARGIN = 7.0
+_DEVIATIONS = 2.0
+_REPEAT_S = 10.0
+# Beginnings that are not, beside the best, are within so many seconds of it: at 10 m/s an error of a second
+# is that of a poor receiver.
+_SPREAD_S = 1.0
+_MIN_CORRELATION = 0.5  # of the speeds, or of the turns: cameras that tilt and turn all the time have no more
+_MAX_SEARCH_S = 172_800.0  # of log to be searched; longer ones are no flight
+_LEAST_S = 40.0  # films shorter than that have one bend or one stop, and those of other flights are like it
 
 
-def check_overlap(film: FilmTime, telemetry: Telemetry, options: ClockOptions | None = None) -> None:
+def check_overlap(film: FilmTime, telemetry: Telemetry) -> None:
     """Refuse, before the film is looked at, a log that cannot be of it by any reading of the clocks.
 
     Raises:
         TelemetryError: names both spans.
     """
-    options = options or ClockOptions()
     low, high = log_span(telemetry)
     if film.told_s is not None:
         if film.told_s > high or film.told_s + film.duration_s < low:
@@ -78,8 +63,7 @@ def check_overlap(film: FilmTime, telemetry: Telemetry, options: ClockOptions | 
         return
     expected = possible_beginnings(film, telemetry)
     if expected is not None and not any(
-        start - options.drift_s <= high and start + film.duration_s + options.drift_s >= low
-        for start in expected
+        start - _DRIFT_S <= high and start + film.duration_s + _DRIFT_S >= low for start in expected
     ):
         assert film.created is not None
         raise TelemetryError(
@@ -90,46 +74,43 @@ def check_overlap(film: FilmTime, telemetry: Telemetry, options: ClockOptions | 
         )
 
 
-def lay_on_film(
-    motion: Motion, telemetry: Telemetry, film: FilmTime, options: ClockOptions | None = None
-) -> Lag:
+def lay_on_film(motion: Motion, telemetry: Telemetry, film: FilmTime) -> Lag:
     """Where on the telemetry's `times_s` the film's time 0 is, as a lag; None with the reason where unclear.
 
     The telemetry is not in the film's time. A beginning that a person tells is moved by `told_s` at most, and
     stays as it is where the movements do not tell.
     """
-    options = options or ClockOptions()
     low, high = log_span(telemetry)
     first, last = (float(motion.time_s[k]) for k in (0, -1)) if len(motion) else (0.0, 0.0)
     search = (low - last, high - first)
     if film.told_s is not None:
         # A person who is wrong by an hour can be told so, and need not be by a week.
         search = (max(search[0], film.told_s - _HALF_DAY_S), min(search[1], film.told_s + _HALF_DAY_S))
-    elif high - low > options.max_search_s:
+    elif high - low > _MAX_SEARCH_S:
         return _refused(
             f"{log_text(telemetry)}: too long to look for a film in; cut it to the day of the flight, or "
             f"{_OVERRIDE}"
         )
-    match = match_movement(motion, telemetry, search, options.match) if search[0] < search[1] else None
+    match = match_movement(motion, telemetry, search, _LEAST_S) if search[0] < search[1] else None
     if match is not None and not (match.evidence > 0).any():
         match = None
     if film.told_s is not None:
-        near = (film.told_s - options.told_s, film.told_s + options.told_s)
-        close = match_movement(motion, telemetry, near, CurveMatchOptions())
-        return _near_told(match, close, telemetry, film, film.told_s, options)
+        near = (film.told_s - _TOLD_S, film.told_s + _TOLD_S)
+        close = match_movement(motion, telemetry, near)
+        return _near_told(match, close, telemetry, film, film.told_s)
     if match is None:
         return _refused(
-            f"{log_text(telemetry)}; {film.name} has less than {options.match.least_s:.0f} s of movement in "
+            f"{log_text(telemetry)}; {film.name} has less than {_LEAST_S:.0f} s of movement in "
             f"common with it, too little to tell where in it the film begins: {_OVERRIDE}"
         )
-    return _found(match, telemetry, film, options)
+    return _found(match, telemetry, film)
 
 
-def _found(match: Match, telemetry: Telemetry, film: FilmTime, options: ClockOptions) -> Lag:
+def _found(match: Match, telemetry: Telemetry, film: FilmTime) -> Lag:
     """The beginning by the movements alone, if it is clear and the film's own clock can mean it."""
-    found = best_beginning(match, options)
+    found = best_beginning(match)
     start, correlation = found.lag_s, found.correlation
-    if found.lead < options.margin or correlation < options.min_correlation:
+    if found.lead < _MARGIN or correlation < _MIN_CORRELATION:
         return _refused(
             f"the movements of picture and receiver do not tell where {film.name} begins in all of the log: "
             f"they correlate by {correlation:.2f} if it does {at_text(start, telemetry)}, and by "
@@ -144,7 +125,7 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime, options: ClockOpt
         return Lag(late_s=round(start, 3), correlation=correlation, message=said)
     assert film.created is not None
     ahead = film.created.timestamp() - (clock_offset_s(telemetry) or 0.0) - start
-    if np.abs(start - expected).min() > options.drift_s:
+    if np.abs(start - expected).min() > _DRIFT_S:
         return _refused(
             f"{said}, but {film.name} was made at {utc_text(film.created.timestamp())} by its own clock, "
             f"{ahead:+.0f} s from there, and that is no time zone; if that clock is wrong, give --film-start "
@@ -157,18 +138,13 @@ def _found(match: Match, telemetry: Telemetry, film: FilmTime, options: ClockOpt
 
 
 def _near_told(
-    match: Match | None,
-    close: Match | None,
-    telemetry: Telemetry,
-    film: FilmTime,
-    told: float,
-    options: ClockOptions,
+    match: Match | None, close: Match | None, telemetry: Telemetry, film: FilmTime, told: float
 ) -> Lag:
     """What a person tells: moved a little where movements are clear, refused where they clearly deny it."""
     if match is not None:
-        far = best_beginning(match, options)
-        clear = far.lead >= options.margin and far.correlation >= options.min_correlation
-        if clear and abs(far.lag_s - told) > options.told_s:
+        far = best_beginning(match)
+        clear = far.lead >= _MARGIN and far.correlation >= _MIN_CORRELATION
+        if clear and abs(far.lag_s - told) > _TOLD_S:
             return _refused(
                 f"--film-start says that {film.name} begins {at_text(told, telemetry)}; picture and receiver "
                 f"move alike only if it begins {at_text(far.lag_s, telemetry)} (correlation "
@@ -176,13 +152,13 @@ def _near_told(
                 "--telemetry-late 0 beside yours if you are sure of it",
                 far.correlation,
             )
-    found = None if close is None else best_beginning(close, options)
+    found = None if close is None else best_beginning(close)
     if (
         found is None
-        or found.lead < options.margin
-        or found.correlation < options.min_correlation
+        or found.lead < _MARGIN
+        or found.correlation < _MIN_CORRELATION
         # At the edge of what was looked at the best is not yet found.
-        or abs(found.lag_s - told) > options.told_s - 0.5
+        or abs(found.lag_s - told) > _TOLD_S - 0.5
     ):
         return Lag(
             late_s=told,
@@ -215,14 +191,14 @@ class Beginning:
     lead: float
 
 
-def best_beginning(match: Match, options: ClockOptions) -> Beginning:
+def best_beginning(match: Match) -> Beginning:
     """The likeliest lag, and its lead over those that are farther than `spread_s` from it."""
     evidence = match.evidence
     best = int(np.argmax(evidence))
     away_s = np.abs(match.lags_s - match.lags_s[best])
     # Beside the best the curves are nearly the same, and so is what chance does to them.
-    chance = np.where(away_s > options.repeat_s, options.deviations * match.luck(best), 0.0)
-    elsewhere = away_s > options.spread_s
+    chance = np.where(away_s > _REPEAT_S, _DEVIATIONS * match.luck(best), 0.0)
+    elsewhere = away_s > _SPREAD_S
     behind = np.where(elsewhere, evidence[best] - evidence - chance, np.inf)
     rival = int(np.argmin(behind)) if elsewhere.any() else best
     better = np.nan_to_num(np.fmax(match.speed, match.turn))

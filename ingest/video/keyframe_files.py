@@ -19,12 +19,13 @@ from featuredb.features.film_lens import UNNAMED_MAKE, shot_model
 from featuredb.video.film import VideoFrame, VideoInfo, VideoOptions, fitted_size
 from featuredb.video.frames import open_video
 from ingest.executor import Progress
-from ingest.video.burnt_in import BurntIn, BurntInOptions, find_burnt_in, painted_over
+from ingest.video.burnt_in import BurntIn, find_burnt_in, painted_over
 from ingest.video.keyframes import KeyframeChoice
 from ingest.video.positions import GimbalAngles, Position
 from ingest.workspace import atomic_file
 
 _GIMBAL = XMP_ANGLES["drone-dji"]
+_QUALITY = 95  # of JPEG; films are compressed already, and what it adds should not be seen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,12 +34,10 @@ class Encoding:
 
     Attributes:
         video: how the film is read: the same stretch as when keyframes were chosen.
-        quality: of JPEG.
         unnamed: the camera's model where the film does not say; no two films have the same.
     """
 
     video: VideoOptions
-    quality: int
     unnamed: str
 
 
@@ -67,7 +66,7 @@ def write_keyframes(
                 continue
             camera = _camera(video.info, encoding.unnamed, choice.shot[k])
             with atomic_file(folder / keyframe_name(frame.index)) as file:
-                file.write_bytes(_jpeg(frame, video.info, camera, told[0][k], told[1][k], encoding.quality))
+                file.write_bytes(_jpeg(frame, video.info, camera, told[0][k], told[1][k]))
             left -= 1
             progress("keyframes", len(wanted) - left, len(wanted))
             if not left:
@@ -95,7 +94,6 @@ def _jpeg(
     camera: tuple[str, str],
     place: Position | None,
     angles: GimbalAngles | None,
-    quality: int,
 ) -> bytes:
     """One keyframe, of a camera's make and model."""
     exif = Image.Exif()
@@ -116,13 +114,11 @@ def _jpeg(
         words = {f"drone-dji:{name}": f"{angle:+.2f}" for name, angle in zip(_GIMBAL, angles, strict=True)}
         xmp = with_properties(b"", words)
     out = io.BytesIO()
-    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=quality, subsampling=0, exif=exif, xmp=xmp)
+    Image.fromarray(frame.rgb()).save(out, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp)
     return out.getvalue()
 
 
-def clean_keyframes(
-    folder: Path, choice: KeyframeChoice, side_px: int, quality: int, options: BurntInOptions
-) -> dict[int, BurntIn]:
+def clean_keyframes(folder: Path, choice: KeyframeChoice, side_px: int) -> dict[int, BurntIn]:
     """Paint over what is burnt into keyframes, so that no feature comes of it.
 
     Args:
@@ -133,14 +129,14 @@ def clean_keyframes(
     """
     files = [folder / keyframe_name(index) for index in choice.index]
     pictures = [_shrunk(file, side_px) for file in files]
-    found = find_burnt_in(pictures, choice.shot, options)
+    found = find_burnt_in(pictures, choice.shot)
     for file, shot in zip(files, choice.shot, strict=True):
         if found[shot].mask.any():
-            _paint_over(file, found[shot].mask, quality)
+            _paint_over(file, found[shot].mask)
     return found
 
 
-def _paint_over(file: Path, mask: NDArray[np.bool_], quality: int) -> None:
+def _paint_over(file: Path, mask: NDArray[np.bool_]) -> None:
     """Paint over a keyframe's mask."""
     with Image.open(file) as picture:
         rgb, exif, xmp = np.asarray(picture.convert("RGB")), picture.getexif(), picture.info.get("xmp", b"")
@@ -148,7 +144,7 @@ def _paint_over(file: Path, mask: NDArray[np.bool_], quality: int) -> None:
     large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     with atomic_file(file) as target:
         Image.fromarray(painted_over(rgb, large)).save(
-            target, format="JPEG", quality=quality, subsampling=0, exif=exif, xmp=xmp
+            target, format="JPEG", quality=_QUALITY, subsampling=0, exif=exif, xmp=xmp
         )
 
 

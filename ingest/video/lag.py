@@ -10,28 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from featuredb.video.telemetry.values import Telemetry
-from ingest.video.match import CurveMatchOptions, match_movement
+from ingest.video.match import LEAST_S, STEP_S, match_movement
 from ingest.video.motion import Motion
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LagOptions:
-    """When a lag is believed.
-
-    Attributes:
-        most_s: that is looked for. step_s: of the search.
-        smooth_s: speeds are means over so long; receivers smooth, too, and pictures shake.
-        least_s: of film that both know.
-        min_correlation: of the two curves at the best lag.
-        min_drop: how much less it is, half a second off to either side.
-    """
-
-    most_s: float = 3.0
-    step_s: float = 0.05
-    smooth_s: float = 0.5
-    least_s: float = 5.0
-    min_correlation: float = 0.8
-    min_drop: float = 0.02
+_MOST_S = 3.0  # that is looked for
+_MIN_CORRELATION = 0.8  # of the two curves at the best lag
+_MIN_DROP = 0.02  # how much less it is, half a second off to either side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,11 +33,9 @@ class Lag:
     message: str
 
 
-def estimate_lag(motion: Motion, telemetry: Telemetry, options: LagOptions | None = None) -> Lag:
+def estimate_lag(motion: Motion, telemetry: Telemetry) -> Lag:
     """The lag of the telemetry behind the picture."""
-    options = options or LagOptions()
-    how = CurveMatchOptions(step_s=options.step_s, smooth_s=options.smooth_s, least_s=options.least_s)
-    match = match_movement(motion, telemetry, (-options.most_s, options.most_s), how)
+    match = match_movement(motion, telemetry, (-_MOST_S, _MOST_S))
     if match is None:
         return Lag(late_s=None, correlation=float("nan"), message="too few samples to tell the lag")
     lags, found = match.lags_s, match.speed
@@ -61,14 +43,14 @@ def estimate_lag(motion: Motion, telemetry: Telemetry, options: LagOptions | Non
         return Lag(
             late_s=None,
             correlation=float("nan"),
-            message=f"picture and telemetry have no {options.least_s:g} s in common to tell the lag by",
+            message=f"picture and telemetry have no {LEAST_S:g} s in common to tell the lag by",
         )
     best = int(np.nanargmax(found))
-    aside = round(0.5 / options.step_s)
+    aside = round(0.5 / STEP_S)
     drops = [found[best] - found[k] for k in (best - aside, best + aside) if 0 <= k < len(lags)]
     drop = float(np.nanmin(drops)) if np.isfinite(drops).any() else 0.0
     correlation = float(found[best])
-    if len(drops) < 2 or correlation < options.min_correlation or drop < options.min_drop:
+    if len(drops) < 2 or correlation < _MIN_CORRELATION or drop < _MIN_DROP:
         return Lag(
             late_s=None,
             correlation=correlation,

@@ -23,21 +23,9 @@ _WILD_M_S = 150.0  # no drone and no car, as in `featuredb.video.telemetry.assem
 # Slower than this a course is the receiver's noise; turning faster than this it is no flight's.
 _COURSE_M_S, _COURSE_RAD_S = 1.5, 1.5
 _FEWEST = 10  # samples of a curve
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CurveMatchOptions:
-    """How curves are compared.
-
-    Attributes:
-        step_s: of the shifts.
-        smooth_s: curves are means over so long; receivers smooth, too, and pictures shake.
-        least_s: of film that both must know.
-    """
-
-    step_s: float = 0.05
-    smooth_s: float = 0.5
-    least_s: float = 5.0
+STEP_S = 0.05  # of the shifts
+_SMOOTH_S = 0.5  # curves are means over so long; receivers smooth, too, and pictures shake
+LEAST_S = 5.0  # of film that both must know
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,24 +79,24 @@ def match_movement(
     motion: Motion,
     telemetry: Telemetry,
     range_s: tuple[float, float],
-    options: CurveMatchOptions | None = None,
+    least_s: float = LEAST_S,
 ) -> Match | None:
     """Compare at all lags of a range; None where picture or receiver have too few samples for their speeds.
 
     Args:
         range_s: lowest and highest lag.
+        least_s: of film that both must know.
     """
-    options = options or CurveMatchOptions()
     speeds, receiver = _picture_speeds(motion), _receiver_speed(telemetry)
     if min(len(speeds[0].times_s), len(receiver.times_s)) < _FEWEST:
         return None
-    first, last = (round(float(end) / options.step_s) for end in range_s)
-    speed, samples = _slid(speeds[0], receiver, first, last, options)
-    other, other_samples = _slid(speeds[1], receiver, first, last, options)
+    first, last = (round(float(end) / STEP_S) for end in range_s)
+    speed, samples = _slid(speeds[0], receiver, first, last, least_s)
+    other, other_samples = _slid(speeds[1], receiver, first, last, least_s)
     better = _evidence(other, other_samples) > _evidence(speed, samples)
-    turn, turn_samples = _slid(_picture_turn(motion), _course_turn(telemetry), first, last, options)
+    turn, turn_samples = _slid(_picture_turn(motion), _course_turn(telemetry), first, last, least_s)
     return Match(
-        lags_s=np.asarray(options.step_s * np.arange(first, last + 1), dtype=np.float64),
+        lags_s=np.asarray(STEP_S * np.arange(first, last + 1), dtype=np.float64),
         speed=np.where(better, other, speed),
         turn=turn,
         speed_samples=np.where(better, other_samples, samples),
@@ -203,13 +191,13 @@ def _places(telemetry: Telemetry) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _slid(
-    ours: _Curve, theirs: _Curve, first: int, last: int, options: CurveMatchOptions
+    ours: _Curve, theirs: _Curve, first: int, last: int, least_s: float
 ) -> tuple[FloatArray, FloatArray]:
     """Correlation and independent samples at the lags first to last, in steps; NaN and 0 where none."""
     correlation, samples = np.full(last + 1 - first, np.nan), np.zeros(last + 1 - first)
     if min(len(ours.times_s), len(theirs.times_s)) < _FEWEST:
         return correlation, samples
-    step = options.step_s
+    step = STEP_S
     ours_s = np.arange(ours.times_s[0], ours.times_s[-1], step)
     # Lags are multiples of the step, and the receiver's grid is the picture's, carried on.
     begin = max(first, int(np.floor((theirs.times_s[0] - ours_s[0]) / step)) - len(ours_s))
@@ -217,12 +205,12 @@ def _slid(
     if begin > end:
         return correlation, samples
     theirs_s = ours_s[0] + step * np.arange(begin, end + len(ours_s))
-    a, a_known = _sampled(ours, ours_s, options)
-    b, b_known = _sampled(theirs, theirs_s, options)
+    a, a_known = _sampled(ours, ours_s)
+    b, b_known = _sampled(theirs, theirs_s)
     if not (a_known.any() and b_known.any()):
         return correlation, samples
     count, found = _correlations(a, a_known, b, b_known)
-    found[step * count < options.least_s] = np.nan
+    found[step * count < least_s] = np.nan
     correlation[begin - first : end - first + 1] = found
     # Three samples fit any two curves: as for Fisher's transform, they are no evidence.
     free = np.maximum(step * count / _memory_s(a[a_known], b[b_known], step) - 3.0, 0.0)
@@ -230,13 +218,11 @@ def _slid(
     return correlation, samples
 
 
-def _sampled(
-    curve: _Curve, times_s: FloatArray, options: CurveMatchOptions
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _sampled(curve: _Curve, times_s: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
     """Smooth values at evenly spaced times, and which are no more than a second from a sample."""
     place = np.clip(np.searchsorted(curve.times_s, times_s), 1, len(curve.times_s) - 1)
     near = np.minimum(np.abs(times_s - curve.times_s[place - 1]), np.abs(times_s - curve.times_s[place]))
-    width = max(1, round(options.smooth_s / options.step_s))
+    width = max(1, round(_SMOOTH_S / STEP_S))
     values = np.interp(times_s, curve.times_s, curve.values)
     padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
     return np.convolve(padded, np.full(width, 1.0 / width), mode="valid"), near <= 1.0

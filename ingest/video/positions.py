@@ -8,10 +8,10 @@ from featuredb.errors import TelemetryError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.telemetry.values import Telemetry
 from ingest.fingerprint import digest
-from ingest.video.clocks import ClockOptions, lay_on_film
+from ingest.video.clocks import lay_on_film
 from ingest.video.film_time import FilmTime
 from ingest.video.keyframes import KeyframeChoice
-from ingest.video.lag import LagOptions, estimate_lag
+from ingest.video.lag import estimate_lag
 from ingest.video.motion import Motion
 
 Position = tuple[float, float, float]
@@ -28,7 +28,6 @@ def lateness(
     telemetry: Telemetry,
     film: FilmTime,
     told_late_s: float | None,
-    options: tuple[LagOptions, ClockOptions],
     *,
     needed: bool,
 ) -> tuple[float | None, tuple[str, ...]]:
@@ -44,11 +43,11 @@ def lateness(
     if telemetry.in_video_time:
         if told_late_s is not None:
             return told_late_s, ()
-        lag = estimate_lag(motion, telemetry, options[0])
+        lag = estimate_lag(motion, telemetry)
         return lag.late_s or 0.0, (lag.message,)
     if told_late_s is not None and film.told_s is not None:
         return film.told_s + told_late_s, ()
-    laid = lay_on_film(motion, telemetry, film, options[1])
+    laid = lay_on_film(motion, telemetry, film)
     if laid.late_s is None and needed:
         raise TelemetryError(laid.message)
     return laid.late_s, (laid.message,)

@@ -17,17 +17,17 @@ from featuredb.video.telemetry.values import Telemetry
 from ingest.executor import Progress, no_progress
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.report.films import ShotOutcome
-from ingest.video.burnt_in import BurntIn, BurntInOptions
-from ingest.video.clocks import ClockOptions, check_overlap
+from ingest.video.burnt_in import BurntIn
+from ingest.video.clocks import check_overlap
 from ingest.video.film_time import FilmTime
 from ingest.video.keyframe_files import Encoding, clean_keyframes, keyframe_name, write_keyframes
 from ingest.video.keyframes import KeyframeChoice, KeyframeOptions, choose_keyframes, shots_of
-from ingest.video.lag import LagOptions
-from ingest.video.motion import FrameKind, Motion, MotionOptions, measure_motion
+from ingest.video.motion import FrameKind, Motion, measure_motion
 from ingest.video.positions import angles_at, digest_of_telemetry, lateness, positions_at
 from ingest.workspace import write_json
 
 _DONE = "film.json"
+_MOTION_SIDE_PX = 640  # frames are made so small to measure their motion
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,9 +35,6 @@ class StillsOptions:
     """From a film to photos.
 
     Attributes:
-        motion_side_px: frames are made so small to measure their motion.
-        max_side_px: of the photos; None: as the film is.
-        quality: of JPEG; films are compressed already, and what it adds should not be seen.
         start_s, end_s: the stretch of the film; None: all of it.
         telemetry_late_s: telemetry that is shown at t belongs to t minus this; None: estimated (`lag.py`),
             and 0 where that says nothing.
@@ -47,19 +44,12 @@ class StillsOptions:
             placed by other means.
     """
 
-    motion_side_px: int = 640
-    max_side_px: int | None = None
-    quality: int = 95
     start_s: float | None = None
     end_s: float | None = None
     telemetry_late_s: float | None = None
     film_start_s: float | None = None
     positions: bool = True
-    lag: LagOptions = field(default_factory=LagOptions)
-    clock: ClockOptions = field(default_factory=ClockOptions)
-    motion: MotionOptions = field(default_factory=MotionOptions)
     keyframes: KeyframeOptions = field(default_factory=KeyframeOptions)
-    burnt_in: BurntInOptions = field(default_factory=BurntInOptions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,7 +59,6 @@ class Stills:
     Attributes:
         folder: of the photos.
         shots: with the file names of their keyframes; a film of titles alone has none of them.
-        breaks: where nothing connects a frame with the one before.
         positions: photos with a position. heights: what their heights count from, for people.
         late_s: the telemetry's time that belongs to the film's time 0: how late it is, or where in the log
             the film begins; None where that is not known, and no photo has a position.
@@ -78,7 +67,6 @@ class Stills:
 
     folder: Path
     shots: tuple[ShotOutcome, ...]
-    breaks: int
     positions: int
     heights: str
     late_s: float | None
@@ -116,12 +104,12 @@ def make_stills(
     known = _known(folder)
     if known is not None:
         return known
-    with open_video(film, _video_options(options, options.motion_side_px)) as video:
+    with open_video(film, _video_options(options, _MOTION_SIDE_PX)) as video:
         when = _film_time(video.info, options)
         if telemetry is not None and options.positions and not telemetry.in_video_time:
-            check_overlap(when, telemetry, options.clock)
+            check_overlap(when, telemetry)
         progress("motion", 0, video.info.frame_count or 0)
-        motion = measure_motion(video, options.motion)
+        motion = measure_motion(video)
         notes = list(video.report.complaints())
     choice = choose_keyframes(motion, options.keyframes)
     shots = _shots(motion, choice)
@@ -135,24 +123,21 @@ def make_stills(
             telemetry,
             when,
             options.telemetry_late_s,
-            (options.lag, options.clock),
             needed=options.positions,
         )
         notes += said
     places, heights = positions_at(telemetry, choice, late_s)
     angles = angles_at(telemetry, choice, late_s)
     encoding = Encoding(
-        video=_video_options(options, options.max_side_px),
-        quality=options.quality,
+        video=_video_options(options, None),
         unnamed=unnamed_model(content),
     )
     write_keyframes(film, folder, choice, (places, angles), encoding, progress)
-    burnt_in = clean_keyframes(folder, choice, options.motion_side_px, options.quality, options.burnt_in)
+    burnt_in = clean_keyframes(folder, choice, _MOTION_SIDE_PX)
     shots = tuple(_with_findings(number, shot, burnt_in) for number, shot in enumerate(shots))
     made = Stills(
         folder=folder,
         shots=shots,
-        breaks=int(motion.broken[1:].sum()),
         positions=sum(place is not None for place in places),
         heights=heights,
         late_s=late_s,

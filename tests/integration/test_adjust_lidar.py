@@ -15,7 +15,6 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.precision import linearise
 from ingest.register.block import block_of_map, map_of_block
 from ingest.register.structure.adjustment import LidarAdjustment, adjust_to_scan, adjusted_map
-from ingest.register.structure.adjustment_options import AdjustLidarOptions
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, placed_map, project_structure
 from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, scanned_map
@@ -23,6 +22,8 @@ from tests.support.scanned_map import CAMERA, FRAME, ScannedMap, plain_cloud, sc
 pytest.importorskip("numba")
 pytest.importorskip("small_gicp")
 
+_ADJUSTMENT = "ingest.register.structure.adjustment"
+_STIFF = LensWidths(focal_rel=1e-6, aspect_rel=0.002, center_rel=1e-6, radial=1e-6, tangential=1e-6)
 _LONG = 1.15  # how much longer the wrong lens is
 
 
@@ -169,7 +170,9 @@ def test_no_scan_under_the_map_is_refused(world: ScannedMap) -> None:
     assert adjust_to_scan(world.feature_map, structure, registered, away).reason == "NO_SCAN"
 
 
-def test_a_scan_that_contradicts_the_photos_is_refused(world: ScannedMap) -> None:
+def test_a_scan_that_contradicts_the_photos_is_refused(
+    world: ScannedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A scan twice as rugged as the ground, and a lens that may not change to make up for it."""
     registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
     structure = project_structure(world.feature_map, registered, world.cloud)
@@ -178,25 +181,30 @@ def test_a_scan_that_contradicts_the_photos_is_refused(world: ScannedMap) -> Non
         replace(r, registration=replace(r.registration, points_local=r.registration.points_local * rugged))
         for r in registered
     ]
-    options = AdjustLidarOptions(reach_m=5.0, focal_rel=1e-6, center_rel=1e-6, radial=1e-6)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", replace(_STIFF, tangential=0.003))
     scan = plain_cloud(world.cloud.xyz.astype(np.float64) * rugged)
-    adjustment = adjust_to_scan(world.feature_map, structure, high, scan, options)
+    adjustment = adjust_to_scan(world.feature_map, structure, high, scan)
     assert adjustment.reason == "CONTROL"
     assert adjustment.block is None
 
 
-def test_bending_the_photos_to_the_scan_is_refused(world: ScannedMap) -> None:
+def test_bending_the_photos_to_the_scan_is_refused(
+    world: ScannedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Waves that are not there, and tracks that are hardly trusted: the map bends, and its photos tell."""
     registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
     structure = project_structure(world.feature_map, registered, world.cloud)
     xyz = world.cloud.xyz.astype(np.float64)
     xyz[:, 2] += 0.4 * np.sin(xyz[:, 0] / 2.0) * np.sin(xyz[:, 1] / 2.0)
-    options = AdjustLidarOptions(min_sigma_rel=0.05)
-    adjustment = adjust_to_scan(world.feature_map, structure, registered, plain_cloud(xyz), options)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._MIN_SIGMA_REL", 0.05)
+    adjustment = adjust_to_scan(world.feature_map, structure, registered, plain_cloud(xyz))
     assert adjustment.reason == "REPROJECTION"
 
 
-def test_an_adjustment_that_does_not_gain_is_refused(world: ScannedMap) -> None:
+def test_an_adjustment_that_does_not_gain_is_refused(
+    world: ScannedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Control that pulls the map off the scan: correspondences all 2 m too high."""
     registered = [world.registered(k, correspondences=150) for k in (0, 4, 8)]
     structure = project_structure(world.feature_map, registered, world.cloud)
@@ -209,21 +217,23 @@ def test_an_adjustment_that_does_not_gain_is_refused(world: ScannedMap) -> None:
         )
         for r in registered
     ]
-    options = AdjustLidarOptions(reach_m=5.0, min_surface_m=5.0, max_control_rel=1.0)
-    assert adjust_to_scan(world.feature_map, structure, high, world.cloud, options).reason == "SURFACE"
+    monkeypatch.setattr(f"{_ADJUSTMENT}._REACH_M", 5.0)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._MIN_SURFACE_M", 5.0)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._MAX_CONTROL_REL", 1.0)
+    assert adjust_to_scan(world.feature_map, structure, high, world.cloud).reason == "SURFACE"
 
 
-def test_a_lens_that_folds_is_refused(world: ScannedMap) -> None:
+def test_a_lens_that_folds_is_refused(world: ScannedMap, monkeypatch: pytest.MonkeyPatch) -> None:
     """A barrel so strong that the polynomial turns back inside the picture."""
     folding = Camera(model="RADIAL", width=1200, height=900, params=(1000.0, 600.0, 450.0, -0.9, 0.0))
     assert folding.tan_of_fold < 0.75  # the corner is at 0.75
     bad = replace(world.feature_map, cameras=(folding,))
     registered = [world.registered(4, correspondences=150)]
     structure = project_structure(world.feature_map, registered, world.cloud)
-    options = AdjustLidarOptions(
-        radial=1e-6, tangential=1e-6, focal_rel=1e-6, center_rel=1e-6, rounds=1, steps=1
-    )
-    assert adjust_to_scan(bad, structure, registered, world.cloud, options).reason == "LENS"
+    monkeypatch.setattr(f"{_ADJUSTMENT}._LENS", _STIFF)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._ROUNDS", 1)
+    monkeypatch.setattr(f"{_ADJUSTMENT}._STEPS", 1)
+    assert adjust_to_scan(bad, structure, registered, world.cloud).reason == "LENS"
 
 
 def test_the_placement_s_similarity_is_next_to_the_truth(world: ScannedMap) -> None:

@@ -24,8 +24,7 @@ from ingest.anchoring import AnchorRequest, anchor
 from ingest.cli.anchor import summary
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
-from ingest.register.anchor.frames import FramesOptions
-from ingest.register.anchor.values import AnchorOptions
+from ingest.register.anchor.anchor_map import AnchorOptions
 from schemas import load_schema
 from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos
 from tests.support.hill_scan import EPSG, write_hill_scan
@@ -184,7 +183,7 @@ def test_a_scan_of_another_place_moves_nothing(
     version = database.poll_version()
     request = AnchorRequest(map_id=only_map(path).map_id, photos=photos, out=out, auto=True)
     # Each frame that is refused has gone through every source and every search: one is enough here.
-    done = anchor(database, request, options=AnchorOptions(frames=FramesOptions(max_tries=1)))
+    done = anchor(database, request, options=AnchorOptions(max_tries=1))
     assert not done.placed
     result = done.report.result
     assert result is not None

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from featuredb.errors import IngestError
-from ingest.executor import InProcessExecutor, Lost, PoolExecutor, raise_lost
+from ingest.executor import InProcessExecutor, Lost, PoolExecutor
 
 _MINUTE_S = 60.0
 
@@ -107,8 +107,6 @@ def test_a_task_that_kills_its_workers_is_lost_and_the_rest_goes_on() -> None:
     assert lost.task == "5"
     assert "out of memory" in lost.reason
     assert [f for f in found if f is not lost] == [i for i in range(50) if i != 5]
-    with pytest.raises(IngestError, match=r"numbers: 1 of 50 tasks are lost \(5\)"):
-        raise_lost("numbers", found)
 
 
 def test_tasks_that_a_dead_worker_had_run_again_and_no_others(tmp_path: Path) -> None:
@@ -122,7 +120,7 @@ def test_tasks_that_a_dead_worker_had_run_again_and_no_others(tmp_path: Path) ->
 def test_a_worker_killed_from_outside_costs_nothing_but_time() -> None:
     def kill_one(_: str, done: int, __: int) -> None:
         if done == 10:
-            os.kill(pool.pids[0], signal.SIGKILL)
+            os.kill(pool._workers[0].pid, signal.SIGKILL)
 
     with PoolExecutor(2) as pool:
         assert pool.map("squares", square, list(range(40)), kill_one) == [i * i for i in range(40)]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from featuredb.cli.main import main
 from featuredb.errors import IngestError
@@ -18,6 +19,7 @@ from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
 from ingest.models_in.model_map import ModelOptions, map_of_model
 from ingest.models_in.opensfm_folder import read_opensfm
+from ingest.models_in.stored import ModelSource
 from tests.integration.test_ingest_model import error_m, localised
 from tests.support import planar_map as field
 from tests.support.command_line import only_command
@@ -187,6 +189,12 @@ def write_tiny(folder: Path, name: str = "reconstruction.json", version: int = 1
     return folder
 
 
+def diameters(read: ModelSource) -> list[NDArray[np.float32]]:
+    """Of each image's keypoints, pixels."""
+    with read.open_features("") as features:
+        return [features.keypoints(k).scale for k in range(len(features))]
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_reconstruction_by_hand(tmp_path: Path, version: int) -> None:
     read = read_opensfm(write_tiny(tmp_path, version=version))
@@ -194,7 +202,7 @@ def test_a_reconstruction_by_hand(tmp_path: Path, version: int) -> None:
     assert stored.names == ("a.jpg", "b.jpg")
     np.testing.assert_allclose(stored.xy[0], [[590.0, 400.0], [500.0, 310.0]], atol=1e-9)
     np.testing.assert_allclose(stored.xy[1], [[635.0, 400.0], [590.0, 490.0]], atol=1e-9)
-    np.testing.assert_allclose(np.concatenate(read.diameters), [4.0, 2.0, 3.0, 8.0], rtol=1e-6)
+    np.testing.assert_allclose(np.concatenate(diameters(read)), [4.0, 2.0, 3.0, 8.0], rtol=1e-6)
     model = stored.model
     np.testing.assert_allclose(model.centers(), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], atol=1e-12)
     np.testing.assert_array_equal(model.xyz, [[1.0, 0.0, 10.0], [0.0, -2.0, 20.0]])
@@ -248,7 +256,7 @@ def test_opendronemaps_projected_coordinates_are_not_taken(tmp_path: Path) -> No
 def test_sizes_are_those_of_the_detector(tmp_path: Path, config: str, factor: float) -> None:
     """HAHOG, the default, and OpenDroneMap's say a standard deviation, SIFT a diameter."""
     (write_tiny(tmp_path) / "config.yaml").write_text(f"# settings\n{config}\n")
-    np.testing.assert_allclose(read_opensfm(tmp_path).diameters[0], [4.0 * factor, 2.0 * factor], rtol=1e-6)
+    np.testing.assert_allclose(diameters(read_opensfm(tmp_path))[0], [4.0 * factor, 2.0 * factor], rtol=1e-6)
 
 
 def test_one_of_several_is_chosen(tmp_path: Path) -> None:

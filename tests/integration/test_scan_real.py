@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from featuredb.features.decode import decode_gray
-from ingest.photos.duplicates import DuplicateOptions, hash_bits, hash_distances, picture_hash
+from ingest.photos.duplicates import MAX_BITS, hash_bits, hash_distances, picture_hash
 from ingest.photos.scan import scan_folder
 
 pytestmark = pytest.mark.real_data
@@ -71,7 +71,7 @@ def test_true_neighbours_are_farther_than_any_copy(shared_data: Path, name: str)
             data = cv2.imencode(".jpg", np.clip(copy * 1.1, 0, 255), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
             copied = hash_bits([picture_hash(decode_gray(data.tobytes()))])
             farthest = max(farthest, int(hash_distances(own, copied)[0]))
-    assert farthest <= DuplicateOptions().max_bits < nearest
+    assert farthest <= MAX_BITS < nearest
 
 
 def test_a_smaller_copy_of_a_flight_is_found(shared_data: Path, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from featuredb.video.writer import VideoWriter
 from ingest.register.frame_registration import FramePrior
-from ingest.track.map_over_scan import MapOverScanFinder
+from ingest.track.finders import MapOverScanFinder
 from ingest.track.scan_ground import ScanFinder, ScanGround
 from reloc.localiser import Localiser
 from reloc.tracking.ground import Finder, Keyframe, Unmatched

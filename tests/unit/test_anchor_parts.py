@@ -14,10 +14,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.render.levels import build_cloud
-from ingest.register.anchor.page import FramePicture, flick_page
-from ingest.register.anchor.pictures import edges_of, overlay_rgb, scan_view
-from ingest.register.anchor.proposal_file import SavedProposals, load_proposals, save_proposals
-from ingest.register.anchor.proposals import ProposalOptions, propose_frames, small_camera
+from ingest.register.anchor.files import load_proposals, save_proposals
+from ingest.register.anchor.pictures import FramePicture, edges_of, flick_page, overlay_rgb, scan_view
+from ingest.register.anchor.proposals import propose_frames, small_camera
 from ingest.register.frame_registration import FramePrior, FrameRegistration
 from ingest.register.structure.map_move import map_move, map_residuals, viewing_distance_m
 from tests.support.maps import random_map
@@ -105,7 +104,8 @@ def test_frames_that_see_more_of_the_scan_come_first_and_others_not_at_all() -> 
     assert ids.index(1 - ids[0]) > 0
 
 
-def test_blurred_and_empty_photos_fall_back() -> None:
+def test_blurred_and_empty_photos_fall_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ingest.register.anchor.proposals._OVERLAP_PENALTY", 0.0)
     feature_map = seeing_map([down(0, 0), down(0.5, 0), down(1, 0)])
     rng = np.random.default_rng(0)
     sharp = rng.integers(0, 255, (600, 800)).astype(np.uint8)
@@ -113,11 +113,7 @@ def test_blurred_and_empty_photos_fall_back() -> None:
 
     photos = {0: np.full((600, 800), 90, np.uint8), 1: sharp, 2: cv2.GaussianBlur(sharp, (0, 0), 4.0)}
     ranked = propose_frames(
-        feature_map,
-        town(feature_map),
-        priors(feature_map),
-        lambda image: photos[image.image_id],
-        ProposalOptions(overlap_penalty=0.0),
+        feature_map, town(feature_map), priors(feature_map), lambda image: photos[image.image_id]
     )
     assert [p.image.image_id for p in ranked] == [1, 2, 0]
 
@@ -227,9 +223,8 @@ def registration() -> FrameRegistration:
 
 
 def test_proposals_read_back_exactly_and_only_for_the_same_state(tmp_path: Path) -> None:
-    saved = SavedProposals(map_id="m", write_id="w", scan_id="s", registrations={3: registration()})
-    save_proposals(tmp_path, saved)
-    found = load_proposals(tmp_path, "m", "w", "s").registrations[3]
+    save_proposals(tmp_path, ("m", "w", "s"), {3: registration()})
+    found = load_proposals(tmp_path, ("m", "w", "s"))[3]
     np.testing.assert_array_equal(found.pixels, registration().pixels)
     np.testing.assert_array_equal(found.points_local, registration().points_local)
     assert found.cam_from_local is not None
@@ -238,9 +233,9 @@ def test_proposals_read_back_exactly_and_only_for_the_same_state(tmp_path: Path)
     assert (found.source, found.evidence, found.seconds) == ("rgb", {"inliers": 4}, {"look": 0.25})
     for other in (("n", "w", "s"), ("m", "v", "s"), ("m", "w", "t")):
         with pytest.raises(RegistrationError, match="run the command without --confirm again"):
-            load_proposals(tmp_path, *other)
+            load_proposals(tmp_path, other)
     (tmp_path / "proposals.json").write_text("{}")
     with pytest.raises(RegistrationError, match="propose anew"):
-        load_proposals(tmp_path, "m", "w", "s")
+        load_proposals(tmp_path, ("m", "w", "s"))
     with pytest.raises(RegistrationError, match="nothing has been proposed"):
-        load_proposals(tmp_path / "nowhere", "m", "w", "s")
+        load_proposals(tmp_path / "nowhere", ("m", "w", "s"))

@@ -17,8 +17,9 @@ from featuredb.render.levels import build_cloud
 from ingest.register.anchor.start.files import read_picks, read_pose
 from ingest.register.anchor.start.picks import Picks, pose_from_picks
 from ingest.register.anchor.start.priors import (
+    MIN_SIGMA_HORIZONTAL_M,
+    MIN_SIGMA_VERTICAL_M,
     RoughPose,
-    StartOptions,
     height_shift,
     image_named,
     look_at_angles,
@@ -28,7 +29,6 @@ from ingest.register.anchor.start.priors import (
 from tests.support.maps import EASTING, EPSG, HEIGHT, NORTHING, random_map
 
 CAMERA = Camera(model="SIMPLE_RADIAL", width=1600, height=1200, params=(1300.0, 800.0, 600.0, 0.02))
-OPTIONS = StartOptions()
 
 
 def looking_down(height_m: float = 60.0, yaw_deg: float = 30.0) -> Rigid3:
@@ -47,11 +47,11 @@ def picks_at(pose: Rigid3, count: int = 9, noise_px: float = 1.0, seed: int = 0)
 def test_picks_give_the_pose() -> None:
     truth = looking_down()
     picks, points = picks_at(truth)
-    found = pose_from_picks(picks, points, CAMERA, truth, OPTIONS)
+    found = pose_from_picks(picks, points, CAMERA, truth)
     assert np.linalg.norm(found.prior.cam_from_local.center - truth.center) < 0.3
     assert found.prior.cam_from_local.angle_to_deg(truth) < 0.3
     assert found.outliers == []
-    assert OPTIONS.min_sigma_horizontal_m <= found.prior.sigma_horizontal_m < 2.0
+    assert MIN_SIGMA_HORIZONTAL_M <= found.prior.sigma_horizontal_m < 2.0
 
 
 def test_an_outlier_among_the_picks_is_named_and_left_out() -> None:
@@ -59,21 +59,19 @@ def test_an_outlier_among_the_picks_is_named_and_left_out() -> None:
     picks, points = picks_at(truth)
     pixels = picks.pixels.copy()
     pixels[4] += (150.0, -90.0)
-    found = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth, OPTIONS)
+    found = pose_from_picks(replace(picks, pixels=pixels), points, CAMERA, truth)
     assert found.outliers == [4]
     assert np.linalg.norm(found.prior.cam_from_local.center - truth.center) < 0.3
 
 
 def test_the_covariance_of_picked_poses_is_honest() -> None:
     truth = looking_down()
-    sigma_px = OPTIONS.pick_sigma_px_rel * CAMERA.width
+    sigma_px = 0.00075 * CAMERA.width
     squared = []
     for seed in range(30):
         picks, points = picks_at(truth, count=8, noise_px=sigma_px, seed=seed)
         rng = np.random.default_rng(1000 + seed)
-        found = pose_from_picks(
-            picks, points + rng.normal(0, OPTIONS.pick_sigma_m, points.shape), CAMERA, truth, OPTIONS
-        )
+        found = pose_from_picks(picks, points + rng.normal(0, 0.2, points.shape), CAMERA, truth)
         error = (truth @ found.prior.cam_from_local.inverse()).log()
         squared.append(float(error @ np.linalg.solve(found.covariance, error)))
     # Six degrees of freedom; residuals of few picks make it a little conservative.
@@ -95,7 +93,7 @@ def test_picks_that_cannot_be_used(change: object, message: str) -> None:
     picks, _ = picks_at(looking_down())
     pixels, utm = change(picks)  # type: ignore[operator]
     with pytest.raises(RegistrationError, match=message):
-        pose_from_picks(Picks(image="a.jpg", pixels=pixels, utm=utm), utm, CAMERA, looking_down(), OPTIONS)
+        pose_from_picks(Picks(image="a.jpg", pixels=pixels, utm=utm), utm, CAMERA, looking_down())
 
 
 def test_picks_close_together_leave_the_pose_open() -> None:
@@ -104,7 +102,7 @@ def test_picks_close_together_leave_the_pose_open() -> None:
     points = np.array([5.0, -3.0, 0.0]) + rng.uniform(-0.2, 0.2, (8, 3))
     picks = Picks(image="a.jpg", pixels=CAMERA.project(truth.act(points)), utm=points)
     with pytest.raises(RegistrationError, match="spread them"):
-        pose_from_picks(picks, points, CAMERA, truth, OPTIONS)
+        pose_from_picks(picks, points, CAMERA, truth)
 
 
 def test_angles_against_scipy() -> None:
@@ -153,21 +151,21 @@ def test_heights_are_compared_where_map_and_scan_meet() -> None:
     _, nearest = cKDTree(points[:, :2]).query(grid)
     heights = points[nearest, 2] + 8.5 + 15.0 * (rng.uniform(size=len(grid)) < 0.2)
     cloud = build_cloud(feature_map.frame, "unknown", np.column_stack([grid, heights]))
-    shift = height_shift(feature_map, cloud, OPTIONS)
+    shift = height_shift(feature_map, cloud)
     assert shift is not None
     assert shift.shift_m == pytest.approx(8.5, abs=0.3)
-    prior = prior_from_map(feature_map, feature_map.images[0], shift, OPTIONS)
+    prior = prior_from_map(feature_map, feature_map.images[0], shift)
     image = feature_map.images[0]
     np.testing.assert_allclose(
         prior.cam_from_local.center, image.cam_from_local.center + np.array([0, 0, shift.shift_m]), atol=1e-9
     )
-    assert prior.sigma_vertical_m == pytest.approx(max(shift.sigma_m, OPTIONS.min_sigma_vertical_m))
+    assert prior.sigma_vertical_m == pytest.approx(max(shift.sigma_m, MIN_SIGMA_VERTICAL_M))
     far = build_cloud(feature_map.frame, "unknown", np.column_stack([grid + 5000.0, heights]))
-    assert height_shift(feature_map, far, OPTIONS) is None
+    assert height_shift(feature_map, far) is None
 
 
 def test_the_prior_of_a_placement_has_its_sigmas() -> None:
-    prior = prior_from_map(flat_map(), flat_map().images[0], None, OPTIONS)
+    prior = prior_from_map(flat_map(), flat_map().images[0], None)
     assert prior.sigma_vertical_m == pytest.approx(10.0, abs=0.2)
     assert prior.sigma_heading_deg == pytest.approx(np.degrees(0.04))
     assert prior.sigma_tilt_deg == pytest.approx(np.degrees(0.02))

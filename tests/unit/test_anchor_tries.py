@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 
 from ingest.register.anchor import frames
-from ingest.register.anchor.frames import FramesOptions, try_frames
+from ingest.register.anchor.frames import try_frames
 
 
-def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool], options: FramesOptions) -> int:
+def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool]) -> int:
     """How many of frames that are registered or not, in their order, are tried."""
     images = [SimpleNamespace(image_id=k, name=str(k)) for k in range(len(registered))]
     proposals = [SimpleNamespace(image=image) for image in images]
@@ -21,7 +21,7 @@ def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool], options: Fram
     monkeypatch.setattr(frames, "prior_from_map", lambda *_: None)
     monkeypatch.setattr(frames, "propose_frames", lambda *_: proposals)
     monkeypatch.setattr(frames, "_try", try_one)
-    found = try_frames(SimpleNamespace(images=images), None, lambda _: None, options)  # type: ignore[arg-type, return-value]
+    found = try_frames(SimpleNamespace(images=images), None, lambda _: None, 3, 6)  # type: ignore[arg-type, return-value]
     return len(found.tried)
 
 
@@ -40,4 +40,4 @@ def tried(monkeypatch: pytest.MonkeyPatch, registered: list[bool], options: Fram
 def test_once_a_frame_is_registered_others_have_more_tries(
     monkeypatch: pytest.MonkeyPatch, registered: list[bool], count: int
 ) -> None:
-    assert tried(monkeypatch, registered, FramesOptions()) == count
+    assert tried(monkeypatch, registered) == count

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from featuredb.errors import IngestError
-from ingest.models_in.colmap_whole import check_whole
+from ingest.models_in.colmap_folder import check_whole
 
 NAMES = ("cameras", "rigs", "frames", "images", "points3D")
 

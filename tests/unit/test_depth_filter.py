@@ -9,11 +9,10 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.rendering import Rendering
-from ingest.register.structure.depth_filter import DepthFilterOptions, surface_at
+from ingest.register.structure.depth_filter import surface_at
 from tests.support.scanned_map import plain_cloud
 
 _CAMERA = Camera(model="PINHOLE", width=120, height=90, params=(100.0, 100.0, 60.0, 45.0))
-_OPTIONS = DepthFilterOptions()
 # Camera axes are the local ones: z forward. Depth is the local z.
 _POSE = Rigid3.identity()
 
@@ -48,14 +47,14 @@ def _hit(depth: FloatArray) -> NDArray[np.bool_]:
     """Whether the ray of each pixel hits the surface; (h, w) as the picture."""
     row, column = np.indices(depth.shape)
     pixels = np.stack([column + 0.5, row + 0.5], axis=-1).reshape(-1, 2)
-    return surface_at(*_rendering(depth), pixels, _OPTIONS).valid.reshape(depth.shape)
+    return surface_at(*_rendering(depth), pixels).valid.reshape(depth.shape)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.5, -0.8])
 def test_hits_lie_on_a_tilted_plane(slope: float) -> None:
     rendering, cloud = _rendering(_plane(slope))
     pixels = np.random.default_rng(0).uniform((10, 10), (110, 80), (50, 2))
-    hits = surface_at(rendering, cloud, pixels, _OPTIONS)
+    hits = surface_at(rendering, cloud, pixels)
     assert hits.valid.all()
     # The closed form: ray (x, y, 1) t meets z = 40 + slope x.
     x, y = ((pixels - (60, 45)) / 100).T
@@ -79,10 +78,10 @@ def test_a_steep_plane_is_no_silhouette() -> None:
     assert _hit(_plane(1.0))[8:-8, 8:-8].all()
 
 
-def test_nothing_beyond_the_far_plane() -> None:
+def test_nothing_beyond_the_far_plane(monkeypatch: pytest.MonkeyPatch) -> None:
     rendering, cloud = _rendering(_plane(0.0))
-    near = DepthFilterOptions(max_depth_m=39.0)
-    assert not surface_at(rendering, cloud, np.array([[60.0, 45.0]]), near).valid.any()
+    monkeypatch.setattr("ingest.register.structure.depth_filter._MAX_DEPTH_M", 39.0)
+    assert not surface_at(rendering, cloud, np.array([[60.0, 45.0]])).valid.any()
 
 
 def test_closed_holes_are_not_depths() -> None:
@@ -98,18 +97,19 @@ def test_closed_holes_are_not_depths() -> None:
         intensity=None,
         points_drawn=0,
     )
-    hits = surface_at(closed, cloud, np.array([[60.0, 45.0], [20.0, 20.0]]), _OPTIONS)
+    hits = surface_at(closed, cloud, np.array([[60.0, 45.0], [20.0, 20.0]]))
     assert hits.valid.tolist() == [False, True]
 
 
-def test_grazing_surfaces_are_left_out() -> None:
+def test_grazing_surfaces_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     rendering, cloud = _rendering(_plane(0.5))
-    strict = DepthFilterOptions(max_grazing_deg=20.0)  # the plane is seen at 26.6 degrees straight ahead
-    assert not surface_at(rendering, cloud, np.array([[60.0, 45.0]]), strict).valid.any()
-    assert surface_at(rendering, cloud, np.array([[60.0, 45.0]]), _OPTIONS).valid.all()
+    assert surface_at(rendering, cloud, np.array([[60.0, 45.0]])).valid.all()
+    # The plane is seen at 26.6 degrees straight ahead.
+    monkeypatch.setattr("ingest.register.structure.depth_filter._MAX_GRAZING_DEG", 20.0)
+    assert not surface_at(rendering, cloud, np.array([[60.0, 45.0]])).valid.any()
 
 
 def test_pixels_at_the_border_have_no_window() -> None:
     rendering, cloud = _rendering(_plane(0.0))
     outside = np.array([[1.0, 45.0], [-5.0, 45.0], [119.9, 89.9], [500.0, 45.0]])
-    assert not surface_at(rendering, cloud, outside, _OPTIONS).valid.any()
+    assert not surface_at(rendering, cloud, outside).valid.any()

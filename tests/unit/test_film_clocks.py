@@ -12,7 +12,7 @@ from featuredb.errors import InvalidValueError, TelemetryError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.film import VideoFrame
 from featuredb.video.telemetry.values import Clock, Telemetry
-from ingest.video.clocks import ClockOptions, check_overlap, lay_on_film
+from ingest.video.clocks import check_overlap, lay_on_film
 from ingest.video.film_time import FilmTime, film_start
 from ingest.video.match import _picture_turn
 from ingest.video.motion import Motion, measure_motion
@@ -234,10 +234,11 @@ def test_logs_that_cannot_be_of_the_film_are_refused_with_both_spans(flight: _Fl
     check_overlap(_film(told_s=-100.0), log)
 
 
-def test_a_log_of_days_is_not_searched(flight: _Flight) -> None:
+def test_a_log_of_days_is_not_searched(flight: _Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ingest.video.clocks._MAX_SEARCH_S", 600.0)
     rng = np.random.default_rng(13)
     log = flight.log(rng)
-    found = lay_on_film(flight.film(rng), log, _film(), ClockOptions(max_search_s=600.0))
+    found = lay_on_film(flight.film(rng), log, _film())
     assert found.late_s is None
     assert "too long to look for a film in" in found.message
 
@@ -307,7 +308,9 @@ def test_any_log_is_laid_or_refused(
     )
     film = _film(_TRUE, told)
     motion = _Flight(1).film(np.random.default_rng(1), length_s=60.0)
-    found = lay_on_film(motion, log, film, ClockOptions(max_search_s=20_000.0))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ingest.video.clocks._MAX_SEARCH_S", 20_000.0)
+        found = lay_on_film(motion, log, film)
     assert found.message
     assert found.late_s is None or np.isfinite(found.late_s)
 

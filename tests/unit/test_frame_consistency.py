@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ingest.register.frame.features.consistency import ConsistencyOptions, consistent_matches
+from ingest.register.frame.features.consistency import consistent_matches
 
 SIDE, AREA = 1600.0, 1600.0 * 1200.0
 Array = NDArray[np.float64]
@@ -29,9 +29,9 @@ def matches(
 @pytest.mark.parametrize("rate", [0.03, 0.05, 0.07])
 def test_finds_most_true_matches_among_few(rate: float) -> None:
     photo, reference, true = matches(rate, seed=3)
-    found = consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions())
-    recall = (found.kept & true).sum() / true.sum()
-    precision = (found.kept & true).sum() / max(found.kept.sum(), 1)
+    found = consistent_matches(photo, reference, SIDE, AREA)
+    recall = (found & true).sum() / true.sum()
+    precision = (found & true).sum() / max(found.sum(), 1)
     assert recall > (0.3 if rate < 0.04 else 0.75), f"{recall:.2f} of the true matches kept"
     assert precision > 0.85, f"{precision:.2f} of the kept matches true; {rate} before"
 
@@ -40,29 +40,28 @@ def test_random_matches_are_hardly_ever_kept() -> None:
     kept = 0
     for seed in range(3):
         photo, reference, _ = matches(0.0, seed=seed)
-        kept += int(consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions()).kept.sum())
+        kept += int(consistent_matches(photo, reference, SIDE, AREA).sum())
     # Three chance hits are expected per run; they come in groups of neighbours.
     assert kept <= 30
 
 
 def test_rotation_beyond_the_limit_supports_nothing() -> None:
     photo, reference, true = matches(0.1, seed=5, turn_deg=90.0, zoom=1.0)
-    narrow = consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions(max_turn_deg=45.0))
-    wide = consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions(max_turn_deg=180.0))
-    assert (narrow.kept & true).sum() < 0.1 * true.sum()
-    assert (wide.kept & true).sum() > 0.7 * true.sum()
+    narrow = consistent_matches(photo, reference, SIDE, AREA, 45.0)
+    wide = consistent_matches(photo, reference, SIDE, AREA, 180.0)
+    assert (narrow & true).sum() < 0.1 * true.sum()
+    assert (wide & true).sum() > 0.7 * true.sum()
 
 
 def test_copies_of_one_keypoint_do_not_support_each_other() -> None:
     photo = np.repeat(np.array([[400.0, 300.0]]), 30, axis=0) + np.linspace(0, 2, 30)[:, None]
-    found = consistent_matches(photo, photo + 50.0, SIDE, AREA, ConsistencyOptions())
-    assert not found.kept.any()
-    assert (found.support == 0).all()
+    found = consistent_matches(photo, photo + 50.0, SIDE, AREA)
+    assert not found.any()
 
 
 def test_places_behind_the_reference_view_are_left_out() -> None:
     photo, reference, true = matches(0.2, seed=6)
     reference[::2] = np.nan
-    found = consistent_matches(photo, reference, SIDE, AREA, ConsistencyOptions())
-    assert not found.kept[::2].any()
-    assert (found.kept & true)[1::2].sum() > 0.6 * true[1::2].sum()
+    found = consistent_matches(photo, reference, SIDE, AREA)
+    assert not found[::2].any()
+    assert (found & true)[1::2].sum() > 0.6 * true[1::2].sum()

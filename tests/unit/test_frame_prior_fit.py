@@ -83,7 +83,7 @@ def test_information_is_that_of_the_deviations() -> None:
     pose = looking_down([3.0, 4.0, 100.0])
     wanted = 1.0 / np.array([*np.radians([2.0, 2.0, 3.0]), 10.0, 10.0, 20.0]) ** 2
     np.testing.assert_allclose(prior_information(pose, prior_at(pose)), np.diag(wanted), rtol=1e-5, atol=1e-6)
-    loose = prior_information(pose, loosened(prior_at(pose), 2.0))
+    loose = prior_information(pose, loosened(prior_at(pose)))
     np.testing.assert_allclose(loose, np.diag(wanted) / 4.0, rtol=1e-5, atol=1e-6)
 
 
@@ -98,7 +98,7 @@ def test_what_matches_leave_open_the_prior_decides() -> None:
     options = PoseOptions(tolerance_rel=0.02)
     apart = np.linalg.norm(LONG_LENS.project(slid.act(points)) - exact.pixels, axis=1)
     assert np.median(apart) < 3.0  # matches hardly tell the two apart
-    found = fitted_under_prior(matches, start(slid, LONG_LENS, 150), prior_at(truth), options, 4.0)
+    found = fitted_under_prior(matches, start(slid, LONG_LENS, 150), prior_at(truth), options)
     assert prior_sigmas(prior_at(truth), slid) > 4.0
     assert prior_sigmas(prior_at(truth), found.cam_from_local) < 1.0
     left = LONG_LENS.project(found.cam_from_local.act(points)) - exact.pixels
@@ -113,7 +113,7 @@ def test_what_matches_determine_the_prior_does_not_move() -> None:
     matches = seen_by(camera, truth, points)
     noisy = FrameMatches(pixels=matches.pixels + rng.normal(0.0, 0.5, (200, 2)), points=points)
     wrong = prior_at(looking_down([8.0, -6.0, 75.0], (6.0, -3.0, 18.0)))
-    found = fitted_under_prior(noisy, start(truth, camera, 200), wrong, PoseOptions(), 4.0)
+    found = fitted_under_prior(noisy, start(truth, camera, 200), wrong, PoseOptions())
     assert np.linalg.norm(found.cam_from_local.center - truth.center) < 0.03
     assert found.cam_from_local.angle_to_deg(truth) < 0.03
 
@@ -123,7 +123,7 @@ def test_few_matches_leave_the_pose() -> None:
     points = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 5.0, 0.0]])
     given = start(pose, LONG_LENS, 3)
     matches = seen_by(LONG_LENS, pose, points)
-    assert fitted_under_prior(matches, given, prior_at(pose), PoseOptions(), 4.0) is given
+    assert fitted_under_prior(matches, given, prior_at(pose), PoseOptions()) is given
 
 
 def test_a_step_turns_and_displaces() -> None:

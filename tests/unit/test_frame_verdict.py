@@ -9,10 +9,9 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from ingest.register.frame.prior_fit import prior_sigmas
-from ingest.register.frame.uncertainty import left_perturbation
+from ingest.register.frame.register import left_perturbation
 from ingest.register.frame.verdict import (
     FrameEvidence,
-    VerdictOptions,
     asks_elsewhere,
     cells_with_inliers,
     verdict,
@@ -37,7 +36,7 @@ GOOD = FrameEvidence(
 
 
 def test_good_evidence_is_believed() -> None:
-    assert verdict(GOOD, VerdictOptions()) is None
+    assert verdict(GOOD) is None
 
 
 @pytest.mark.parametrize(
@@ -54,7 +53,7 @@ def test_good_evidence_is_believed() -> None:
     ],
 )
 def test_each_gate_fires(change: dict[str, float], reason: str) -> None:
-    refusal = verdict(replace(GOOD, **change), VerdictOptions())  # type: ignore[arg-type]
+    refusal = verdict(replace(GOOD, **change))  # type: ignore[arg-type]
     assert refusal is not None
     assert refusal[0] == reason
 
@@ -63,54 +62,51 @@ MIDDLING = replace(GOOD, log_nfa=0.0, confirmation_log_nfa=9.0)
 
 
 def test_middling_evidence_is_believed_where_other_places_show_much_less() -> None:
-    options = VerdictOptions()
-    assert verdict(MIDDLING, options) is not None  # nobody has looked elsewhere
-    assert asks_elsewhere(MIDDLING, options)
-    assert verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=0.4), options) is None
-    refusal = verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=3.0), options)
+    assert verdict(MIDDLING) is not None  # nobody has looked elsewhere
+    assert asks_elsewhere(MIDDLING)
+    assert verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=0.4)) is None
+    refusal = verdict(replace(MIDDLING, places_elsewhere=2, elsewhere_log_nfa=3.0))
     assert refusal is not None
     assert refusal[0] == "AMBIGUOUS"
 
 
 def test_relief_needs_evidence_of_its_own() -> None:
     relief = replace(MIDDLING, places_elsewhere=5, relief_only=True)
-    assert verdict(replace(relief, relief_only=False), VerdictOptions()) is None
-    refusal = verdict(relief, VerdictOptions())
+    assert verdict(replace(relief, relief_only=False)) is None
+    refusal = verdict(relief)
     assert refusal is not None
     assert refusal[0] == "NOT_CONFIRMED"
-    assert verdict(replace(relief, confirmation_log_nfa=25.0), VerdictOptions()) is None
+    assert verdict(replace(relief, confirmation_log_nfa=25.0)) is None
 
 
 def test_features_and_pictures_add_up() -> None:
-    assert verdict(replace(MIDDLING, log_nfa=22.0), VerdictOptions()) is None
-    assert verdict(replace(MIDDLING, log_nfa=20.0), VerdictOptions()) is not None
+    assert verdict(replace(MIDDLING, log_nfa=22.0)) is None
+    assert verdict(replace(MIDDLING, log_nfa=20.0)) is not None
 
 
 def test_middling_evidence_far_from_the_prior_is_refused() -> None:
-    options = VerdictOptions()
     asked = replace(MIDDLING, places_elsewhere=5, confirmation_log_nfa=7.7)
-    assert verdict(replace(asked, prior_sigmas=2.4), options) is None
+    assert verdict(replace(asked, prior_sigmas=2.4)) is None
     assert weighed_log_nfa(replace(asked, prior_sigmas=2.4)) == 7.7
-    refusal = verdict(replace(asked, prior_sigmas=4.7), options)
+    refusal = verdict(replace(asked, prior_sigmas=4.7))
     assert refusal is not None
     assert refusal[0] == "NOT_CONFIRMED"
     assert "4.7 deviations" in refusal[1]
-    assert verdict(replace(GOOD, prior_sigmas=4.7), options) is None  # features speak for it
+    assert verdict(replace(GOOD, prior_sigmas=4.7)) is None  # features speak for it
 
 
 def test_elsewhere_is_asked_only_where_it_decides() -> None:
-    options = VerdictOptions()
-    assert not asks_elsewhere(GOOD, options)
-    assert not asks_elsewhere(replace(MIDDLING, inliers=12), options)
-    assert not asks_elsewhere(replace(MIDDLING, confirmed=False), options)
+    assert not asks_elsewhere(GOOD)
+    assert not asks_elsewhere(replace(MIDDLING, inliers=12))
+    assert not asks_elsewhere(replace(MIDDLING, confirmed=False))
 
 
 def test_decisive_features_bear_silent_pictures_but_no_contradiction() -> None:
     silent = replace(GOOD, log_nfa=900.0, confirmed=False, confirmation_pieces=10, confirmation_log_nfa=0.0)
-    assert verdict(silent, VerdictOptions()) is None
+    assert verdict(silent) is None
     contradicted = replace(silent, confirmation_pieces=150)
-    assert verdict(contradicted, VerdictOptions()) is not None
-    assert verdict(replace(silent, log_nfa=20.0), VerdictOptions()) is not None
+    assert verdict(contradicted) is not None
+    assert verdict(replace(silent, log_nfa=20.0)) is not None
 
 
 def prior(heading: float) -> FramePrior:

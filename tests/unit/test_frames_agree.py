@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.anchor.agreement import AgreementOptions, LoneFrame, frames_that_agree
-
-OPTIONS = AgreementOptions()
+from ingest.register.anchor.frames import LoneFrame, frames_that_agree
 
 
 def lone(image_id: int, east_m: float = 0.0, turn_rad: float = 0.0) -> LoneFrame:
@@ -16,34 +14,34 @@ def lone(image_id: int, east_m: float = 0.0, turn_rad: float = 0.0) -> LoneFrame
 
 
 def test_frames_within_the_bend_of_a_map_agree() -> None:
-    found = frames_that_agree([lone(1), lone(2, 0.4), lone(3, -0.5)], OPTIONS)
+    found = frames_that_agree([lone(1), lone(2, 0.4), lone(3, -0.5)])
     assert found.agreeing == (1, 2, 3)
     assert found.apart_m[1, 2] == pytest.approx(0.4, abs=1e-6)
     assert found.allowed_m[1, 2] == pytest.approx(1.5)
 
 
 def test_the_majority_outvotes_a_wrong_frame() -> None:
-    found = frames_that_agree([lone(1), lone(2, 12.0), lone(3, 0.3)], OPTIONS)
+    found = frames_that_agree([lone(1), lone(2, 12.0), lone(3, 0.3)])
     assert found.agreeing == (1, 3)
     assert found.apart_m[1, 2] > found.allowed_m[1, 2]
 
 
 def test_two_that_disagree_carry_nothing() -> None:
-    assert frames_that_agree([lone(1), lone(2, 12.0)], OPTIONS).agreeing == ()
+    assert frames_that_agree([lone(1), lone(2, 12.0)]).agreeing == ()
     four = [lone(1), lone(2), lone(3, 12.0), lone(4, 12.0)]
-    assert frames_that_agree(four, OPTIONS).agreeing == ()
+    assert frames_that_agree(four).agreeing == ()
 
 
 def test_a_turn_is_a_disagreement_too() -> None:
     # 10 degrees at up to 28 m from the middle: 2.7 m in the median.
-    assert frames_that_agree([lone(1), lone(2, turn_rad=0.17)], OPTIONS).agreeing == ()
+    assert frames_that_agree([lone(1), lone(2, turn_rad=0.17)]).agreeing == ()
 
 
 def test_a_chain_in_which_the_ends_disagree_keeps_the_closer_pair() -> None:
-    found = frames_that_agree([lone(1), lone(2, 1.0), lone(3, 2.2)], OPTIONS)
+    found = frames_that_agree([lone(1), lone(2, 1.0), lone(3, 2.2)])
     assert found.agreeing == (1, 2)
 
 
 def test_one_frame_agrees_with_itself_and_none_is_none() -> None:
-    assert frames_that_agree([lone(4)], OPTIONS).agreeing == (4,)
-    assert frames_that_agree([], OPTIONS).agreeing == ()
+    assert frames_that_agree([lone(4)]).agreeing == (4,)
+    assert frames_that_agree([]).agreeing == ()

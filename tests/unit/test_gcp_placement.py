@@ -7,9 +7,8 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from ingest.register.control.evidence import residual_table
+from ingest.register.control.maps import residual_table, vertical_of
 from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
-from ingest.register.control.registered_map import vertical_of
 from tests.support.control import LOCAL_FROM_BLOCK, SurveyedBlock, moved_mark, surveyed_block
 
 _OPTIONS = GcpOptions()
@@ -126,10 +125,11 @@ def test_wrong_coordinates_are_named(world: SurveyedBlock) -> None:
 
 
 @pytest.mark.evaluation
-def test_covariance_covers_the_errors() -> None:
+def test_covariance_covers_the_errors(monkeypatch: pytest.MonkeyPatch) -> None:
     """Normalised squared errors of the seven parameters average about seven, and points lie where it says."""
     # The world's lens is known and its noise is white; what lenses leave open would make the covariance wide.
-    exact = replace(_OPTIONS, adjust=replace(_OPTIONS.adjust, keep_lens=True, dilution=1.0))
+    exact = replace(_OPTIONS, keep_lens=True)
+    monkeypatch.setattr("ingest.register.control.adjust._DILUTION", 1.0)
     scores, inside = [], []
     for trial in range(6):
         world = surveyed_block(seed=trial, points=7, marks_of_point=3)
@@ -170,9 +170,9 @@ def test_exchanged_columns_are_refused(world: SurveyedBlock) -> None:
     assert place_by_gcp(world.block, world.control(_flat(mirrored)), _OPTIONS).reason == "RESIDUALS"
 
 
-def test_a_scale_that_is_not_known_is_refused(world: SurveyedBlock) -> None:
-    options = replace(_OPTIONS, max_scale_sigma=1e-5)
-    assert place_by_gcp(world.block, world.control(_noisy(world, 0.05)), options).reason == "SCALE"
+def test_a_scale_that_is_not_known_is_refused(world: SurveyedBlock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ingest.register.control.placement._MAX_SCALE_SIGMA", 1e-5)
+    assert place_by_gcp(world.block, world.control(_noisy(world, 0.05)), _OPTIONS).reason == "SCALE"
 
 
 def test_another_zone_contradicts_gps(world: SurveyedBlock) -> None:

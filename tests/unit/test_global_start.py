@@ -7,8 +7,8 @@ import pytest
 
 from featuredb.geometry.camera import Camera
 from ingest.sfm import mapper as sfm
-from ingest.sfm.global_start import is_usual
 from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView
+from ingest.sfm.view_graph_focals import is_usual
 
 _LENS = Camera.from_focal(854, 480, 577.0, "SIMPLE_RADIAL")
 

@@ -12,8 +12,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, with_observations
-from ingest.colmap.bridge import Model
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored
+from ingest.colmap.bridge import Model, with_observations
 from ingest.growth.place.drift import (
     DriftOptions,
     PhotoSpread,

@@ -11,7 +11,6 @@ import pytest
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.bridge import Model
-from ingest.colmap.submodel import keep_photos
 from ingest.growth.graph.budget import drift_gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, place_of, solve_with_new
 from ingest.growth.graph.new_overlaps import overlaps_to_measure
@@ -23,6 +22,7 @@ from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import ConfirmationOptions, CorroboratingImage, Source
 from ingest.growth.trust.promotion import Promotion, canary_gate
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
+from ingest.sfm.links import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 
 _ANCHOR = strip_map("A", 20.0, owners=["survey"])

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.track.keyframe_average import KeyframeAverage
+from ingest.track.scan_ground import KeyframeAverage
 from tests.support.planar_map import view
 
 _SIGMA = np.array([0.002, 0.002, 0.002, 0.15, 0.15, 0.15])

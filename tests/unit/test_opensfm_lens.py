@@ -8,7 +8,7 @@ import pytest
 from featuredb.errors import IngestError
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.geometry.camera import Camera
-from ingest.models_in.opensfm_lens import camera_from_opensfm
+from ingest.models_in.opensfm_parts import camera_from_opensfm
 from tests.integration.test_export_opensfm import CAMERAS
 
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from featuredb.maps.feature_map import GeoPrior
-from ingest.photos.duplicates import DuplicateOptions, copies_of, near_duplicates
+from ingest.photos.duplicates import MAX_BITS, copies_of, near_duplicates
 from ingest.photos.photo import Photo
 from ingest.sfm.matching import Matched
 from ingest.sfm.overlays import OverlayOptions, is_copy, without_overlay
@@ -107,7 +107,7 @@ def test_an_upload_with_another_place_and_time_is_still_a_copy() -> None:
             _photo("a", "ann", gps=_gps(48.0), gps_is_hint=hint, capture_time=datetime(2026, 1, 1)),
             _photo("b", "bob", gps=_gps(48.1), gps_is_hint=hint, capture_time=datetime(2026, 2, 1)),
         ]
-        found = near_duplicates(photos, hashes, DuplicateOptions())
+        found = near_duplicates(photos, hashes)
         assert found == ({"b": ("a", 3)} if hint else {})
 
 
@@ -119,13 +119,13 @@ def test_near_duplicates_are_those_of_an_exhaustive_search() -> None:
         flips[rng.choice(256, rng.integers(0, 40), replace=False)] = 1
         bits[k] = bits[k - 1] ^ np.packbits(flips)
     photos = [_photo(f"{k:03d}", "ann") for k in range(300)]
-    found = near_duplicates(photos, [b.tobytes().hex() for b in bits], DuplicateOptions())
+    found = near_duplicates(photos, [b.tobytes().hex() for b in bits])
     kept: list[int] = []
     wanted = {}
     for i in range(300):
         near = [(int(np.bitwise_count(bits[i] ^ bits[k]).sum()), k) for k in kept]
         best = min(near, default=(999, -1))
-        if best[0] <= DuplicateOptions().max_bits:
+        if best[0] <= MAX_BITS:
             wanted[photos[i].name] = (photos[best[1]].name, best[0])
         else:
             kept.append(i)

@@ -13,9 +13,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import GeoPrior
 from ingest.colmap.bridge import Model, without_impossible
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.photos.cameras import photo_cameras
-from ingest.photos.photo import Photo
-from ingest.photos.positions import center_priors, local_frame_of
+from ingest.photos.photo import Photo, center_priors, local_frame_of, photo_cameras
 from ingest.reconstruction import MapMakingOptions
 from ingest.sfm.mapper import SfmOptions, SfmTask, SfmView, disjoint, mapping_settings
 from tests.support.planar_map import CAMERA

@@ -12,13 +12,11 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from ingest.register.structure.similarity import (
     Pairs,
-    SimilarityOptions,
     ransac_similarity,
     refine_similarity,
     similarities,
 )
 
-_OPTIONS = SimilarityOptions()
 _TRUE = Sim3(scale=1.03, rotation=so3_exp([0.02, -0.03, 0.4]), translation=np.array([3.0, -8.0, 11.0]))
 
 
@@ -81,7 +79,7 @@ def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:
     target = pairs.target.copy()
     wrong = rng.permutation(300)[:200]
     target[wrong] += rng.normal(0, 20, (200, 3))
-    found = ransac_similarity(replace(pairs, target=target), np.full(300, 0.3), _OPTIONS)
+    found = ransac_similarity(replace(pairs, target=target), np.full(300, 0.3))
     assert found is not None
     right = np.setdiff1d(np.arange(300), wrong)
     assert np.linalg.norm(found.act(pairs.source[right]) - pairs.target[right], axis=1).mean() < 0.3
@@ -89,14 +87,14 @@ def test_ransac_finds_the_similarity_among_two_thirds_outliers() -> None:
 
 def test_ransac_needs_three_pairs() -> None:
     pairs = _pairs(np.random.default_rng(0), 2)
-    assert ransac_similarity(pairs, np.full(2, 1.0), _OPTIONS) is None
+    assert ransac_similarity(pairs, np.full(2, 1.0)) is None
 
 
 def test_exact_pairs_give_the_exact_similarity() -> None:
     pairs = _pairs(np.random.default_rng(2), sigma=1e-9)
     pairs = replace(pairs, covariance=np.tile(np.eye(3) * 0.05**2, (len(pairs), 1, 1)))
     start = Sim3.exp([0.01, 0.01, 0.0, -0.02, 0.3, -0.2, 0.1]) @ _TRUE
-    assert np.abs(_error(refine_similarity(start, pairs, _OPTIONS).target_from_source)).max() < 1e-6
+    assert np.abs(_error(refine_similarity(start, pairs).target_from_source)).max() < 1e-6
 
 
 def test_outliers_lose_their_weight() -> None:
@@ -104,7 +102,7 @@ def test_outliers_lose_their_weight() -> None:
     pairs = _pairs(rng, 300)
     target = pairs.target.copy()
     target[:60] += [0.0, 0.0, 2.0]
-    fit = refine_similarity(_TRUE, replace(pairs, target=target), _OPTIONS)
+    fit = refine_similarity(_TRUE, replace(pairs, target=target))
     assert not fit.inliers[:60].any()
     assert fit.inliers[60:].mean() > 0.95
     assert np.abs(fit.target_from_source.act(pairs.source) - _TRUE.act(pairs.source)).max() < 0.05
@@ -124,7 +122,7 @@ def test_covariance_covers_the_errors(frames: int, frame_sigma: float, cell_sigm
         pairs = _pairs(
             np.random.default_rng(seed), frames=frames, frame_sigma=frame_sigma, cell_sigma=cell_sigma
         )
-        fit = refine_similarity(_TRUE, pairs, _OPTIONS)
+        fit = refine_similarity(_TRUE, pairs)
         error = _error(fit.target_from_source)
         squared = float(error @ np.linalg.solve(fit.covariance, error))
         inside += squared <= chi2.ppf(0.9, 7)
@@ -135,8 +133,8 @@ def test_covariance_covers_the_errors(frames: int, frame_sigma: float, cell_sigm
 
 
 def test_a_frame_s_pose_error_does_not_average_out_over_its_pairs() -> None:
-    few = refine_similarity(_TRUE, _pairs(np.random.default_rng(0), 200, frame_sigma=0.2), _OPTIONS)
-    many = refine_similarity(_TRUE, _pairs(np.random.default_rng(0), 2000, frame_sigma=0.2), _OPTIONS)
+    few = refine_similarity(_TRUE, _pairs(np.random.default_rng(0), 200, frame_sigma=0.2))
+    many = refine_similarity(_TRUE, _pairs(np.random.default_rng(0), 2000, frame_sigma=0.2))
     for fit in (few, many):
         assert np.sqrt(np.diag(fit.covariance)[4:]).min() >= 0.19
 
@@ -147,6 +145,6 @@ def test_a_poor_frame_does_not_outvote_a_good_one() -> None:
     target = pairs.target.copy()
     target[pairs.frame_of == 0] += [0.5, 0.0, 0.0]
     covariance = np.stack([np.diag([1e-12] * 3 + [s**2] * 3) for s in (0.5, 0.01)])
-    fit = refine_similarity(_TRUE, replace(pairs, target=target, frame_covariance=covariance), _OPTIONS)
+    fit = refine_similarity(_TRUE, replace(pairs, target=target, frame_covariance=covariance))
     assert np.abs(fit.target_from_source.act(pairs.source) - _TRUE.act(pairs.source)).mean() < 0.03
     assert fit.frame_corrections[0, 3] == pytest.approx(0.5, abs=0.05)

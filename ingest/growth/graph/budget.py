@@ -10,11 +10,11 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
-from ingest.colmap.submodel import keep_photos
 from ingest.growth.gates import Gate
 from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, solve_with_new
 from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
 from ingest.growth.values import GrownMap, Refused
+from ingest.sfm.links import keep_photos
 
 _LEAST_PHOTOS = 3  # of a reconstruction
 _TRIES = 3  # the part within the budget may lie otherwise, and be cut again

@@ -15,7 +15,6 @@ from featuredb.maps.error_modes import without_modes
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
-from ingest.colmap.submodel import keep_photos
 from ingest.growth.map_places import drift_m, places_of
 from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.localised import LocaliseEachOptions, in_frame, with_lens
@@ -26,7 +25,7 @@ from ingest.growth.place.refinement import RefinementOptions, refine_placed
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
-from ingest.sfm.links import connected_parts
+from ingest.sfm.links import connected_parts, keep_photos
 from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)

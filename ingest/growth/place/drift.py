@@ -24,9 +24,8 @@ from ingest.colmap.anchored import (
     FixedPoints,
     Lenses,
     block_and_marks,
-    with_observations,
 )
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import design_effect
 
 _LEAST_FREEDOM = 0.1

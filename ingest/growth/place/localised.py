@@ -325,7 +325,7 @@ def with_shared_lenses(
     A photo that this lens does not fit keeps its own (`with_lens`).
 
     Args:
-        keys: of the cameras, by row (`ingest.photos.cameras.shared_key`).
+        keys: of the cameras, by row (`ingest.photos.photo.shared_key`).
     """
     found = dict(localised)
     cameras: dict[str, list[int]] = {}

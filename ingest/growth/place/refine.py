@@ -16,9 +16,8 @@ from ingest.colmap.anchored import (
     FixedPoints,
     Lenses,
     adjust_anchored,
-    with_observations,
 )
-from ingest.colmap.bridge import Model
+from ingest.colmap.bridge import Model, with_observations
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.values import LocalisedPhoto
 from ingest.photos.photo import Photo

@@ -6,7 +6,7 @@ covers the map, the rigid motion that brings the map's points onto its surface m
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,8 @@ from featuredb.store.scans import has_scans
 from ingest.growth.gates import Gate, sigmas_limit
 from ingest.growth.map_places import growth_of
 from ingest.register.structure.surface_fit import (
+    MIN_REACH_M,
     Surface,
-    SurfaceFitOptions,
     plane_distances,
     reach_of,
     surface_near,
@@ -45,7 +45,6 @@ class ScanCheckOptions:
     """When a scan says that a map is elsewhere.
 
     Attributes:
-        surface: the scan as the comparison sees it.
         min_views: of the points that take part; two views leave points along a ray.
         min_points: over the scan; fewer decide nothing.
         max_sigmas: of the motion, in standard deviations of the map's placement, the scan and the fit.
@@ -59,7 +58,6 @@ class ScanCheckOptions:
         margin_m: of scan around the map. max_points: of the map; more say nothing new.
     """
 
-    surface: SurfaceFitOptions = field(default_factory=SurfaceFitOptions)
     min_views: int = 3
     min_points: int = 100
     max_sigmas: float = 3.0
@@ -114,13 +112,13 @@ def cloud_gate(
     cloud: PointCloud, points: FloatArray, covariance: FloatArray, options: ScanCheckOptions
 ) -> Gate | None:
     """The gate for points (n, 3) in the cloud's local frame, of a placement with that covariance (7, 7)."""
-    surface = surface_near(cloud, points, options.surface)
+    surface = surface_near(cloud, points)
     if surface is None:
         return None
     over = points[_over_scan(surface, points, options)]
     if len(over) < options.min_points:
         return None
-    reach = reach_of(surface, options.surface)
+    reach = reach_of(surface)
     distances = plane_distances(surface, over, reach)
     near = np.isfinite(distances)
     middle = over.mean(axis=0)
@@ -175,7 +173,7 @@ class _Laid:
     def sigma_m(self, move: Rigid3) -> float:
         """Standard deviation of those distances that are not of something else."""
         distance = np.abs(self.residuals(move)[0])
-        return max(_MAD * float(np.median(distance)), self.options.surface.min_move_m)
+        return max(_MAD * float(np.median(distance)), 0.02)  # below is the scan's own noise
 
     def weights(self, places: FloatArray) -> FloatArray:
         """(n,) such that the points of one cell weigh one together."""
@@ -257,7 +255,7 @@ def _points(feature_map: FeatureMap, options: ScanCheckOptions) -> FloatArray:
 
 def _over_scan(surface: Surface, points: FloatArray, options: ScanCheckOptions) -> NDArray[np.bool_]:
     """Points with scan around them in plan: elsewhere there is a hole, and its rim says nothing."""
-    cell = max(options.surface.min_reach_m, 2.0 * surface.spacing_m)
+    cell = max(MIN_REACH_M, 2.0 * surface.spacing_m)
     filled = _cells(surface.points + surface.middle, cell)
     return np.isin(_cells(points, cell), filled)
 

@@ -2,11 +2,12 @@
 
 Frames start from the map's present placement (or from a person's), are registered each on its own, must
 agree with each other on where the map goes, and then place it together. Nothing is written here: the result
-is a new map, or a reason.
+is a new map, or a reason. Gates ask of the map as a whole whether it lies on the scan, and may be there.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,15 +15,90 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.executor import Progress, no_progress
-from ingest.register.anchor.agreement import FrameAgreement, LoneFrame, frames_that_agree
-from ingest.register.anchor.frames import TriedFrame, TriedFrames
-from ingest.register.anchor.gates import judged
-from ingest.register.anchor.placing import place_in_rounds, with_lens
+from ingest.register.anchor.frames import (
+    FrameAgreement,
+    LoneFrame,
+    TriedFrame,
+    TriedFrames,
+    frames_that_agree,
+)
+from ingest.register.anchor.placing import PlaceRound, place_in_rounds, with_lens
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.values import AnchorOptions, AnchorResult
+from ingest.register.structure.map_move import (
+    MapMove,
+    MapResidual,
+    map_move,
+    map_residuals,
+    viewing_distance_m,
+)
 from ingest.register.structure.projection import (
     project_structure,
 )
+
+# How far the map may move in the plane and turn, in standard deviations of its placement. Six, because
+# receivers understate their errors. Heights are not judged: those of GPS have an unknown datum and differ
+# from a scan's by tens of metres.
+_MAX_PLACEMENT_SIGMAS = 6.0
+# That much is always allowed.
+_MIN_MOVE_M = 2.0
+_MIN_TURN_DEG = 2.0
+_MAX_SCALE_CHANGE = 0.1  # relative; GPS and scan both measure metres
+# Median distance of the map's points from the scan after, as a share of the distance from which they are
+# seen: 0.02 is 1 m from 50 m, what trees and a day's change leave.
+_MAX_RESIDUAL_SHARE = 0.02
+
+AnchorReason = Literal[
+    "NO_SCAN",  # no frame of the map sees the scan
+    "NO_FRAME",  # no frame was registered
+    "TOO_FEW_FRAMES",  # fewer agree than are needed without a person
+    "FRAMES_DISAGREE",  # frames send the map to different places, and none are in the majority
+    "STRUCTURE",  # the map's points do not lie on the scan under any similarity
+    "CONTRADICTS_PLACEMENT",  # the map would go where its placement says it cannot be
+    "NOT_BETTER",  # the map's points are no closer to the scan than before
+]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnchorOptions:
+    """How a map is anchored.
+
+    Attributes:
+        frames: so many accepted ones are wanted; three spread ones show most of a map's bend.
+        max_tries: frames tried until the first one is registered, at most; a wrong scan costs all of them.
+        min_agreeing: so many frames must agree before a map is moved without a person's word. One frame's
+            verdict is good; two that were found independently and agree are hardly both wrong.
+    """
+
+    frames: int = 3
+    max_tries: int = 6
+    min_agreeing: int = 2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AnchorResult:
+    """A placed map, or why there is none.
+
+    Attributes:
+        reason, message: of the refusal; None and "" for a placed map.
+        feature_map: the map at its new place, None when refused.
+        agreement: of the frames, None where there was nothing to compare.
+        used: ids of the images that placed the map.
+        rounds: of placing; more than one where the lens changed.
+        before, after: how the map lies on the scan, None where it was not come to.
+        checks: figures of the gates, JSON-able.
+        seconds: wall time by step.
+    """
+
+    reason: AnchorReason | None
+    message: str
+    feature_map: FeatureMap | None
+    agreement: FrameAgreement | None = None
+    used: tuple[int, ...] = ()
+    rounds: tuple[PlaceRound, ...] = ()
+    before: MapResidual | None = None
+    after: MapResidual | None = None
+    checks: dict[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 def place_map(
@@ -46,15 +122,15 @@ def place_map(
     if not frames:
         return _nothing_registered(tried)
     clock = StageClock()
-    lone, refusals = _alone(feature_map, frames, cloud, options)
-    agreement = frames_that_agree(lone, options.agreement)
+    lone, refusals = _alone(feature_map, frames, cloud)
+    agreement = frames_that_agree(lone)
     needed = 1 if confirmed else options.min_agreeing
     refusal = _too_little(frames, lone, refusals, agreement, needed)
     if refusal is not None:
         return replace(refusal, agreement=agreement if lone else None)
     used = [frame for frame in frames if frame.image.image_id in agreement.agreeing]
     clock.lap("agreement")
-    placed, rounds, words = place_in_rounds(feature_map, used, cloud, read_gray, options, progress)
+    placed, rounds, words = place_in_rounds(feature_map, used, cloud, read_gray, progress)
     seconds = clock.seconds | {
         "structure projection": sum(r.structure_s for r in rounds),
         "adjustment": sum(r.adjust_s for r in rounds),
@@ -71,7 +147,7 @@ def place_map(
     )
     if placed is None:
         return found
-    return judged(feature_map, placed, cloud, found, options, supervised=supervised or confirmed)
+    return _judged(feature_map, placed, cloud, found, supervised=supervised or confirmed)
 
 
 def _nothing_registered(tried: TriedFrames) -> AnchorResult:
@@ -93,7 +169,7 @@ def _nothing_registered(tried: TriedFrames) -> AnchorResult:
 
 
 def _alone(
-    feature_map: FeatureMap, frames: Sequence[TriedFrame], cloud: PointCloud, options: AnchorOptions
+    feature_map: FeatureMap, frames: Sequence[TriedFrame], cloud: PointCloud
 ) -> tuple[list[LoneFrame], dict[str, str]]:
     """Where each frame alone sends the map; and why not, by image name, of those that send it nowhere."""
     points = feature_map.points_local(cloud.frame)
@@ -102,9 +178,7 @@ def _alone(
     refused: dict[str, str] = {}
     for frame in frames:
         image = frame.image
-        structure = project_structure(
-            feature_map, [with_lens(frame, feature_map.cameras)], cloud, options.structure
-        )
+        structure = project_structure(feature_map, [with_lens(frame, feature_map.cameras)], cloud)
         if not structure.accepted or structure.new_from_old is None:
             refused[image.name] = f"{structure.reason}: {structure.message}"
             continue
@@ -158,3 +232,79 @@ def _too_little(
             feature_map=None,
         )
     return None
+
+
+def _judged(
+    old: FeatureMap, new: FeatureMap, cloud: PointCloud, found: AnchorResult, *, supervised: bool
+) -> AnchorResult:
+    """The gates on the placed map as a whole."""
+    before, after = map_residuals(old, new, cloud)
+    move = map_move(old, new)
+    distance = viewing_distance_m(new)
+    apart = found.agreement.apart_m if found.agreement else {}
+    allowed = found.agreement.allowed_m if found.agreement else {}
+    checks: dict[str, Any] = {
+        "before": before.as_figures(),
+        "after": after.as_figures(),
+        "move": move.as_figures(),
+        "viewing_distance_m": distance,
+        "frames_apart_m": [
+            {"frames": list(pair), "apart_m": metres, "allowed_m": allowed[pair]}
+            for pair, metres in apart.items()
+        ],
+    }
+    found = replace(found, before=before, after=after, checks=checks, message="")
+    if not len(after.distance_m) or after.median_m > max(_MAX_RESIDUAL_SHARE * distance, 0.05):
+        return replace(
+            found,
+            reason="NOT_BETTER",
+            message=f"the map's points would lie {after.median_m:.2f} m (median) from the scan, "
+            f"{max(_MAX_RESIDUAL_SHARE * distance, 0.05):.2f} m allowed",
+        )
+    if after.median_m > max(before.median_m, 0.05):
+        return replace(
+            found,
+            reason="NOT_BETTER",
+            message=f"the map's points lie {before.median_m:.2f} m (median) from the scan now and would lie "
+            f"{after.median_m:.2f} m from it",
+        )
+    words = None if supervised else _contradiction(move)
+    if words is not None:
+        return replace(found, reason="CONTRADICTS_PLACEMENT", message=words)
+    evidence = new.placement.evidence | {
+        "anchor": checks
+        | {
+            "frames": _names(old, found.used),
+            "rounds": [
+                {"focal_px": list(r.focal_px), "structure_s": r.structure_s, "adjust_s": r.adjust_s}
+                for r in found.rounds
+            ],
+            "supervised": supervised,
+        }
+    }
+    placement = replace(new.placement, evidence=evidence)
+    placed = replace(new, placement=placement, generation=0, parents=(), status="active")
+    return replace(found, reason=None, feature_map=placed)
+
+
+def _contradiction(move: MapMove) -> str | None:
+    """Why the map cannot be there by its placement, or None; heights are not judged."""
+    far = _MAX_PLACEMENT_SIGMAS
+    if move.horizontal_m > _MIN_MOVE_M and move.horizontal_sigmas > far:
+        what = f"move by {move.horizontal_m:.1f} m in plan, {move.horizontal_sigmas:.1f} sigmas"
+    elif abs(move.heading_deg) > _MIN_TURN_DEG and move.heading_sigmas > far:
+        what = f"turn by {move.heading_deg:.1f} degrees, {move.heading_sigmas:.1f} sigmas"
+    elif move.tilt_deg > _MIN_TURN_DEG and move.tilt_sigmas > far:
+        what = f"tilt by {move.tilt_deg:.1f} degrees, {move.tilt_sigmas:.1f} sigmas"
+    elif abs(move.scale - 1.0) > _MAX_SCALE_CHANGE and move.scale_sigmas > far:
+        what = f"change its scale by {100 * (move.scale - 1.0):+.1f} %, {move.scale_sigmas:.1f} sigmas"
+    else:
+        return None
+    return (
+        f"the map would {what} of its present placement, {far:.0f} allowed; if that placement is known to be "
+        "wrong, confirm the frames (--confirm)"
+    )
+
+
+def _names(feature_map: FeatureMap, ids: Sequence[int]) -> list[str]:
+    return [image.name for image in feature_map.images if image.image_id in ids]

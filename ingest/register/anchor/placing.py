@@ -3,6 +3,8 @@
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap
@@ -10,7 +12,6 @@ from featuredb.render.cloud import PointCloud
 from ingest.executor import Progress
 from ingest.register.anchor.frames import TriedFrame, register_again
 from ingest.register.anchor.proposals import PhotoReader
-from ingest.register.anchor.values import AnchorOptions, PlaceRound
 from ingest.register.structure.adjustment import (
     adjust_to_scan,
     adjusted_map,
@@ -23,13 +24,40 @@ from ingest.register.structure.projection import (
 
 _LOG = logging.getLogger(__name__)
 
+# A map's lens is adjusted with its placement; while it changes, frames are registered again with the better
+# one, so many times at most.
+_LENS_ROUNDS = 4
+# Relative change of the focal length that needs no further round: 0.3 % is 0.15 m of height from 50 m.
+_LENS_SETTLED = 0.003
+# Prior of frames that are registered again.
+_AGAIN_SIGMA_M = 2.0
+_AGAIN_SIGMA_DEG = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlaceRound:
+    """One round of projecting the structure and adjusting the map.
+
+    Attributes:
+        frames: as they were registered for it.
+        structure_s, adjust_s: wall time of the two steps. structure_cpu_s: processor time of the first.
+        focal_px: of the map's cameras after it.
+        figures: of both steps, JSON-able.
+    """
+
+    frames: tuple[TriedFrame, ...]
+    structure_s: float
+    structure_cpu_s: float
+    adjust_s: float
+    focal_px: tuple[float, ...]
+    figures: dict[str, Any]
+
 
 def place_in_rounds(
     feature_map: FeatureMap,
     frames: Sequence[TriedFrame],
     cloud: PointCloud,
     read_gray: PhotoReader,
-    options: AnchorOptions,
     progress: Progress,
 ) -> tuple[FeatureMap | None, list[PlaceRound], str]:
     """The map by structure projection and adjustment, again with a better lens while that changes.
@@ -40,11 +68,11 @@ def place_in_rounds(
     placed: FeatureMap | None = None
     adjusted: FeatureMap | None = None
     rounds: list[PlaceRound] = []
-    for number in range(options.lens_rounds):
+    for number in range(_LENS_ROUNDS):
         lens = (placed or feature_map).cameras
         registered = [with_lens(frame, lens) for frame in frames]
         start, cpu = time.perf_counter(), time.process_time()
-        structure = project_structure(feature_map, registered, cloud, options.structure)
+        structure = project_structure(feature_map, registered, cloud)
         structure_s, structure_cpu_s = time.perf_counter() - start, time.process_time() - cpu
         if not structure.accepted:
             if placed is not None:
@@ -53,7 +81,7 @@ def place_in_rounds(
                 )
             return placed, rounds, f"{structure.reason}: {structure.message}"
         start = time.perf_counter()
-        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, options.adjust, adjusted)
+        adjustment = adjust_to_scan(feature_map, structure, registered, cloud, adjusted)
         adjust_s = time.perf_counter() - start
         if adjustment.accepted:
             placed = adjusted = adjusted_map(feature_map, adjustment, cloud)
@@ -72,19 +100,18 @@ def place_in_rounds(
                 },
             )
         )
-        progress("place", number + 1, options.lens_rounds)
+        progress("place", number + 1, _LENS_ROUNDS)
         change = max(
             abs(new.focal_px / old.focal_px - 1.0) for new, old in zip(placed.cameras, lens, strict=True)
         )
-        if change < options.lens_settled or number + 1 == options.lens_rounds:
+        if change < _LENS_SETTLED or number + 1 == _LENS_ROUNDS:
             break
         again = register_again(
             placed,
             cloud,
             frames,
             read_gray,
-            (options.again_sigma_m, options.again_sigma_deg),
-            options.frames.frame,
+            (_AGAIN_SIGMA_M, _AGAIN_SIGMA_DEG),
         )
         kept = [frame for frame in again if frame.registration.accepted]
         if len(kept) < len(frames):

@@ -17,33 +17,21 @@ from ingest.register.frame_registration import FramePrior
 PhotoReader = Callable[[MapImage], NDArray[np.uint8]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ProposalOptions:
-    """How frames are ranked.
-
-    Attributes:
-        view_width_px: of the renders that tell coverage; figures change by a hundredth with twice as many.
-        grid: cells along each side of the photo in which texture and map points are counted.
-        min_coverage: frames that see less of the scan are not proposed; scans have holes (brighton's frames
-            see 0.4 to 0.65), but a quarter of a photo must have something to match.
-        cell_contrast: standard deviation of the grey values (0 to 255) of a cell that has texture: above the
-            noise of sky, water and out-of-focus lawn (2 to 4 in the photos of brighton and lewis).
-        enough_points: map points seen by a frame after which more do not help: structure projection works
-            with hundreds.
-        max_photos_read: so many photos, best by geometry, are opened for their sharpness.
-        photo_side_px: they are shrunk to this side for it.
-        overlap_penalty: the score of a frame is multiplied by 1 - penalty times the share of its map points
-            that frames chosen before see already: frames side by side tell of the same corner of the map.
-    """
-
-    view_width_px: int = 200
-    grid: int = 8
-    min_coverage: float = 0.25
-    cell_contrast: float = 6.0
-    enough_points: int = 300
-    max_photos_read: int = 40
-    photo_side_px: int = 800
-    overlap_penalty: float = 0.5
+_VIEW_WIDTH_PX = 200  # of the renders that tell coverage; figures change by a hundredth with twice as many
+_GRID = 8  # cells along each side of the photo in which texture and map points are counted
+# Frames that see less of the scan are not proposed; scans have holes (brighton's frames see 0.4 to 0.65), but
+# a quarter of a photo must have something to match.
+_MIN_COVERAGE = 0.25
+# Standard deviation of the grey values (0 to 255) of a cell that has texture: above the noise of sky, water
+# and out-of-focus lawn (2 to 4 in the photos of brighton and lewis).
+_CELL_CONTRAST = 6.0
+# Map points seen by a frame after which more do not help: structure projection works with hundreds.
+_ENOUGH_POINTS = 300
+_MAX_PHOTOS_READ = 40  # so many photos, best by geometry, are opened for their sharpness
+_PHOTO_SIDE_PX = 800  # they are shrunk to this side for it
+# The score of a frame is multiplied by 1 - penalty times the share of its map points that frames chosen
+# before see already: frames side by side tell of the same corner of the map.
+_OVERLAP_PENALTY = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,7 +76,6 @@ def propose_frames(
     cloud: PointCloud,
     priors: Mapping[int, FramePrior],
     read_gray: PhotoReader | None,
-    options: ProposalOptions | None = None,
 ) -> list[FrameProposal]:
     """All frames that see enough of the scan, the most promising first.
 
@@ -99,36 +86,35 @@ def propose_frames(
         priors: of the images to be ranked, by image id, in the cloud's frame.
         read_gray: gives the photo's grey pixels (h, w) uint8, at any size; None ranks by geometry alone.
     """
-    options = options or ProposalOptions()
     rough = []
     for image in feature_map.images:
         if image.image_id in priors:
-            score = _geometry_score(feature_map, image, priors[image.image_id], cloud, options)
-            if score.coverage >= options.min_coverage:
+            score = _geometry_score(feature_map, image, priors[image.image_id], cloud)
+            if score.coverage >= _MIN_COVERAGE:
                 rough.append(FrameProposal(image=image, score=score, prior=priors[image.image_id]))
     rough.sort(key=lambda p: (-p.score.score, p.image.image_id))
     if read_gray is not None:
-        read = [_photo_figures(read_gray(p.image), options) for p in rough[: options.max_photos_read]]
+        read = [_photo_figures(read_gray(p.image)) for p in rough[:_MAX_PHOTOS_READ]]
         best = max((sharpness for _, sharpness in read), default=1.0) or 1.0
         rough = [
             _with_photo(p, *(read[i] if i < len(read) else (np.nan, np.nan)), best)
             for i, p in enumerate(rough)
         ]
-    return _spread_out(feature_map, rough, options)
+    return _spread_out(feature_map, rough)
 
 
 def _geometry_score(
-    feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud, options: ProposalOptions
+    feature_map: FeatureMap, image: MapImage, prior: FramePrior, cloud: PointCloud
 ) -> FrameScore:
     camera = feature_map.cameras[image.camera_id]
-    small = small_camera(camera, options.view_width_px)
+    small = small_camera(camera, _VIEW_WIDTH_PX)
     seen = render(cloud, small, prior.cam_from_local, RenderOptions(attributes=False))
     valid = seen.valid
     coverage = float(valid.mean())
     mine = feature_map.observations.image_id == image.image_id
     points = len(np.unique(feature_map.observations.point_index[mine]))
-    cells = feature_map.observations.xy[mine] / [camera.width, camera.height] * options.grid
-    spread = len(np.unique(np.floor(cells).clip(0, options.grid - 1), axis=0)) / options.grid**2
+    cells = feature_map.observations.xy[mine] / [camera.width, camera.height] * _GRID
+    spread = len(np.unique(np.floor(cells).clip(0, _GRID - 1), axis=0)) / _GRID**2
     return _scored(
         FrameScore(
             score=0.0,
@@ -138,8 +124,7 @@ def _geometry_score(
             spread=spread,
             texture=float("nan"),
             sharpness=float("nan"),
-        ),
-        options,
+        )
     )
 
 
@@ -155,11 +140,11 @@ def _downward(camera: Camera, pose: Rigid3, valid: NDArray[np.bool_]) -> float:
     return float(np.maximum(-up[np.isfinite(up)], 0.0).mean())
 
 
-def _scored(score: FrameScore, options: ProposalOptions) -> FrameScore:
+def _scored(score: FrameScore) -> FrameScore:
     factors = [
         score.coverage,
         score.downward,
-        min(score.points / options.enough_points, 1.0),
+        min(score.points / _ENOUGH_POINTS, 1.0),
         score.spread,
         score.texture,
         score.sharpness,
@@ -168,27 +153,25 @@ def _scored(score: FrameScore, options: ProposalOptions) -> FrameScore:
     return FrameScore(**{**asdict(score), "score": value})
 
 
-def _photo_figures(gray: NDArray[np.uint8], options: ProposalOptions) -> tuple[float, float]:
+def _photo_figures(gray: NDArray[np.uint8]) -> tuple[float, float]:
     """Share of textured cells, and the energy of the finest detail over that of twice as coarse detail."""
-    shrink = options.photo_side_px / max(gray.shape)
+    shrink = _PHOTO_SIDE_PX / max(gray.shape)
     small = cv2.resize(gray, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA).astype(np.float32)
-    blocks = [np.array_split(band, options.grid, axis=1) for band in np.array_split(small, options.grid)]
+    blocks = [np.array_split(band, _GRID, axis=1) for band in np.array_split(small, _GRID)]
     contrast = np.array([[block.std() for block in row] for row in blocks])
     fine = small - cv2.GaussianBlur(small, (0, 0), 1.0)
     coarse = cv2.GaussianBlur(small, (0, 0), 1.0) - cv2.GaussianBlur(small, (0, 0), 2.0)
     sharpness = float(fine.std() / max(float(coarse.std()), 1e-6))
-    return float((contrast >= options.cell_contrast).mean()), sharpness
+    return float((contrast >= _CELL_CONTRAST).mean()), sharpness
 
 
 def _with_photo(proposal: FrameProposal, texture: float, sharpness: float, best: float) -> FrameProposal:
     figures = asdict(proposal.score) | {"texture": texture, "sharpness": sharpness / best}
-    score = _scored(FrameScore(**figures), ProposalOptions())
+    score = _scored(FrameScore(**figures))
     return FrameProposal(image=proposal.image, score=score, prior=proposal.prior)
 
 
-def _spread_out(
-    feature_map: FeatureMap, proposals: Sequence[FrameProposal], options: ProposalOptions
-) -> list[FrameProposal]:
+def _spread_out(feature_map: FeatureMap, proposals: Sequence[FrameProposal]) -> list[FrameProposal]:
     """Order by score and by what frames before have not seen."""
     observations = feature_map.observations
     sees = {
@@ -199,8 +182,7 @@ def _spread_out(
     left, ordered = list(proposals), []
     while left:
         values = [
-            p.score.score * (1.0 - options.overlap_penalty * _mean(seen[sees[p.image.image_id]]))
-            for p in left
+            p.score.score * (1.0 - _OVERLAP_PENALTY * _mean(seen[sees[p.image.image_id]])) for p in left
         ]
         chosen = left.pop(int(np.argmax(values)))
         seen[sees[chosen.image.image_id]] = True

@@ -15,10 +15,17 @@ from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.plain_json import plain
 from featuredb.render.cloud import PointCloud
 from ingest.html_parts import folded, note, page, picture, pill, table
+from ingest.register.anchor.anchor_map import AnchorResult
 from ingest.register.anchor.frames import TriedFrame, TriedFrames
-from ingest.register.anchor.page import FramePicture, flick_page
-from ingest.register.anchor.pictures import map_over_scan_png, overlay_rgb, png, residuals_png, scan_view
-from ingest.register.anchor.values import AnchorResult
+from ingest.register.anchor.pictures import (
+    FramePicture,
+    flick_page,
+    map_over_scan_png,
+    overlay_rgb,
+    png,
+    residuals_png,
+    scan_view,
+)
 from ingest.workspace import atomic_file, write_json
 
 SCHEMA_ID = "featuredb/ingest/anchor/1"
@@ -64,8 +71,6 @@ class AnchorReport:
         times: dict[str, float] = {}
         if tried:
             times["(B) one frame, median"] = float(np.median([f.seconds for f in tried]))
-            refined = [f.seconds - refinement_s(f) for f in tried]
-            times["(B) one frame without intensity refinement, median"] = float(np.median(refined))
             cpu = [f.cpu_s for f in tried if np.isfinite(f.cpu_s)]
             if cpu:
                 times["(B) one frame, median, CPU"] = float(np.median(cpu))
@@ -75,11 +80,6 @@ class AnchorReport:
             times["(C) structure projection, all frames, CPU"] = last.structure_cpu_s
             times["adjustment of the map, all rounds"] = sum(r.adjust_s for r in self.result.rounds)
         return times
-
-
-def refinement_s(frame: TriedFrame) -> float:
-    """Wall time of the intensity refinement in a registration."""
-    return sum(s for name, s in frame.registration.seconds.items() if "refine" in name or "intensity" in name)
 
 
 def frame_rows(report: AnchorReport) -> list[tuple[Any, ...]]:

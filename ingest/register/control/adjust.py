@@ -4,7 +4,7 @@ A file does not tell wrong marks and coordinates from right ones: they keep a qu
 name and leave out the wrong ones (`ingest.register.control.snooping`).
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,33 +40,16 @@ _TOLERANCE = 1e-7  # of the cost, relative: a hundredth of what a tenth of a sig
 _FOLLOW = (10, 1e-4)  # steps and relative cost: single points settle in three or four
 # A block hangs on a few coordinates, a billionth of what holds its photos together.
 _RADIUS = 1e9
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControlAdjustOptions:
-    """How the block is adjusted.
-
-    Attributes:
-        keep_lens: keep all lenses.
-        lens: around the lenses as the block has them.
-        dilution: so many observations of the size that residuals have with what neighbours share count as
-            one: what lens models leave over is common to whole photos.
-        ground_share: standard deviation of the ground's height under a single mark, over its distance.
-        points_per_photo: of the block's own points that take part, long tracks first, with the weight of all;
-            the others follow the cameras afterwards.
-        max_iterations: of one adjustment.
-    """
-
-    keep_lens: bool = False
-    lens: LensWidths = field(
-        default_factory=lambda: LensWidths(
-            focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.1, tangential=0.003
-        )
-    )
-    dilution: float = 50.0
-    ground_share: float = 0.01
-    points_per_photo: int = 150
-    max_iterations: int = 50
+# Around the lenses as the block has them.
+_LENS = LensWidths(focal_rel=0.02, aspect_rel=0.001, center_rel=0.01, radial=0.1, tangential=0.003)
+# So many observations of the size that residuals have with what neighbours share count as one: what lens
+# models leave over is common to whole photos.
+_DILUTION = 50.0
+_GROUND_SHARE = 0.01  # standard deviation of the ground's height under a single mark, over its distance
+# Of the block's own points that take part, long tracks first, with the weight of all; the others follow the
+# cameras afterwards.
+_POINTS_PER_PHOTO = 150
+_MAX_ITERATIONS = 50  # of one adjustment
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,6 +103,7 @@ class Task:
             ground_m: (m,) how well. It holds points that one photo shows.
         vertical: what is known of it in that frame.
         keypoint_px: standard deviation of a keypoint's coordinate; weight_px: with which keypoints count.
+        keep_lens: keep all lenses.
     """
 
     block: Block
@@ -130,18 +114,14 @@ class Task:
     vertical: Vertical | None
     keypoint_px: float
     weight_px: float
-    options: ControlAdjustOptions
+    keep_lens: bool
 
 
 def task_of(
-    placed: Block,
-    control: Control,
-    control_xyz: FloatArray,
-    vertical: Vertical | None,
-    options: ControlAdjustOptions,
+    placed: Block, control: Control, control_xyz: FloatArray, vertical: Vertical | None, keep_lens: bool
 ) -> Task:
     """For a block in metres in the local frame, in place but for small changes."""
-    chosen = _sample(placed, options.points_per_photo)
+    chosen = _sample(placed, _POINTS_PER_PHOTO)
     variance_px2 = max(block_variance_px2(chosen), _LEAST_PX2)
     share = len(chosen.xy) / len(placed.xy)
     ground = np.full((len(control.marks), 3), np.nan)
@@ -150,15 +130,15 @@ def task_of(
         ground[row] = np.nan if met is None else met
     centers = placed.centers()[control.photo_of]
     return Task(
-        block=chosen if options.keep_lens else whole_lens(chosen),
+        block=chosen if keep_lens else whole_lens(chosen),
         control=control,
         control_xyz=control_xyz,
         ground=ground,
-        ground_m=options.ground_share * np.linalg.norm(ground - centers, axis=1),
+        ground_m=_GROUND_SHARE * np.linalg.norm(ground - centers, axis=1),
         vertical=vertical,
         keypoint_px=float(np.sqrt(variance_px2)),
-        weight_px=float(np.sqrt(variance_px2 * max(1.0, options.dilution * share))),
-        options=options,
+        weight_px=float(np.sqrt(variance_px2 * max(1.0, _DILUTION * share))),
+        keep_lens=keep_lens,
     )
 
 
@@ -168,7 +148,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
     Args:
         previous: under other weights, to go on from.
     """
-    control, options, used = task.control, task.options, weights.points
+    control, used = task.control, weights.points
     block, xyz, vertical, change = task.block, task.control_xyz, task.vertical, Sim3.identity()
     if previous is not None:
         block, change = previous.block, previous.change
@@ -185,7 +165,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
     located = np.unique(control.point_of[weights.marks])
     terms = Terms(
         keypoint_px=task.weight_px,
-        lenses=tuple(_lens_prior(camera, options) for camera in task.block.cameras),
+        lenses=tuple(_lens_prior(camera, task.keep_lens) for camera in task.block.cameras),
         orientations=None if vertical is None else _upright(start, vertical),
         points=None if vertical is None else _anchor(start, vertical),
         targets=Targets(
@@ -197,7 +177,7 @@ def adjust(task: Task, weights: Weights, previous: Adjusted | None = None) -> Ad
         ),
     )
     problem = Problem(replace(start, xyz=np.concatenate([start.xyz, xyz])), terms)
-    problem.solve(options.max_iterations, _TOLERANCE, _RADIUS)
+    problem.solve(_MAX_ITERATIONS, _TOLERANCE, _RADIUS)
     everything, found = problem.block(), problem.target_marginals()
     adjusted = replace(everything, xyz=everything.xyz[:count])
     by_poses = similarity_of_change(adjusted)
@@ -253,8 +233,8 @@ def _sample(block: Block, per_photo: int) -> Block:
     )
 
 
-def _lens_prior(camera: Camera, options: ControlAdjustOptions) -> LensPrior | None:
-    return None if options.keep_lens else lens_prior(camera, options.lens)
+def _lens_prior(camera: Camera, keep_lens: bool) -> LensPrior | None:
+    return None if keep_lens else lens_prior(camera, _LENS)
 
 
 def _of_all(values: FloatArray, rows: NDArray[np.int64], count: int, otherwise: float) -> FloatArray:

@@ -105,36 +105,24 @@ class ControlFit:
     sigma_m: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ControlFitOptions:
-    """Robust fit.
-
-    Attributes:
-        max_mark_error_px: marks further from the common intersection disagree. A person marks to one to
-            three pixels, a block may be bent by a few; wrong targets are tens to hundreds off.
-        min_ray_angle_deg: rays closer to parallel than that give no place.
-        outlier_sigmas: points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane.
-        min_sigma_m: survey and marks are not better than that, so smaller residuals never make outliers.
-        max_samples: of hypotheses.
-        seed: of the samples.
-    """
-
-    max_mark_error_px: float = 12.0
-    min_ray_angle_deg: float = 1.0
-    outlier_sigmas: float = 3.5
-    min_sigma_m: float = 0.02
-    max_samples: int = 1500
-    seed: int = 0
+# Marks further from the common intersection disagree. A person marks to one to three pixels, a block may be
+# bent by a few; wrong targets are tens to hundreds off.
+_MAX_MARK_ERROR_PX = 12.0
+_MIN_RAY_ANGLE_DEG = 1.0  # rays closer to parallel than that give no place
+_OUTLIER_SIGMAS = 3.5  # points further out are left out; 3.5 keeps 99.8 % of honest ones in the plane
+_MIN_SIGMA_M = 0.02  # survey and marks are not better than that, so smaller residuals never make outliers
+_MAX_SAMPLES = 1500  # of hypotheses
+_SEED = 0  # of the samples
 
 
-def hypotheses(block: Block, control: Control, options: ControlFitOptions) -> list[Hypothesis]:
+def hypotheses(block: Block, control: Control) -> list[Hypothesis]:
     """Every place that the marks of a point, or some of them, point to."""
     found: list[Hypothesis] = []
     for point in range(len(control.names)):
         rows = control.marks_of(point)
         seen: set[tuple[int, ...]] = set()
         for pair in itertools.islice(itertools.combinations(rows, 2), _MOST_PAIRS):
-            consensus = _consensus(block, control, rows, pair, options)
+            consensus = _consensus(block, control, rows, pair)
             if consensus is not None and consensus[1] not in seen:
                 seen.add(consensus[1])
                 found.append(Hypothesis(point=point, xyz=consensus[0], marks=consensus[1], by_rays=True))
@@ -146,17 +134,17 @@ def hypotheses(block: Block, control: Control, options: ControlFitOptions) -> li
 
 
 def _consensus(
-    block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int], options: ControlFitOptions
+    block: Block, control: Control, rows: NDArray[np.int64], pair: Sequence[int]
 ) -> tuple[FloatArray, tuple[int, ...]] | None:
     """The intersection of all marks that agree with a pair; None where the pair does not agree itself."""
     chosen = np.array(pair)
     xyz = None
     for _ in range(3):
-        xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], options.min_ray_angle_deg)
+        xyz = intersect(block, control.photo_of[chosen], control.xy[chosen], _MIN_RAY_ANGLE_DEG)
         if xyz is None:
             return None
         errors = mark_errors(block, control.photo_of[rows], control.xy[rows], xyz)
-        again = rows[errors <= options.max_mark_error_px]
+        again = rows[errors <= _MAX_MARK_ERROR_PX]
         if not set(pair) <= set(again.tolist()):
             return None
         if np.array_equal(again, chosen):
@@ -166,7 +154,7 @@ def _consensus(
 
 
 def fit_similarity(
-    found: Sequence[Hypothesis], surveyed: FloatArray, vertical: Vertical | None, options: ControlFitOptions
+    found: Sequence[Hypothesis], surveyed: FloatArray, vertical: Vertical | None
 ) -> ControlFit | None:
     """The similarity that most points agree on, or None where no sample gives one.
 
@@ -176,16 +164,16 @@ def fit_similarity(
     """
     xyz = np.array([h.xyz for h in found])
     point = np.array([h.point for h in found])
-    start = _least_trimmed(xyz, point, surveyed, vertical, options)
+    start = _least_trimmed(xyz, point, surveyed, vertical)
     if start is None:
         return None
     sim = start
     for _ in range(10):  # settles in two or three rounds
         residuals = _residuals(sim, xyz, surveyed[point])
         lengths = np.linalg.norm(residuals, axis=1)
-        sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical, options)
-        chosen = _choose(found, lengths, len(surveyed), options.outlier_sigmas * sigma)
-        inliers = lengths[chosen] <= options.outlier_sigmas * sigma
+        sigma = _sigma(_per_point(lengths, point, len(surveyed)), surveyed, vertical)
+        chosen = _choose(found, lengths, len(surveyed), _OUTLIER_SIGMAS * sigma)
+        inliers = lengths[chosen] <= _OUTLIER_SIGMAS * sigma
         refined = refined_similarity(sim, xyz[chosen][inliers], surveyed[inliers], sigma, vertical)
         moved = float(np.abs(refined.act(xyz[chosen]) - sim.act(xyz[chosen])).max())
         sim = refined
@@ -195,7 +183,7 @@ def fit_similarity(
     return ControlFit(
         local_from_block=sim,
         residuals_m=rest,
-        inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= options.outlier_sigmas * sigma,
+        inliers=np.linalg.norm(np.nan_to_num(rest), axis=1) <= _OUTLIER_SIGMAS * sigma,
         chosen=tuple(found[int(i)] for i in chosen),
         sigma_m=sigma,
     )
@@ -214,11 +202,7 @@ def _per_point(lengths: FloatArray, point: NDArray[np.int64], count: int) -> Flo
 
 
 def _least_trimmed(
-    xyz: FloatArray,
-    point: NDArray[np.int64],
-    surveyed: FloatArray,
-    vertical: Vertical | None,
-    options: ControlFitOptions,
+    xyz: FloatArray, point: NDArray[np.int64], surveyed: FloatArray, vertical: Vertical | None
 ) -> Sim3 | None:
     """Of similarities through few hypotheses, the one whose better half of points fits best."""
     size = 3 if vertical is None else 2
@@ -226,7 +210,7 @@ def _least_trimmed(
     count = len(np.unique(point))
     kept = (count + size + 1) // 2
     best: tuple[float, Sim3] | None = None
-    for rows in _samples(usable, point, size, options):
+    for rows in _samples(usable, point, size):
         sim = (
             similarity_closed_form(xyz[rows], surveyed[point[rows]])
             if vertical is None
@@ -241,22 +225,20 @@ def _least_trimmed(
     return None if best is None else best[1]
 
 
-def _samples(
-    usable: NDArray[np.int64], point: NDArray[np.int64], size: int, options: ControlFitOptions
-) -> list[NDArray[np.int64]]:
+def _samples(usable: NDArray[np.int64], point: NDArray[np.int64], size: int) -> list[NDArray[np.int64]]:
     """Sets of hypotheses of different points: all of them, or random ones where there are too many."""
-    generator = np.random.default_rng(options.seed)
+    generator = np.random.default_rng(_SEED)
     total = 1
     for k in range(size):
         total = total * (len(usable) - k) // (k + 1)
-    if total <= options.max_samples:
+    if total <= _MAX_SAMPLES:
         every = (np.array(c) for c in itertools.combinations(usable, size))
         return [rows for rows in every if len(set(point[rows])) == size]
     names = np.unique(point[usable])
     if len(names) < size:
         return []
     samples = []
-    for _ in range(options.max_samples):
+    for _ in range(_MAX_SAMPLES):
         chosen = generator.choice(names, size, replace=False)
         samples.append(np.array([generator.choice(usable[point[usable] == p]) for p in chosen]))
     return samples
@@ -278,16 +260,14 @@ def _levelled(xyz: FloatArray, surveyed: FloatArray, vertical: Vertical) -> Sim3
     return Sim3(scale=scale, rotation=rotation, translation=np.array([shift.real, shift.imag, up]))
 
 
-def _sigma(
-    lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None, options: ControlFitOptions
-) -> float:
+def _sigma(lengths: FloatArray, surveyed: FloatArray, vertical: Vertical | None) -> float:
     """Robust standard deviation of one coordinate, with the degrees of freedom of the fit."""
     axes = 3 if np.isfinite(surveyed[:, 2]).all() else 2
     equations = int(np.isfinite(surveyed).sum())
     parameters = 7 if vertical is None else 4
     freedom = max(equations - parameters, 1)
     spread = float(np.median(lengths)) * _SIGMA_OF_MEDIAN[axes] * (equations / freedom) ** 0.5
-    return float(max(spread, options.min_sigma_m))
+    return float(max(spread, _MIN_SIGMA_M))
 
 
 def _choose(

@@ -1,7 +1,7 @@
 """Control points that meet a block: which marks lie in which of its photos, and what cannot be used."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,16 +53,13 @@ def control_frame(file: ControlFile) -> LocalFrame:
     )
 
 
-def meet(
-    file: ControlFile, block: Block, frame: LocalFrame, other_photos: Mapping[str, str] | None = None
-) -> Control:
+def meet(file: ControlFile, block: Block, frame: LocalFrame) -> Control:
     """Find the block's photos for the marks.
 
     Args:
         frame: of the surveyed positions that come out.
-        other_photos: photos that are known but not in the block, by name, with the reason.
     """
-    found, unused = _photos(file.marks, block, other_photos or {})
+    found, unused = _photos(file.marks, block)
     chosen = [(mark, photo) for mark, photo in found if _inside(mark, block, photo)]
     unused += [
         (mark, _outside_words(mark, block, photo)) for mark, photo in found if not _inside(mark, block, photo)
@@ -91,15 +88,12 @@ def _local(frame: LocalFrame, lat_lon_h: FloatArray) -> FloatArray:
     return enu
 
 
-def _photos(
-    marks: Sequence[Mark], block: Block, others: Mapping[str, str]
-) -> tuple[list[tuple[Mark, int]], list[tuple[Mark, str]]]:
+def _photos(marks: Sequence[Mark], block: Block) -> tuple[list[tuple[Mark, int]], list[tuple[Mark, str]]]:
     """The block's photo of each mark: by its name, else by its file name alone where only one has it."""
     by_name = {name.lower(): row for row, name in enumerate(block.names)}
     by_file = defaultdict(list)
     for row, name in enumerate(block.names):
         by_file[_file_name(name)].append(row)
-    reasons = {_file_name(name): reason for name, reason in others.items()}
     found, unused = [], []
     for mark in marks:
         rows = by_file[_file_name(mark.photo)]
@@ -110,8 +104,7 @@ def _photos(
         elif rows:
             unused.append((mark, f"{len(rows)} photos are called {mark.photo}; name it with its folder"))
         else:
-            reason = reasons.get(_file_name(mark.photo))
-            unused.append((mark, reason or f"no photo {mark.photo} in the map"))
+            unused.append((mark, f"no photo {mark.photo} in the map"))
     return found, unused
 
 

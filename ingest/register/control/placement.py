@@ -10,7 +10,7 @@ from where the block was before (GPS), and where there is no such place from the
 under the photos is level on the whole. The covariance says how little that is.
 """
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.register.control.adjust import (
     Adjusted,
-    ControlAdjustOptions,
     Task,
     adjust,
     task_of,
@@ -28,17 +27,14 @@ from ingest.register.control.adjust import (
 )
 from ingest.register.control.fit import (
     ControlFit,
-    ControlFitOptions,
     Hypothesis,
     Vertical,
     fit_similarity,
     hypotheses,
 )
-from ingest.register.control.gps_offset import gps_offset
-from ingest.register.control.level import LevelGroundOptions, level_ground
 from ingest.register.control.marks import Control
-from ingest.register.control.residuals import MarkResidual, PointResidual, residuals_of
-from ingest.register.control.snooping import Outcome, TestOptions, improve, initial_weights
+from ingest.register.control.residuals import MarkResidual, PointResidual, gps_offset, residuals_of
+from ingest.register.control.snooping import Outcome, improve, initial_weights
 
 GcpReason = Literal[
     "TOO_FEW",
@@ -53,35 +49,40 @@ GcpReason = Literal[
 _STEEP = 0.5  # sine of 30 degrees: half the photos look up more steeply than photos of a place ever do
 
 
+_MIN_POINTS = 3  # three are the least with which one can be found to be wrong
+_MIN_SHARE = 0.5  # of the points that must agree; with fewer, the file and the photos do not belong together
+# Of the surveyed coordinates' standard deviation over the extent of the points; beyond, they agree no better
+# than points drawn at random would.
+_MAX_SIGMA_OVER_EXTENT = 0.1
+_MAX_SCALE_SIGMA = 0.1  # relative standard deviation of the scale; beyond, a map is no measure
+# Extent of the points across their line over that along it; below, heights of the points do not say which way
+# is up.
+_MIN_LINE_RATIO = 0.02
+# Of the placed photos from their own GPS, beyond three of its sigmas. EXIF is off by metres, rarely by tens;
+# more means another zone, system or unit.
+_MAX_GPS_OFFSET_M = 150.0
+# Of the plane through the block's points, about each axis. Windows of 60 m of the ground in public airborne
+# scans slope by 1.7 to 3.5 degrees, larger ones by less. The cameras' mean axis is no better: a mount may be
+# tilted by more (7 degrees against the plane in `copr`).
+_SIGMA_TILT_DEG = 3.5
+_KEPT_SHARE = 0.9  # of the points, nearest to the middle of them; the far ones are trees and errors
+_ANY_HEIGHT_M = (0.0, 1000.0)  # and standard deviation: that of not knowing; most land lies lower
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GcpOptions:
     """How a block is placed by control points and when that is refused.
 
     Attributes:
-        min_points: three are the least with which one can be found to be wrong.
-        min_share: of the points that must agree; with fewer, the file and the photos do not belong together.
-        max_sigma_over_extent: of the surveyed coordinates' standard deviation over the extent of the points;
-            beyond, they agree no better than points drawn at random would.
-        max_scale_sigma: relative standard deviation of the scale; beyond, a map is no measure.
-        min_line_ratio: extent of the points across their line over that along it; below, heights of the
-            points do not say which way is up.
-        max_gps_offset_m: of the placed photos from their own GPS, beyond three of its sigmas. EXIF is off
-            by metres, rarely by tens; more means another zone, system or unit.
         sigma_m: standard deviation of the surveyed coordinates, horizontal and vertical; None finds it
             from the residuals.
+        ground_m: height of the control points and its standard deviation, where somebody knows it about.
+        keep_lens: keep all lenses.
     """
 
-    min_points: int = 3
-    min_share: float = 0.5
-    max_sigma_over_extent: float = 0.1
-    max_scale_sigma: float = 0.1
-    min_line_ratio: float = 0.02
-    max_gps_offset_m: float = 150.0
     sigma_m: tuple[float, float] | None = None
-    fit: ControlFitOptions = field(default_factory=ControlFitOptions)
-    test: TestOptions = field(default_factory=TestOptions)
-    adjust: ControlAdjustOptions = field(default_factory=ControlAdjustOptions)
-    level: LevelGroundOptions = field(default_factory=LevelGroundOptions)
+    ground_m: tuple[float, float] | None = None
+    keep_lens: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -101,12 +102,12 @@ class GcpPlacement:
 
     reason: GcpReason | None
     message: str
-    local_from_block: Sim3 | None
-    covariance: FloatArray | None
-    block: Block | None
-    points: tuple[PointResidual, ...]
-    marks: tuple[MarkResidual, ...]
-    notes: tuple[str, ...]
+    local_from_block: Sim3 | None = None
+    covariance: FloatArray | None = None
+    block: Block | None = None
+    points: tuple[PointResidual, ...] = ()
+    marks: tuple[MarkResidual, ...] = ()
+    notes: tuple[str, ...] = ()
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -138,78 +139,107 @@ def place_by_gcp(
             guard against gross errors of the file, and what they are off by is told.
         gps_sigma_m: that they state, horizontal and vertical.
     """
-    found = hypotheses(block, control, options.fit)
+    found = hypotheses(block, control)
     usable = sorted({h.point for h in found})
-    if len(usable) < options.min_points:
-        return _refused(
-            "TOO_FEW",
-            f"{len(usable)} control points can be located in the photos, at least {options.min_points} are "
+    if len(usable) < _MIN_POINTS:
+        return GcpPlacement(
+            reason="TOO_FEW",
+            message=f"{len(usable)} control points can be located in the photos, at least {_MIN_POINTS} are "
             "needed; mark each point in two photos or more",
-            {"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
+            figures={"points": len(control.names), "usable_points": len(usable), "marks": len(control.marks)},
         )
     notes: list[str] = []
-    needed = _vertical_is_needed(control, usable, options)
+    needed = _vertical_is_needed(control, usable)
     if needed and vertical is None:
-        vertical = level_ground(block, np.median([h.xyz for h in found], axis=0), options.level)
+        vertical = level_ground(block, np.median([h.xyz for h in found], axis=0), options.ground_m)
         notes.append(vertical.source)
     elif needed and vertical is not None:
         notes.append(f"tilt and height are kept from {vertical.source}")
-    fit = _fit(found, usable, control, vertical if needed else None, options)
-    refused = _gate_fit(fit, control, usable, options)
+    fit = _fit(found, usable, control, vertical if needed else None)
+    refused = _gate_fit(fit, control, usable)
     if refused is not None or fit is None:
-        return refused or _refused("DEGENERATE_LINE", "the control points coincide", {})
+        return refused or GcpPlacement(reason="DEGENERATE_LINE", message="the control points coincide")
     return _adjusted_placement(
         block, control, fit, vertical if needed else None, options, notes, gps_local, gps_sigma_m
     )
 
 
-def _vertical_is_needed(control: Control, usable: list[int], options: GcpOptions) -> bool:
+def level_ground(block: Block, anchor_block: FloatArray, ground_m: tuple[float, float] | None) -> Vertical:
+    """The vertical as the normal of the plane through the block's points, on the cameras' side.
+
+    Args:
+        anchor_block: (3,) where the ground has the height `ground_m`, which comes with its sigma.
+    """
+    normal = _plane_normal(block.xyz)
+    if float((np.median(block.centers(), axis=0) - np.median(block.xyz, axis=0)) @ normal) < 0:
+        normal = -normal
+    height = (
+        "their height is not known at all: the control points are put at height 0"
+        if ground_m is None
+        else f"the control points are put at height {ground_m[0]:g} m, as given"
+    )
+    up_m, sigma_m = ground_m or _ANY_HEIGHT_M
+    return Vertical(
+        up_block=normal,
+        tilt_covariance=np.eye(2) * np.radians(_SIGMA_TILT_DEG) ** 2,
+        anchor_block=anchor_block,
+        anchor_up_m=up_m,
+        sigma_up_m=sigma_m,
+        source="nothing says which way is up, so the ground is taken as level on the whole, to "
+        f"{_SIGMA_TILT_DEG:g} degrees; {height}",
+    )
+
+
+def _plane_normal(points: FloatArray) -> FloatArray:
+    """Unit normal (3,) of the plane through most points (n, 3)."""
+    kept = points
+    for _ in range(5):
+        middle = kept.mean(axis=0)
+        _, axes = np.linalg.eigh(np.cov((kept - middle).T))
+        normal = axes[:, 0]
+        away = np.abs((points - middle) @ normal)
+        kept = points[away <= np.quantile(away, _KEPT_SHARE)]
+    return np.asarray(normal)
+
+
+def _vertical_is_needed(control: Control, usable: list[int]) -> bool:
     """Whether the known heights leave tilt or height open: fewer than three, or three on a line."""
     rows = [i for i in usable if np.isfinite(control.surveyed[i, 2])]
     if len(rows) < 3:
         return True
     spread = np.linalg.svd(control.surveyed[rows] - control.surveyed[rows].mean(axis=0))[1]
-    return bool(spread[1] < options.min_line_ratio * spread[0])
+    return bool(spread[1] < _MIN_LINE_RATIO * spread[0])
 
 
 def _fit(
-    found: list[Hypothesis],
-    usable: list[int],
-    control: Control,
-    vertical: Vertical | None,
-    options: GcpOptions,
+    found: list[Hypothesis], usable: list[int], control: Control, vertical: Vertical | None
 ) -> ControlFit | None:
     """The robust fit over the usable points, its rows being those of `usable`."""
     row = {point: k for k, point in enumerate(usable)}
     renumbered = [replace(h, point=row[h.point]) for h in found]
-    return fit_similarity(renumbered, control.surveyed[usable], vertical, options.fit)
+    return fit_similarity(renumbered, control.surveyed[usable], vertical)
 
 
-def _gate_fit(
-    fit: ControlFit | None, control: Control, usable: list[int], options: GcpOptions
-) -> GcpPlacement | None:
+def _gate_fit(fit: ControlFit | None, control: Control, usable: list[int]) -> GcpPlacement | None:
     surveyed = control.surveyed[usable, :2]
     extent = float(np.linalg.norm(np.ptp(surveyed, axis=0)))
     figures: dict[str, Any] = {"usable_points": len(usable), "extent_m": extent}
     if fit is None or extent <= 0:
-        return _refused(
-            "DEGENERATE_LINE",
-            "the control points, or their places in the photos, coincide or lie along a line",
-            figures,
+        return GcpPlacement(
+            reason="DEGENERATE_LINE",
+            message="the control points, or their places in the photos, coincide or lie along a line",
+            figures=figures,
         )
     share = float(fit.inliers.mean())
     figures |= {"agreeing_share": share, "fit_sigma_m": fit.sigma_m}
-    if (
-        share < options.min_share
-        or fit.inliers.sum() < options.min_points
-        or fit.sigma_m > options.max_sigma_over_extent * extent
-    ):
-        return _refused(
-            "RESIDUALS",
-            f"the control points do not fit the photos: {int(fit.inliers.sum())} of {len(usable)} agree, to "
-            f"{fit.sigma_m:.2f} m over {extent:.0f} m; check the reference system, the order of x and y, the "
-            "units, and that the marks are of these photos",
-            figures,
+    if share < _MIN_SHARE or fit.inliers.sum() < _MIN_POINTS or fit.sigma_m > _MAX_SIGMA_OVER_EXTENT * extent:
+        return GcpPlacement(
+            reason="RESIDUALS",
+            message="the control points do not fit the photos: "
+            f"{int(fit.inliers.sum())} of {len(usable)} agree, to {fit.sigma_m:.2f} m over {extent:.0f} m; "
+            "check the reference system, the order of x and y, the units, and that the marks are of these "
+            "photos",
+            figures=figures,
         )
     return None
 
@@ -226,15 +256,9 @@ def _adjusted_placement(
 ) -> GcpPlacement:
     placed = block.moved(fit.local_from_block)
     local_vertical, free_height_m = _in_place(vertical, fit.local_from_block, control)
-    weights, xyz = initial_weights(placed, control, fit, options.sigma_m, options.test)
-    task = task_of(placed, control, xyz, local_vertical, options.adjust)
-    outcome = improve(
-        control,
-        weights,
-        lambda w, last: adjust(task, w, last),
-        options.sigma_m is not None,
-        options.test,
-    )
+    weights, xyz = initial_weights(placed, control, fit, options.sigma_m)
+    task = task_of(placed, control, xyz, local_vertical, options.keep_lens)
+    outcome = improve(control, weights, lambda w, last: adjust(task, w, last), options.sigma_m is not None)
     adjusted = outcome.adjusted
     points, marks = residuals_of(adjusted, control)
     covariance = _covariance(adjusted, free_height_m, outcome.freedom)
@@ -249,7 +273,7 @@ def _adjusted_placement(
         notes=tuple(notes),
         figures=_figures(fit, outcome, covariance, task, options),
     )
-    return _gate(placement, gps_local, gps_sigma_m, options)
+    return _gate(placement, gps_local, gps_sigma_m)
 
 
 def _in_place(
@@ -296,7 +320,6 @@ def _figures(
         "scale_sigma": float(np.sqrt(covariance[0, 0])),
         "rotation_sigma_deg": np.degrees(np.sqrt(np.diag(covariance)[1:4])).tolist(),
         "heights": "surveyed" if task.vertical is None else "unknown or too few",
-        "options": asdict(options),
     }
     if task.vertical is not None:
         residual = task.vertical.residual(Sim3.identity())
@@ -305,26 +328,23 @@ def _figures(
 
 
 def _gate(
-    placement: GcpPlacement,
-    gps_local: FloatArray | None,
-    gps_sigma_m: tuple[float, float],
-    options: GcpOptions,
+    placement: GcpPlacement, gps_local: FloatArray | None, gps_sigma_m: tuple[float, float]
 ) -> GcpPlacement:
     """The gates that look at the finished placement."""
     figures = dict(placement.figures)
     assert placement.block is not None
-    if figures["points_used"] < options.min_points:
+    if figures["points_used"] < _MIN_POINTS:
         return replace(
             placement,
             reason="RESIDUALS",
             message=f"only {figures['points_used']} control points are left after those that contradict the "
-            f"others; at least {options.min_points} are needed",
+            f"others; at least {_MIN_POINTS} are needed",
         )
-    if figures["scale_sigma"] > options.max_scale_sigma:
+    if figures["scale_sigma"] > _MAX_SCALE_SIGMA:
         return replace(
             placement,
             reason="SCALE",
-            message=f"the scale is known to {figures['scale_sigma']:.1%} only, {options.max_scale_sigma:.0%} "
+            message=f"the scale is known to {figures['scale_sigma']:.1%} only, {_MAX_SCALE_SIGMA:.0%} "
             "is needed: the control points are too close together for their accuracy",
         )
     looks_up = float(np.median([pose.rotation[2, 2] for pose in placement.block.cam_from_block]))
@@ -342,7 +362,7 @@ def _gate(
         found, notes = gps_offset(gps_local, gps_sigma_m, centers, placement.covariance)
         figures |= found
         away = float(np.linalg.norm(figures["gps_offset_m"][:2]))
-        if away > options.max_gps_offset_m + 3.0 * gps_sigma_m[0]:
+        if away > _MAX_GPS_OFFSET_M + 3.0 * gps_sigma_m[0]:
             return replace(
                 placement,
                 reason="CONTRADICTS_GPS",
@@ -351,17 +371,3 @@ def _gate(
                 figures=figures,
             )
     return replace(placement, figures=figures, notes=(*placement.notes, *notes))
-
-
-def _refused(reason: GcpReason, message: str, figures: dict[str, Any]) -> GcpPlacement:
-    return GcpPlacement(
-        reason=reason,
-        message=message,
-        local_from_block=None,
-        covariance=None,
-        block=None,
-        points=(),
-        marks=(),
-        notes=(),
-        figures=figures,
-    )

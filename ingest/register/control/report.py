@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from featuredb.geometry.arrays import FloatArray
 from ingest.html_parts import note, page, picture, table
 from ingest.plot_parts import nice_length, png_bytes, residual_exaggeration
-from ingest.register.control.evidence import remarks
+from ingest.register.control.maps import remarks
 from ingest.register.control.marks import Control
 from ingest.register.control.placement import GcpPlacement
 from ingest.workspace import atomic_file, write_json

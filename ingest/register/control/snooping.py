@@ -25,31 +25,18 @@ _LOG = logging.getLogger(__name__)
 _SETTLED = 0.01  # relative change of the sigma, whose own uncertainty is tens of per cent
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TestOptions:
-    """Tests of marks and points.
-
-    Attributes:
-        significance: chance of naming a good observation as wrong, over the whole file.
-        readmission: chance above which a point that was left out comes back; well above the former, so
-            that none goes back and forth.
-        min_mark_px: marks nearer than that are not called wrong: people mark to one to three pixels.
-        min_point_m: the same for points; better surveys are rare.
-        max_mark_px: marks within that take part from the start.
-        start_mark_px: standard deviation of marks before they have been compared.
-        min_mark_sigma_px, min_control_sigma_m: below, agreement is luck.
-        max_rounds: of adjusting and testing.
-    """
-
-    significance: float = 0.01
-    readmission: float = 0.05
-    min_mark_px: float = 5.0
-    min_point_m: float = 0.05
-    max_mark_px: float = 12.0
-    start_mark_px: float = 1.0
-    min_mark_sigma_px: float = 0.3
-    min_control_sigma_m: float = 0.005
-    max_rounds: int = 12
+_SIGNIFICANCE = 0.01  # chance of naming a good observation as wrong, over the whole file
+# Chance above which a point that was left out comes back; well above the former, so that none goes back and
+# forth.
+_READMISSION = 0.05
+_MIN_MARK_PX = 5.0  # marks nearer than that are not called wrong: people mark to one to three pixels
+_MIN_POINT_M = 0.05  # the same for points; better surveys are rare
+_MAX_MARK_PX = 12.0  # marks within that take part from the start
+_START_MARK_PX = 1.0  # standard deviation of marks before they have been compared
+# Below, agreement is luck.
+_MIN_MARK_SIGMA_PX = 0.3
+_MIN_CONTROL_SIGMA_M = 0.005
+_MAX_ROUNDS = 12  # of adjusting and testing
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,11 +54,7 @@ class Outcome:
 
 
 def initial_weights(
-    placed: Block,
-    control: Control,
-    fit: ControlFit,
-    sigma_m: tuple[float, float] | None,
-    options: TestOptions,
+    placed: Block, control: Control, fit: ControlFit, sigma_m: tuple[float, float] | None
 ) -> tuple[Weights, FloatArray]:
     """What takes part at first, and where the control points lie in the placed block."""
     count = len(control.names)
@@ -82,15 +65,13 @@ def initial_weights(
         point = control.point_of[hypothesis.marks[0]]
         rows = control.marks_of(int(point))
         xyz[point] = fit.local_from_block.act(hypothesis.xyz)
-        near = (
-            mark_errors(placed, control.photo_of[rows], control.xy[rows], xyz[point]) <= options.max_mark_px
-        )
+        near = mark_errors(placed, control.photo_of[rows], control.xy[rows], xyz[point]) <= _MAX_MARK_PX
         near |= np.isin(rows, hypothesis.marks)
         points[point] = inlier
         marks[rows] = near
     horizontal, vertical = sigma_m or (fit.sigma_m, fit.sigma_m)
     weights = Weights(
-        mark_px=options.start_mark_px,
+        mark_px=_START_MARK_PX,
         control_m=np.array([horizontal, horizontal, vertical]),
         marks=marks,
         points=points,
@@ -103,22 +84,21 @@ def improve(
     weights: Weights,
     solve: Callable[[Weights, Adjusted | None], Adjusted],
     sigma_is_given: bool,
-    options: TestOptions,
 ) -> Outcome:
     """Adjust, estimate the sigmas, leave out the worst contradiction, until there is none."""
     rounds, adjusted = 0, None
     while True:
         adjusted = solve(weights, adjusted)
         rounds += 1
-        control_m, freedom = _control_sigma(adjusted, control, options)
+        control_m, freedom = _control_sigma(adjusted, control)
         tested = replace(
-            _tested(adjusted, control, freedom, options),
-            mark_px=_mark_sigma(adjusted, options),
+            _tested(adjusted, control, freedom),
+            mark_px=_mark_sigma(adjusted),
             control_m=weights.control_m if sigma_is_given else control_m,
         )
         settled = np.allclose(tested.control_m, weights.control_m, rtol=_SETTLED)
         unchanged = (tested.marks == weights.marks).all() and (tested.points == weights.points).all()
-        if (settled and unchanged) or rounds >= options.max_rounds:
+        if (settled and unchanged) or rounds >= _MAX_ROUNDS:
             return Outcome(adjusted=adjusted, freedom=freedom, rounds=rounds)
         weights = tested
         _LOG.info("round %d: control sigma %s m", rounds, weights.control_m)
@@ -147,13 +127,13 @@ def chance_of(residuals: Whitened, rows: NDArray[np.int64]) -> tuple[FloatArray,
     return alone, float(f_distribution.sf(statistic / variance, len(rows), freedom))
 
 
-def _mark_sigma(adjusted: Adjusted, options: TestOptions) -> float:
+def _mark_sigma(adjusted: Adjusted) -> float:
     redundancy = float(np.trace(adjusted.marks.covariance, axis1=1, axis2=2).sum())
     factor = float((adjusted.marks.residual**2).sum()) / max(redundancy, 1.0)
-    return float(max(adjusted.weights.mark_px * factor**0.5, options.min_mark_sigma_px))
+    return float(max(adjusted.weights.mark_px * factor**0.5, _MIN_MARK_SIGMA_PX))
 
 
-def _control_sigma(adjusted: Adjusted, control: Control, options: TestOptions) -> tuple[FloatArray, float]:
+def _control_sigma(adjusted: Adjusted, control: Control) -> tuple[FloatArray, float]:
     """(3,) standard deviation of surveyed coordinates, and their degrees of freedom."""
     used = np.isfinite(control.surveyed) & adjusted.weights.points[:, None]
     shares = np.einsum("nii->ni", adjusted.survey.covariance)
@@ -165,34 +145,34 @@ def _control_sigma(adjusted: Adjusted, control: Control, options: TestOptions) -
         # Few residuals of one kind say little about it: all kinds together then.
         chosen = columns if own >= 3.0 else slice(0, 3)
         total = max(float(redundancy[:, chosen].sum()), 1.0)
-        return float(max((float(squared[:, chosen].sum()) / total) ** 0.5, options.min_control_sigma_m))
+        return float(max((float(squared[:, chosen].sum()) / total) ** 0.5, _MIN_CONTROL_SIGMA_M))
 
     horizontal, vertical = sigma(slice(0, 2)), sigma(slice(2, 3))
     return np.array([horizontal, horizontal, vertical]), float(redundancy.sum())
 
 
-def _tested(adjusted: Adjusted, control: Control, freedom: float, options: TestOptions) -> Weights:
+def _tested(adjusted: Adjusted, control: Control, freedom: float) -> Weights:
     """The weights without the worst contradiction; marks and points that turn out to fit come back."""
     weights = adjusted.weights
     marks, points = weights.marks.copy(), weights.points.copy()
     errors = np.linalg.norm(mark_residuals(adjusted.block, control, adjusted.control_xyz), axis=1)
-    marks |= errors <= options.min_mark_px
-    points |= _fitting(adjusted, control, freedom, options)
+    marks |= errors <= _MIN_MARK_PX
+    points |= _fitting(adjusted, control, freedom)
     if (marks != weights.marks).any() or (points != weights.points).any():
         return replace(weights, marks=marks, points=points)
-    mark = _worst_mark(adjusted, options)
+    mark = _worst_mark(adjusted)
     if mark is not None:
         marks[mark] = False
         point = int(control.point_of[mark])
         points[point] &= marks[control.marks_of(point)].any()
         return replace(weights, marks=marks, points=points)
-    worst = _worst_point(adjusted, control, options)
+    worst = _worst_point(adjusted, control)
     if worst is not None:
         points[worst] = False
     return replace(weights, points=points)
 
 
-def _fitting(adjusted: Adjusted, control: Control, freedom: float, options: TestOptions) -> NDArray[np.bool_]:
+def _fitting(adjusted: Adjusted, control: Control, freedom: float) -> NDArray[np.bool_]:
     """(n,) points that took no part, and fit the others well."""
     weights = adjusted.weights
     fitting = np.zeros(len(control.names), dtype=bool)
@@ -202,32 +182,32 @@ def _fitting(adjusted: Adjusted, control: Control, freedom: float, options: Test
         variance = np.diag(weights.control_m[known] ** 2) + adjusted.spread[point][np.ix_(known, known)]
         statistic, axes = float(rest @ np.linalg.solve(variance, rest)), int(known.sum())
         chance = float(f_distribution.sf(statistic / axes, axes, max(freedom, 1.0)))
-        fitting[point] = chance > options.readmission or np.linalg.norm(rest) <= options.min_point_m
+        fitting[point] = chance > _READMISSION or np.linalg.norm(rest) <= _MIN_POINT_M
     return fitting
 
 
-def _worst_mark(adjusted: Adjusted, options: TestOptions) -> int | None:
+def _worst_mark(adjusted: Adjusted) -> int | None:
     rows = np.flatnonzero(adjusted.weights.marks)
     residuals = adjusted.marks.of(np.ones((len(rows), 2), dtype=bool))
     tests = []
     for k, row in enumerate(rows.tolist()):
         alone, chance = chance_of(residuals, 2 * k + np.arange(2))
-        if adjusted.weights.mark_px * float(np.linalg.norm(alone)) > options.min_mark_px:
+        if adjusted.weights.mark_px * float(np.linalg.norm(alone)) > _MIN_MARK_PX:
             tests.append((chance, row))
-    return _least(tests, len(rows), options)
+    return _least(tests, len(rows))
 
 
-def _worst_point(adjusted: Adjusted, control: Control, options: TestOptions) -> int | None:
+def _worst_point(adjusted: Adjusted, control: Control) -> int | None:
     rows = np.flatnonzero(adjusted.weights.points)
     tests = []
     for point in rows.tolist():
         residual, chance = left_out(adjusted, control, point)
-        if float(np.linalg.norm(residual)) > options.min_point_m:
+        if float(np.linalg.norm(residual)) > _MIN_POINT_M:
             tests.append((chance, point))
-    return _least(tests, len(rows), options)
+    return _least(tests, len(rows))
 
 
-def _least(tests: list[tuple[float, int]], count: int, options: TestOptions) -> int | None:
+def _least(tests: list[tuple[float, int]], count: int) -> int | None:
     """The row of the least chance, where it is too small for so many tests."""
     chance, row = min(tests, default=(1.0, -1))
-    return row if chance < options.significance / count else None
+    return row if chance < _SIGNIFICANCE / count else None

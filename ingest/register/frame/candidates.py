@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
 from ingest.register.frame.dense.confirmation import PictureConfirmation
-from ingest.register.frame.dense.hypotheses import (
+from ingest.register.frame.dense.fit import (
     confirmed,
     dense_fitted,
     dense_hypotheses,
@@ -23,10 +23,24 @@ from ingest.register.frame.features.search import (
     search,
     star_groups,
 )
-from ingest.register.frame.options import FrameOptions
 from ingest.register.frame.prior_fit import loosened
-from ingest.register.frame.views import FrameViews
+from ingest.register.frame.verdict import MIN_CONFIRMATION_PIECES, MIN_JOINT_LOG_NFA
+from ingest.register.frame.views import FULL_CIRCLE_SIGMA_DEG, FrameViews
 from ingest.register.frame_registration import FramePrior, RenderSource
+
+_MIN_LOG_NFA = 2.0  # a pose with less evidence among the features' matches is not looked into
+_DECISIVE_LOG_NFA = 60.0  # one with so much, if the pictures confirm it, ends the search
+# And so does one that the pictures confirm so strongly. Three of four right poses do; wrong ones reached 8.
+_SURE_CONFIRMATION_LOG_NFA = 20.0
+# A pose of the dense search with less evidence of the pictures is not fitted. Before the fit right ones had
+# 0.6 and more, of those at wrong places one in ten.
+_PROMISING_LOG_NFA = 0.5
+# So many times at most the best pose is searched and fitted again, where it is not confirmed, but has that
+# much evidence.
+_MORE_LOOKS = 2
+# First radius around a predicted place in which a match is looked for, share of the longer side; the second
+# is a third of it.
+_GUIDED_RADIUS_REL = 0.012
 
 _GUIDED_ROUNDS = 2
 
@@ -41,23 +55,22 @@ class Judged:
 
 def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> Judged | None:
     """The first pose that is beyond doubt, or of all found the one that the pictures confirm most."""
-    options = views.options
     judged: list[Judged] = []
-    loose = loosened(prior, options.prior_slack)
+    loose = loosened(prior)
     for start in _starts(views, prior, clock):
         with clock.stage("compare sources"):
             begun = by_agreement(views, start)
-        if start.kind == "dense" and begun.confirmation.log_nfa < options.promising_log_nfa:
+        if start.kind == "dense" and begun.confirmation.log_nfa < _PROMISING_LOG_NFA:
             continue
         judged.append(polished(views, loose, begun.found, clock))
         confirmation = judged[-1].confirmation
         # Decisive features stand alone where the pictures have too little to compare.
-        silent = confirmation.pieces < options.verdict.min_confirmation_pieces
-        if start.log_nfa >= options.decisive_log_nfa and (confirmation.confirmed or silent):
+        silent = confirmation.pieces < MIN_CONFIRMATION_PIECES
+        if start.log_nfa >= _DECISIVE_LOG_NFA and (confirmation.confirmed or silent):
             return judged[-1]
         joint = start.log_nfa + confirmation.log_nfa
-        sure = confirmation.log_nfa >= options.sure_confirmation_log_nfa
-        if confirmation.confirmed and (sure or joint >= options.verdict.min_joint_log_nfa):
+        sure = confirmation.log_nfa >= _SURE_CONFIRMATION_LOG_NFA
+        if confirmation.confirmed and (sure or joint >= MIN_JOINT_LOG_NFA):
             return judged[-1]
     best = max(judged, key=lambda j: j.confirmation.log_nfa, default=None)
     return best and _looked_again(views, prior, best, clock)
@@ -65,15 +78,15 @@ def best_candidate(views: FrameViews, prior: FramePrior, clock: StageClock) -> J
 
 def _looked_again(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> Judged:
     """A pose that is nearly confirmed, searched and fitted in turns: each leaves the other's dead ends."""
-    options, best, start = views.options, judged, judged.found
-    for _ in range(options.more_looks):
-        if best.confirmation.confirmed or best.confirmation.log_nfa < options.promising_log_nfa:
+    best, start = judged, judged.found
+    for _ in range(_MORE_LOOKS):
+        if best.confirmation.confirmed or best.confirmation.log_nfa < _PROMISING_LOG_NFA:
             break
         with clock.stage("look again"):
             near = searched_again(views, prior, start)
         if near is None:
             break
-        again = polished(views, loosened(prior, options.prior_slack), near, clock)
+        again = polished(views, loosened(prior), near, clock)
         best, start = max(best, again, key=lambda j: j.confirmation.log_nfa), again.found
     return best
 
@@ -90,27 +103,22 @@ def available_sources(cloud: PointCloud) -> tuple[RenderSource, ...]:
 
 def _starts(views: FrameViews, prior: FramePrior, clock: StageClock) -> Iterator[FrameHypothesis]:
     """Poses to begin with, made as they are asked for: by source, features first, then dense templates."""
-    options = views.options
     with clock.stage("render star"):
         star = star_groups(views, prior)
     fan: list[RenderGroup] | None = None
-    for source in _searched(_sources(views)):
-        for upright in _kinds(prior, options):
+    for source in _searched(available_sources(views.cloud)):
+        for upright in _kinds(prior):
             if upright and fan is None:
                 with clock.stage("render fan"):
                     fan = fan_groups(views, prior)
             groups = [*star, *(fan or [])] if upright else star
             with clock.stage(f"search {source} {'upright' if upright else 'oriented'}"):
                 found = search(views, groups, source, upright)
-            if found is not None and found.log_nfa >= options.min_log_nfa:
+            if found is not None and found.log_nfa >= _MIN_LOG_NFA:
                 yield found
         with clock.stage(f"search {source} dense"):
             dense = dense_hypotheses(views, prior, source)
         yield from dense
-
-
-def _sources(views: FrameViews) -> tuple[RenderSource, ...]:
-    return views.options.sources or available_sources(views.cloud)
 
 
 def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
@@ -124,12 +132,14 @@ def _searched(sources: tuple[RenderSource, ...]) -> tuple[RenderSource, ...]:
 def by_agreement(views: FrameViews, found: FrameHypothesis) -> Judged:
     """The pose with the source that agrees best with the photo there, whichever it was found by."""
     own = Judged(found=found, confirmation=confirmed(views, found))
-    if found.log_nfa >= views.options.decisive_log_nfa:
+    if found.log_nfa >= _DECISIVE_LOG_NFA:
         return own
-    others = [replace(found, source=source) for source in _sources(views) if source != found.source]
+    others = [
+        replace(found, source=source) for source in available_sources(views.cloud) if source != found.source
+    ]
     judged = [own, *(Judged(found=other, confirmation=confirmed(views, other)) for other in others)]
     # Relief shows what stands and nothing of the ground: it is asked instead of others only beyond doubt.
-    sure = views.options.sure_confirmation_log_nfa
+    sure = _SURE_CONFIRMATION_LOG_NFA
     heard = [j for j in judged if j is own or j.found.source != "shaded" or j.confirmation.log_nfa >= sure]
     return max(heard, key=lambda j: j.confirmation.log_nfa)
 
@@ -149,16 +159,16 @@ def polished(views: FrameViews, prior: FramePrior, found: FrameHypothesis, clock
 def _guided(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis:
     side = max(views.camera.width, views.camera.height)
     for turn in range(_GUIDED_ROUNDS):
-        better = guided(views, prior, found, views.options.guided_radius_rel * side / 3.0**turn)
+        better = guided(views, prior, found, _GUIDED_RADIUS_REL * side / 3.0**turn)
         if better is None:
             break
         found = better
     return found
 
 
-def _kinds(prior: FramePrior, options: FrameOptions) -> tuple[bool, ...]:
+def _kinds(prior: FramePrior) -> tuple[bool, ...]:
     """Upright features first where the heading is known; without, those with orientation cost less."""
-    unknown = prior.sigma_heading_deg >= options.star.full_circle_sigma_deg
+    unknown = prior.sigma_heading_deg >= FULL_CIRCLE_SIGMA_DEG
     if not unknown:
         return (True, False)
     return (False, True) if oriented_features_suffice(prior) else (True,)

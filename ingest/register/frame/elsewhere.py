@@ -7,7 +7,7 @@ place can have.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from ingest.register.frame.dense.confirmation import confirm_pose
-from ingest.register.frame.dense.search import DenseOptions, register_dense
-from ingest.register.frame.features.star import turned_about_vertical
-from ingest.register.frame.views import FrameViews, first_look
+from ingest.register.frame.dense.search import REACH_SIGMA, register_dense
+from ingest.register.frame.views import FrameViews, first_look, turned_about_vertical
 from ingest.register.frame_registration import FramePrior, RenderSource
 
 _FINALISTS = 3  # as in the search at the photo's own place
@@ -27,19 +26,6 @@ _MIN_COVER = 0.5  # of what the photo's own prior sees; over less there is less 
 _KNOWN_HEADING_DEG = 30.0  # with a heading so sure a photo is not upside down
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Elsewhere:
-    """The strongest agreement at wrong places.
-
-    Attributes:
-        places: how many were searched.
-        log_nfa: largest evidence among them, in the measure of `confirmation`; 0 where nothing was found.
-    """
-
-    places: int
-    log_nfa: float
-
-
 def agreement_elsewhere(
     views: FrameViews,
     prior: FramePrior,
@@ -47,8 +33,11 @@ def agreement_elsewhere(
     source: RenderSource,
     max_places: int,
     enough: float,
-) -> Elsewhere:
-    """Searches the photo beside `pose`, at no more than `max_places` places, until `enough` is reached."""
+) -> tuple[int, float]:
+    """The strongest agreement at wrong places: how many were searched, and the largest evidence (0 for none).
+
+    Searches the photo beside `pose`, at no more than `max_places` places, until `enough` is reached.
+    """
     most, count = 0.0, 0
     for other in _priors_beside(views, prior, pose):
         if count == max_places or most >= enough:
@@ -63,14 +52,12 @@ def agreement_elsewhere(
                 views.gray, views.camera, there, views.cloud, source, views.options.confirm
             )
             most = max(most, agreement.log_nfa)
-    return Elsewhere(places=count, log_nfa=most)
+    return count, most
 
 
 def _priors_beside(views: FrameViews, prior: FramePrior, pose: Rigid3) -> Iterator[FramePrior]:
     """The prior moved out of reach of the pose, to four sides, and turned round, where the scan is seen."""
-    reach = DenseOptions().reach_sigma * (
-        prior.sigma_horizontal_m + views.look.depth_m * np.radians(prior.sigma_tilt_deg)
-    )
+    reach = REACH_SIGMA * (prior.sigma_horizontal_m + views.look.depth_m * np.radians(prior.sigma_tilt_deg))
     right = np.array([*prior.cam_from_local.rotation[0, :2], 0.0])
     right = np.array([1.0, 0.0, 0.0]) if np.linalg.norm(right) < 0.1 else right / np.linalg.norm(right)
     ahead = np.array([-right[1], right[0], 0.0])

@@ -21,6 +21,10 @@ from reloc.localise.pose import PoseHypothesis, reprojection_errors
 
 _ROUNDS = 5  # Gauss-Newton; a step of 50 m and 3 degrees leaves a metre to the next
 _MIN_MATCHES = 6
+# In the fit the prior's deviations count so many times as large. People and devices understate them, and what
+# matches leave open stays well within what the verdict bears.
+_PRIOR_SLACK = 2.0
+CORRELATED_INLIERS = 4.0  # so many count as one measurement, by the errors of photos of the simulated town
 
 
 def prior_residual(pose: Rigid3, prior: FramePrior) -> FloatArray:
@@ -49,14 +53,14 @@ def prior_sigmas(prior: FramePrior, pose: Rigid3) -> float:
     return float(np.linalg.norm(prior_residual(pose, prior)))
 
 
-def loosened(prior: FramePrior, factor: float) -> FramePrior:
-    """The prior with deviations so many times as large; a heading that was unknown stays unknown."""
+def loosened(prior: FramePrior) -> FramePrior:
+    """The prior with deviations as the fit takes them; a heading that was unknown stays unknown."""
     return replace(
         prior,
-        sigma_horizontal_m=factor * prior.sigma_horizontal_m,
-        sigma_vertical_m=factor * prior.sigma_vertical_m,
-        sigma_heading_deg=factor * prior.sigma_heading_deg,
-        sigma_tilt_deg=factor * prior.sigma_tilt_deg,
+        sigma_horizontal_m=_PRIOR_SLACK * prior.sigma_horizontal_m,
+        sigma_vertical_m=_PRIOR_SLACK * prior.sigma_vertical_m,
+        sigma_heading_deg=_PRIOR_SLACK * prior.sigma_heading_deg,
+        sigma_tilt_deg=_PRIOR_SLACK * prior.sigma_tilt_deg,
     )
 
 
@@ -71,12 +75,11 @@ def fitted_under_prior(
     pose: PoseHypothesis,
     prior: FramePrior,
     options: PoseOptions,
-    correlated: float,
 ) -> PoseHypothesis:
     """The most likely pose next to `pose`, given matches with Cauchy residuals and the prior.
 
     Args:
-        options: of the fit that `pose` comes from. correlated: so many matches count as one.
+        options: of the fit that `pose` comes from.
 
     Returns:
         `pose` itself where the matches are few.
@@ -89,7 +92,7 @@ def fitted_under_prior(
         found = _information(matches, pose.camera, here, tolerance_px)
         if found is None:
             return pose
-        information, pull = (part / correlated for part in found)
+        information, pull = (part / CORRELATED_INLIERS for part in found)
         slopes = _prior_slopes(here, prior)
         information += slopes.T @ slopes
         pull += slopes.T @ prior_residual(here, prior)

@@ -1,6 +1,7 @@
 """One photo registered to a scan, from a coarse prior (paper, section 2.3: building block B)."""
 
 from dataclasses import asdict, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,29 +10,32 @@ from numpy.typing import NDArray
 from featuredb.errors import ImageError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.stage_clock import StageClock
-from ingest.register.frame.candidates import Judged, best_candidate
+from ingest.register.frame.candidates import Judged, best_candidate, by_agreement, polished
 from ingest.register.frame.elsewhere import agreement_elsewhere
-from ingest.register.frame.features.search import FrameHypothesis, pose_options
+from ingest.register.frame.features.search import FrameHypothesis, pose_options, unmatched
 from ingest.register.frame.options import FrameOptions
-from ingest.register.frame.prior_fit import loosened, prior_sigmas
-from ingest.register.frame.uncertainty import frame_covariance
+from ingest.register.frame.prior_fit import CORRELATED_INLIERS, loosened, prior_information, prior_sigmas
 from ingest.register.frame.verdict import (
+    MAX_PLACES_ELSEWHERE,
+    MIN_COVER,
+    MIN_INLIERS,
     FrameEvidence,
     asks_elsewhere,
     cells_with_inliers,
     highest_elsewhere,
     verdict,
 )
-from ingest.register.frame.views import FrameViews, first_look
-from ingest.register.frame_registration import (
-    FramePrior,
-    FrameReason,
-    FrameRegistration,
-)
+from ingest.register.frame.views import MIN_SIDE_PX, FrameViews, first_look
+from ingest.register.frame_registration import FramePrior, FrameReason, FrameRegistration, RenderSource
+from reloc.localise.pose import pose_uncertainty
 
 _MIN_FOR_COVARIANCE = 6  # twice the least that determines a pose
+# Standard deviation of what all inliers share, as a share of the scan's spacing; by photos of the simulated
+# town.
+_SHARED_POINT_SHARE = 0.1
 
 
 def register_frame(
@@ -56,33 +60,78 @@ def register_frame(
     options = options or FrameOptions()
     clock = StageClock()
     gray = _gray(image, camera)
-    with clock.stage("look"):
-        look = first_look(cloud, camera, prior)
-    if look is None or look.cover < options.verdict.min_cover:
-        cover = 0.0 if look is None else look.cover
-        return _refused(
-            "NO_SCAN",
-            f"the scan covers {100 * cover:.0f} % of what the prior sees; is it of this place?",
-            {"cover": cover},
-            clock,
-        )
-    views = FrameViews(gray, camera, cloud, look, options)
+    views = _views(gray, camera, prior, cloud, options, clock)
+    if isinstance(views, FrameRegistration):
+        return views
     judged = best_candidate(views, prior, clock)
     if judged is None:
         return _refused("NO_CONSISTENT_POSE", "no pose has matches behind it", {}, clock)
     return _verdict(views, prior, judged, clock)
 
 
+def fit_near(
+    gray: NDArray[np.uint8],
+    camera: Camera,
+    prior: FramePrior,
+    cloud: PointCloud,
+    source: RenderSource,
+    options: FrameOptions,
+) -> FrameRegistration:
+    """Fit the pose of a frame (h, w) from one that is right to some pixels; nothing is searched for.
+
+    For the frames of a film that is followed. The pose found is shown to the pictures as any other is.
+
+    Args:
+        prior: the pose to start from, with how far it may be off.
+        source: of the frames before, with which this one is compared first.
+    """
+    clock = StageClock()
+    views = _views(gray, camera, prior, cloud, options, clock)
+    if isinstance(views, FrameRegistration):
+        return views
+    start, loose = unmatched(prior.cam_from_local, camera, source, "oriented"), loosened(prior)
+    judged = polished(views, loose, start, clock)
+    if not judged.confirmation.confirmed:
+        # Other light, other seasons: what agreed for the frames before need not for this one.
+        other = by_agreement(views, replace(start, kind="dense"))
+        judged = polished(views, loose, other.found, clock)
+    found, confirmation = judged.found, judged.confirmation
+    if not confirmation.confirmed:
+        return _refused("NOT_CONFIRMED", confirmation.message, {}, clock)
+    if len(found.inliers) < MIN_INLIERS:
+        words = f"{len(found.inliers)} independent inliers, {MIN_INLIERS} needed"
+        return _refused("TOO_FEW_MATCHES", words, {}, clock)
+    return _accepted(found, frame_covariance(views, prior, found), {}, clock)
+
+
+def _views(
+    gray: NDArray[np.uint8],
+    camera: Camera,
+    prior: FramePrior,
+    cloud: PointCloud,
+    options: FrameOptions,
+    clock: StageClock,
+) -> FrameViews | FrameRegistration:
+    """Photo and scan, or the refusal where the scan is not in view."""
+    with clock.stage("look"):
+        look = first_look(cloud, camera, prior)
+    if look is not None and look.cover >= MIN_COVER:
+        return FrameViews(gray, camera, cloud, look, options)
+    cover = 0.0 if look is None else look.cover
+    words = f"the scan covers {100 * cover:.0f} % of what the prior sees; is it of this place?"
+    return _refused("NO_SCAN", words, {"cover": cover}, clock)
+
+
 def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageClock) -> FrameRegistration:
-    options, found = views.options, judged.found
+    found = judged.found
     with clock.stage("verdict"):
-        covariance = _covariance(views, prior, found)
+        covariance = frame_covariance(views, prior, found)
         evidence = _evidence(views, prior, judged, covariance)
-    if asks_elsewhere(evidence, options.verdict):
+    if asks_elsewhere(evidence):
         with clock.stage("search elsewhere"):
             evidence = _compared(views, prior, judged, evidence)
     with clock.stage("verdict"):
-        refusal = verdict(evidence, options.verdict)
+        refusal = verdict(evidence)
     figures = asdict(evidence) | {
         "matched_by": found.kind,
         "confirmation": asdict(judged.confirmation),
@@ -93,36 +142,37 @@ def _verdict(views: FrameViews, prior: FramePrior, judged: Judged, clock: StageC
     }
     if refusal is not None:
         return _refused(*refusal, figures, clock)
-    return FrameRegistration(
-        cam_from_local=found.pose.cam_from_local,
-        covariance=covariance,
-        reason=None,
-        message="",
-        source=found.source,
-        camera=found.pose.camera,
-        points_local=found.inliers.points,
-        pixels=found.inliers.pixels,
-        evidence=figures,
-        seconds=clock.seconds,
-    )
+    return _accepted(found, covariance, figures, clock)
 
 
-def _covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FloatArray | None:
-    """None where too few matches stand behind the pose to say."""
-    options = views.options
+def frame_covariance(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FloatArray | None:
+    """Covariance (6, 6) of the left perturbation of cam_from_local; None where too few matches tell it.
+
+    Residuals of neighbouring correspondences are not independent: they come from one render of one scan. So
+    `CORRELATED_INLIERS` of them count as one. What all share, a shift of the whole scan's appearance by a
+    part of its point spacing, shows in no residual and is added to the position.
+    """
     if len(found.inliers) < _MIN_FOR_COVARIANCE:
         return None
-    return frame_covariance(
-        found.inliers.pixels,
-        found.inliers.points,
-        found.pose,
-        views.look.spacing_m,
-        views.look.depth_m,
-        pose_options(views),
-        options.correlated_inliers,
-        options.shared_point_share,
-        loosened(prior, options.prior_slack),
-    )
+    pixels, points, look = found.inliers.pixels, found.inliers.points, views.look
+    spread = (0.3 * look.spacing_m) ** 2 * np.eye(3)  # a point stands for a cell of its spacing
+    spreads = np.broadcast_to(spread, (len(points), 3, 3))
+    covariance = pose_uncertainty(pixels, points, spreads, found.pose, pose_options(views)).covariance
+    shared = (_SHARED_POINT_SHARE * look.spacing_m) ** 2
+    covariance = CORRELATED_INLIERS * covariance + np.diag([shared / look.depth_m**2] * 3 + [shared] * 3)
+    pose = found.pose.cam_from_local
+    information = np.linalg.inv(covariance) + prior_information(pose, loosened(prior))
+    return left_perturbation(np.asarray(np.linalg.inv(information), dtype=np.float64), pose)
+
+
+def left_perturbation(covariance: FloatArray, cam_from_local: Rigid3) -> FloatArray:
+    """From small rotations of the camera about local axes and displacements of its centre.
+
+    With R_wc' = exp(dtheta) R_wc and C' = C + dC: cam_from_local' = exp(-R dtheta, -R dC) cam_from_local.
+    """
+    turn = np.kron(np.eye(2), -cam_from_local.rotation)
+    result = turn @ covariance @ turn.T
+    return np.asarray((result + result.T) / 2.0, dtype=np.float64)
 
 
 def _evidence(
@@ -130,7 +180,7 @@ def _evidence(
 ) -> FrameEvidence:
     found, confirmation = judged.found, judged.confirmation
     cells, agreement = 0, 0.0
-    renderings = views.renders([found.pose.cam_from_local], views.options.min_side_px)
+    renderings = views.renders([found.pose.cam_from_local], MIN_SIDE_PX)
     if renderings:
         cells, agreement = cells_with_inliers(found.inliers.pixels, renderings[0].valid, views.camera)
     share = np.inf
@@ -155,16 +205,28 @@ def _evidence(
 
 def _compared(views: FrameViews, prior: FramePrior, judged: Judged, evidence: FrameEvidence) -> FrameEvidence:
     """With how well the photo agrees with the scan at places where it cannot be."""
-    options, found = views.options.verdict, judged.found
-    elsewhere = agreement_elsewhere(
-        views,
-        prior,
-        found.pose.cam_from_local,
-        found.source,
-        options.max_places_elsewhere,
-        highest_elsewhere(evidence.confirmation_log_nfa, options),
+    pose, enough = judged.found.pose.cam_from_local, highest_elsewhere(evidence.confirmation_log_nfa)
+    places, log_nfa = agreement_elsewhere(
+        views, prior, pose, judged.found.source, MAX_PLACES_ELSEWHERE, enough
     )
-    return replace(evidence, places_elsewhere=elsewhere.places, elsewhere_log_nfa=elsewhere.log_nfa)
+    return replace(evidence, places_elsewhere=places, elsewhere_log_nfa=log_nfa)
+
+
+def _accepted(
+    found: FrameHypothesis, covariance: FloatArray | None, evidence: dict[str, Any], clock: StageClock
+) -> FrameRegistration:
+    return FrameRegistration(
+        cam_from_local=found.pose.cam_from_local,
+        covariance=covariance,
+        reason=None,
+        message="",
+        source=found.source,
+        camera=found.pose.camera,
+        points_local=found.inliers.points,
+        pixels=found.inliers.pixels,
+        evidence=evidence,
+        seconds=clock.seconds,
+    )
 
 
 def _refused(

@@ -10,53 +10,40 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from ingest.register.frame_registration import FrameReason
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class VerdictOptions:
-    """Where the line is, by right and wrong registrations of the simulated town (docs/registration.md).
-
-    Attributes:
-        min_cover: smallest share of a render that shows the scan.
-        min_inliers: fewer independent inliers are never believed.
-        min_agreement: smallest share of the parts of the photo where the scan should be seen that hold
-            inliers.
-        min_cells: and the smallest number of such parts, of a hundred: a pose needs width.
-        min_log_nfa_alone: features with that much evidence among their unguided matches need no confirmation
-            where the pictures have fewer than `min_confirmation_pieces` pieces to compare.
-        min_confirmation_log_nfa: evidence of the pictures with which a pose needs no features. It is the best
-            of very many that were tried, and towns resemble each other: of 20 photos of another town the
-            strongest reached 14.3.
-        min_joint_log_nfa: or evidence of features and pictures together; features spoke for none of the wrong
-            poses that were measured.
-        min_confirmation_ratio: with less, it must be so many times what the photo reaches at places of the
-            scan where it cannot be (`elsewhere`), of which max_places_elsewhere are tried and
-            min_places_elsewhere must be there. Right poses had 10 times as much and more, those of photos of
-            another town up to 3 times as much with all places tried, but up to 5 with three.
-        min_weighed_log_nfa: and so much evidence with the prior counted in (`weighed_log_nfa`): what the
-            pictures must say anyway. Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at
-            4.7 deviations from the prior, which leaves 4.3; right poses had 5.3 and more.
-        rival_share: a pose elsewhere with this share of the inliers makes the registration ambiguous.
-        max_prior_sigmas: largest distance from the prior, in its own standard deviations over all six
-            axes together. Generous: people and devices understate their errors.
-        max_position_sigma_share: largest standard deviation of the position, as a share of the distance to
-            what is seen; above it the geometry does not determine the pose.
-    """
-
-    min_cover: float = 0.03
-    min_inliers: int = 20
-    min_agreement: float = 0.2
-    min_cells: int = 6
-    min_log_nfa_alone: float = 60.0
-    min_confirmation_pieces: int = 25
-    min_confirmation_log_nfa: float = 20.0
-    min_joint_log_nfa: float = 30.0
-    min_confirmation_ratio: float = 6.0
-    max_places_elsewhere: int = 5
-    min_places_elsewhere: int = 1
-    min_weighed_log_nfa: float = 5.0
-    rival_share: float = 0.5
-    max_prior_sigmas: float = 6.0
-    max_position_sigma_share: float = 0.05
+# Where the line is, by right and wrong registrations of the simulated town (docs/registration.md).
+MIN_COVER = 0.03  # smallest share of a render that shows the scan
+MIN_INLIERS = 20  # fewer independent inliers are never believed
+# Smallest share of the parts of the photo where the scan should be seen that hold inliers.
+_MIN_AGREEMENT = 0.2
+_MIN_CELLS = 6  # and the smallest number of such parts, of a hundred: a pose needs width
+# Features with that much evidence among their unguided matches need no confirmation where the pictures have
+# fewer than MIN_CONFIRMATION_PIECES pieces to compare.
+_MIN_LOG_NFA_ALONE = 60.0
+MIN_CONFIRMATION_PIECES = 25
+# Evidence of the pictures with which a pose needs no features. It is the best of very many that were tried,
+# and towns resemble each other: of 20 photos of another town the strongest reached 14.3.
+MIN_CONFIRMATION_LOG_NFA = 20.0
+# Or evidence of features and pictures together; features spoke for none of the wrong poses that were
+# measured.
+MIN_JOINT_LOG_NFA = 30.0
+# With less, it must be so many times what the photo reaches at places of the scan where it cannot be
+# (`elsewhere`), of which MAX_PLACES_ELSEWHERE are tried and _MIN_PLACES_ELSEWHERE must be there. Right poses
+# had 10 times as much and more, those of photos of another town up to 3 times as much with all places tried,
+# but up to 5 with three.
+_MIN_CONFIRMATION_RATIO = 6.0
+MAX_PLACES_ELSEWHERE = 5
+_MIN_PLACES_ELSEWHERE = 1
+# And so much evidence with the prior counted in (`weighed_log_nfa`): what the pictures must say anyway.
+# Blocks of streets alike, 117 m from the photo, agreed with 10^-7.7 at 4.7 deviations from the prior, which
+# leaves 4.3; right poses had 5.3 and more.
+_MIN_WEIGHED_LOG_NFA = 5.0
+_RIVAL_SHARE = 0.5  # a pose elsewhere with this share of the inliers makes the registration ambiguous
+# Largest distance from the prior, in its own standard deviations over all six axes together. Generous: people
+# and devices understate their errors.
+_MAX_PRIOR_SIGMAS = 6.0
+# Largest standard deviation of the position, as a share of the distance to what is seen; above it the
+# geometry does not determine the pose.
+_MAX_POSITION_SIGMA_SHARE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,14 +52,14 @@ class FrameEvidence:
 
     Attributes:
         inliers: independent correspondences that agree with the pose.
-        candidates, log_nfa: matches of the first round and the evidence among them, see VerdictOptions.
+        candidates, log_nfa: matches of the first round and the evidence among them.
         confirmed, confirmation_pieces, confirmation_log_nfa, confirmation_message:
             see ingest.register.frame.dense.confirmation.
         cells: parts of the photo (of a hundred) that hold inliers. agreement: their share of those where the
             scan is seen.
         rival_share: support of the best pose elsewhere in the first round, as a share of this one's.
         prior_sigmas: distance from the prior.
-        position_sigma_share: see VerdictOptions.
+        position_sigma_share: standard deviation of the position over the distance to what is seen.
         places_elsewhere, elsewhere_log_nfa: see `elsewhere`; none where it was not asked.
         relief_only: the pictures were compared by shaded relief, which shows what stands and nothing of the
             ground: an ortho image's roofs agreed with 10^-5.8 while the ground lay 6 m off.
@@ -95,10 +82,10 @@ class FrameEvidence:
     relief_only: bool = False
 
 
-def asks_elsewhere(evidence: FrameEvidence, options: VerdictOptions) -> bool:
+def asks_elsewhere(evidence: FrameEvidence) -> bool:
     """Whether all that keeps the pose from being believed is how the photo agrees with the scan elsewhere."""
-    clean = replace(evidence, places_elsewhere=options.min_places_elsewhere, elsewhere_log_nfa=0.0)
-    return verdict(evidence, options) is not None and verdict(clean, options) is None
+    clean = replace(evidence, places_elsewhere=_MIN_PLACES_ELSEWHERE, elsewhere_log_nfa=0.0)
+    return verdict(evidence) is not None and verdict(clean) is None
 
 
 def weighed_log_nfa(evidence: FrameEvidence) -> float:
@@ -111,71 +98,71 @@ def weighed_log_nfa(evidence: FrameEvidence) -> float:
     return evidence.confirmation_log_nfa - against
 
 
-def highest_elsewhere(log_nfa: float, options: VerdictOptions) -> float:
+def highest_elsewhere(log_nfa: float) -> float:
     """The evidence elsewhere that a pose with `log_nfa` bears."""
-    return log_nfa / options.min_confirmation_ratio
+    return log_nfa / _MIN_CONFIRMATION_RATIO
 
 
-def verdict(evidence: FrameEvidence, options: VerdictOptions) -> tuple[FrameReason, str] | None:
+def verdict(evidence: FrameEvidence) -> tuple[FrameReason, str] | None:
     """None if the pose is believed, else the reason and a sentence with the figures."""
-    e, o = evidence, options
-    if e.inliers < o.min_inliers:
-        return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {o.min_inliers} needed"
+    e = evidence
+    if e.inliers < MIN_INLIERS:
+        return "TOO_FEW_MATCHES", f"{e.inliers} independent inliers, {MIN_INLIERS} needed"
     # Pictures that show too little of the scan to be asked contradict nothing;
     # decisive features need no help.
-    silent = e.confirmation_pieces < o.min_confirmation_pieces and e.log_nfa >= o.min_log_nfa_alone
+    silent = e.confirmation_pieces < MIN_CONFIRMATION_PIECES and e.log_nfa >= _MIN_LOG_NFA_ALONE
     if not e.confirmed and not silent:
         return "NOT_CONFIRMED", f"the pictures do not agree at the pose found: {e.confirmation_message}"
-    refusal = None if _suffices(e, o) else _against_elsewhere(e, o)
+    refusal = None if _suffices(e) else _against_elsewhere(e)
     if refusal is not None:
         return refusal
-    if e.cells < o.min_cells or e.agreement < o.min_agreement:
+    if e.cells < _MIN_CELLS or e.agreement < _MIN_AGREEMENT:
         return (
             "NO_CONSISTENT_POSE",
             f"inliers lie in {e.cells} of a hundred parts of the photo, {100 * e.agreement:.0f} % of those "
-            f"where the scan should be seen; {o.min_cells} and {100 * o.min_agreement:.0f} % needed",
+            f"where the scan should be seen; {_MIN_CELLS} and {100 * _MIN_AGREEMENT:.0f} % needed",
         )
-    if e.rival_share >= o.rival_share:
+    if e.rival_share >= _RIVAL_SHARE:
         return "AMBIGUOUS", f"a pose elsewhere has {100 * e.rival_share:.0f} % of this one's inliers"
-    if e.position_sigma_share > o.max_position_sigma_share:
+    if e.position_sigma_share > _MAX_POSITION_SIGMA_SHARE:
         return (
             "NO_CONSISTENT_POSE",
             f"the matches do not determine the pose: position known to {100 * e.position_sigma_share:.1f} % "
-            f"of the distance, {100 * o.max_position_sigma_share:.1f} % needed",
+            f"of the distance, {100 * _MAX_POSITION_SIGMA_SHARE:.1f} % needed",
         )
-    if e.prior_sigmas > o.max_prior_sigmas:
+    if e.prior_sigmas > _MAX_PRIOR_SIGMAS:
         return (
             "CONTRADICTS_PRIOR",
-            f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {o.max_prior_sigmas:.0f} "
+            f"the pose lies {e.prior_sigmas:.1f} deviations from the prior, {_MAX_PRIOR_SIGMAS:.0f} "
             "allowed; if the prior's deviations are too small, give larger ones",
         )
     return None
 
 
-def _suffices(e: FrameEvidence, o: VerdictOptions) -> bool:
+def _suffices(e: FrameEvidence) -> bool:
     """Whether the evidence needs no comparison with other places."""
     return (
-        e.log_nfa >= o.min_log_nfa_alone
-        or e.confirmation_log_nfa >= o.min_confirmation_log_nfa
-        or e.log_nfa + e.confirmation_log_nfa >= o.min_joint_log_nfa
+        e.log_nfa >= _MIN_LOG_NFA_ALONE
+        or e.confirmation_log_nfa >= MIN_CONFIRMATION_LOG_NFA
+        or e.log_nfa + e.confirmation_log_nfa >= MIN_JOINT_LOG_NFA
     )
 
 
-def _against_elsewhere(e: FrameEvidence, o: VerdictOptions) -> tuple[FrameReason, str] | None:
-    if e.relief_only or e.places_elsewhere < o.min_places_elsewhere:
+def _against_elsewhere(e: FrameEvidence) -> tuple[FrameReason, str] | None:
+    if e.relief_only or e.places_elsewhere < _MIN_PLACES_ELSEWHERE:
         return (
             "NOT_CONFIRMED",
             f"the pictures agree too little at a pose that few features speak for: evidence of "
-            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{o.min_confirmation_log_nfa:g} needed",
+            f"10^-{e.confirmation_log_nfa:.1f}, 10^-{MIN_CONFIRMATION_LOG_NFA:g} needed",
         )
     weighed = weighed_log_nfa(e)
-    if weighed < o.min_weighed_log_nfa:
+    if weighed < _MIN_WEIGHED_LOG_NFA:
         return (
             "NOT_CONFIRMED",
             f"the pictures agree with 10^-{e.confirmation_log_nfa:.1f}, {e.prior_sigmas:.1f} deviations from "
-            f"the prior, which leaves 10^-{weighed:.1f}; 10^-{o.min_weighed_log_nfa:g} needed",
+            f"the prior, which leaves 10^-{weighed:.1f}; 10^-{_MIN_WEIGHED_LOG_NFA:g} needed",
         )
-    if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation_log_nfa, o):
+    if e.elsewhere_log_nfa > highest_elsewhere(e.confirmation_log_nfa):
         return (
             "AMBIGUOUS",
             f"evidence of 10^-{e.confirmation_log_nfa:.1f} at the pose found, and of "

@@ -8,7 +8,7 @@ correspondences) and the scan's surface under all points of the map determine po
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -23,9 +23,9 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.maps.lens_uncertainty import LensUncertainty, uncertainty_of_lenses
 from featuredb.render.cloud import PointCloud
+from ingest.colmap.adjust import AdjustOptions, longest_side
 from ingest.colmap.precision import design_effect, linearise
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.adjustment_options import AdjustLidarOptions
 from ingest.register.structure.pairs import RegisteredImage
 from ingest.register.structure.projection import StructurePlacement, move_in_map_frame
 from ingest.register.structure.similarity import similarities
@@ -33,6 +33,31 @@ from ingest.register.structure.surface_fit import Surface, plane_distances, surf
 
 _LOG = logging.getLogger(__name__)
 _FUNCTION_TOLERANCE = 1e-6  # of a round, relative
+_MIN_CONTROL = 60  # correspondences of registered frames; fewer leave lens and height to the surface alone
+# Least standard deviation of keypoints and of correspondences with the scan, as a share of the photo's longer
+# side: a pixel in 4000. Tracks alone may fit to a third of that, but what lens models leave is common to
+# neighbours and does not average out; trusted to their noise, thousands of tracks outvote the frames'
+# correspondences.
+_MIN_SIGMA_REL = 0.00025
+_MIN_SURFACE_M = 0.03  # of a scan's surface against map points; roughness of grass and pavement
+# Structure from motion over flat ground was 25 % off on `brighton`; most lenses are centred, pixels square.
+_LENS = LensWidths(focal_rel=0.3, aspect_rel=0.002, center_rel=0.02, radial=0.1, tangential=0.003)
+# What lenses leave open counts so many times in the poses' covariances
+# (`ingest.colmap.adjust.AdjustOptions.dilution`, measured there).
+_LENS_DILUTION = AdjustOptions().dilution
+_ROUNDS = 25  # of looking up the scan's planes; it ends earlier when points move by less than _SETTLED_M
+_STEPS = 8  # of the solver in each round
+_SETTLED_M = 1e-3  # see above; far below a scan's noise
+_REACH_M = 1.0  # a plane further from a point says nothing of it
+# Median miss of the correspondences after the adjustment, as a share of the photo's longer side: 8 pixels in
+# 4000. Honest ones miss by about two; more means that frames, map and scan contradict each other, and that
+# robust weights have put the frames aside.
+_MAX_CONTROL_REL = 0.002
+# Of the median reprojection error, or of _REPROJECTION_FLOOR_REL of the longer side where it is smaller (half
+# a pixel in 4000).
+_MAX_REPROJECTION_GROWTH = 0.1
+_MAX_SURFACE_POINTS = 250_000  # finer than for the similarity, since single points are moved
+_REPROJECTION_FLOOR_REL = 0.000125
 
 AdjustReason = Literal["NO_CONTROL", "NO_SCAN", "LENS", "CONTROL", "REPROJECTION", "SURFACE"]
 
@@ -68,7 +93,6 @@ def adjust_to_scan(
     structure: StructurePlacement,
     registered: Sequence[RegisteredImage],
     cloud: PointCloud,
-    options: AdjustLidarOptions | None = None,
     begin: FeatureMap | None = None,
 ) -> LidarAdjustment:
     """Adjust a map that `structure` has placed, lens included.
@@ -80,33 +104,31 @@ def adjust_to_scan(
             the one it was registered with.
         begin: the map as an earlier adjustment left it, from which the solver starts.
     """
-    options = options or AdjustLidarOptions()
     assert structure.new_from_old is not None  # accepted
     to_cloud = Sim3.from_rigid3(cloud.frame.enu_from(feature_map.frame))
     start = whole_lens(block_of_map(feature_map).moved(structure.new_from_old @ to_cloud))
     control = control_of(feature_map, structure, registered)
-    if len(control.xyz) < options.min_control:
-        words = f"{len(control.xyz)} correspondences with the scan, at least {options.min_control} are needed"
+    if len(control.xyz) < _MIN_CONTROL:
+        words = f"{len(control.xyz)} correspondences with the scan, at least {_MIN_CONTROL} are needed"
         return _refused("NO_CONTROL", words, {})
     low, high = np.percentile(start.xyz, [1, 99], axis=0)
-    surface = surface_near(cloud, np.clip(start.xyz, low, high), options.surface)
+    surface = surface_near(cloud, np.clip(start.xyz, low, high), _MAX_SURFACE_POINTS)
     if surface is None:
         return _refused("NO_SCAN", "the scan has no points under the map", {})
     first = start
     if begin is not None:
         first = block_of_map(begin).moved(Sim3.from_rigid3(cloud.frame.enu_from(begin.frame)))
-    block = _iterate(first, start.cameras, control, surface, options)
+    block = _iterate(first, start.cameras, control, surface)
     figures = {
         "control": len(control.xyz),
         "frames": len(np.unique(control.photo_of)),
-        "before": _state(start, control, plane_distances(surface, start.xyz, options.reach_m)),
-        "after": _state(block, control, plane_distances(surface, block.xyz, options.reach_m)),
-        "options": asdict(options),
+        "before": _state(start, control, plane_distances(surface, start.xyz, _REACH_M)),
+        "after": _state(block, control, plane_distances(surface, block.xyz, _REACH_M)),
     }
-    reason, message = _gate(block, figures, options)
+    reason, message = _gate(block, figures)
     if reason is not None:
         return _refused(reason, message, figures)
-    poses, lenses = _left_open(block, control, surface, structure, start, options)
+    poses, lenses = _left_open(block, control, surface, structure, start)
     return LidarAdjustment(
         reason=None,
         message="adjusted to the scan",
@@ -178,19 +200,18 @@ def _pairs_as_control(
     return structure.pairs.target[rows], observations.xy[seen].astype(np.float64)
 
 
-def _iterate(
-    start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface, options: AdjustLidarOptions
-) -> Block:
+def _iterate(start: Block, lenses: tuple[Camera, ...], control: Marks, surface: Surface) -> Block:
     """Rounds of planes, standard deviations and solving until the points settle."""
     block = start
-    for _ in range(options.rounds):
-        sigmas = _sigmas(block, control, _planes(surface, block.xyz, options.reach_m)[0], options)
-        problem = Problem(block, _terms(block, control, surface, lenses, sigmas, options))
-        problem.solve(options.steps, _FUNCTION_TOLERANCE)
+    for _ in range(_ROUNDS):
+        planes = _planes(surface, block.xyz, _REACH_M)[0]
+        sigmas = _sigmas(block, control, planes, _MIN_SIGMA_REL, _MIN_SURFACE_M)
+        problem = Problem(block, _terms(block, control, surface, lenses, sigmas))
+        problem.solve(_STEPS, _FUNCTION_TOLERANCE)
         moved = problem.block()
         step_m, block = _step_m(block, moved), moved
         _LOG.debug("sigmas %s, points moved %.4f m", sigmas, step_m)
-        if step_m < options.settled_m:
+        if step_m < _SETTLED_M:
             break
     return block
 
@@ -202,50 +223,32 @@ def _step_m(before: Block, after: Block) -> float:
 
 
 def _terms(
-    block: Block,
-    control: Marks,
-    surface: Surface,
-    lenses: tuple[Camera, ...],
-    sigmas: "_Sigmas",
-    options: AdjustLidarOptions,
+    block: Block, control: Marks, surface: Surface, lenses: tuple[Camera, ...], sigmas: "_Sigmas"
 ) -> Terms:
-    widths = LensWidths(
-        focal_rel=options.focal_rel,
-        aspect_rel=options.aspect_rel,
-        center_rel=options.center_rel,
-        radial=options.radial,
-        tangential=options.tangential,
-    )
     return Terms(
         keypoint_px=sigmas.track_px,
-        lenses=tuple(lens_prior(camera, widths) for camera in lenses),
+        lenses=tuple(lens_prior(camera, _LENS) for camera in lenses),
         marks=replace(control, sigma_px=sigmas.control_px),
-        points=surface_priors(block.xyz, *_planes(surface, block.xyz, options.reach_m), sigmas.surface_m),
+        points=surface_priors(block.xyz, *_planes(surface, block.xyz, _REACH_M), sigmas.surface_m),
     )
 
 
 def _left_open(
-    block: Block,
-    control: Marks,
-    surface: Surface,
-    structure: StructurePlacement,
-    start: Block,
-    options: AdjustLidarOptions,
+    block: Block, control: Marks, surface: Surface, structure: StructurePlacement, start: Block
 ) -> tuple[tuple[FloatArray, ...], LensUncertainty | None]:
     """(6, 6) of each pose with all that points and lenses leave open, and what is left open of the lenses.
 
     Residuals count with their spread as it is, and as neighbours err alike, by as much less as the keypoints
     or the pairs of structure projection do; what lens models leave over is common to whole photos besides.
     """
-    as_is = replace(options, min_sigma_rel=1e-6, min_surface_m=1e-3)
-    sigmas = _sigmas(block, control, _planes(surface, block.xyz, options.reach_m)[0], as_is)
-    found = Problem(block, _terms(block, control, surface, start.cameras, sigmas, options)).marginals()
-    shared = design_effect(_track_residuals(block), block.xy, block.photo_of, _longer_side(block))
+    sigmas = _sigmas(block, control, _planes(surface, block.xyz, _REACH_M)[0], 1e-6, 1e-3)
+    found = Problem(block, _terms(block, control, surface, start.cameras, sigmas)).marginals()
+    shared = design_effect(_track_residuals(block), block.xy, block.photo_of, longest_side(block.cameras))
     factor = max(float(structure.figures["neighbours_factor"]), shared)
-    lenses = [factor * options.lens_dilution * found.lens(c) for c in range(len(block.cameras))]
+    lenses = [factor * _LENS_DILUTION * found.lens(c) for c in range(len(block.cameras))]
     photos = np.bincount(block.camera_of, minlength=len(lenses)).tolist()
-    uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, options.lens_dilution)
-    return tuple(factor * found.poses(options.lens_dilution)), uncertainty
+    uncertainty = uncertainty_of_lenses(block.cameras, lenses, photos, _LENS_DILUTION)
+    return tuple(factor * found.poses(_LENS_DILUTION)), uncertainty
 
 
 def _planes(surface: Surface, xyz: FloatArray, reach_m: float) -> tuple[FloatArray, FloatArray]:
@@ -264,18 +267,20 @@ class _Sigmas:
     surface_m: float
 
 
-def _sigmas(block: Block, control: Marks, offset: FloatArray, options: AdjustLidarOptions) -> _Sigmas:
+def _sigmas(
+    block: Block,
+    control: Marks,
+    offset: FloatArray,
+    least_rel: float,
+    least_m: float,
+) -> _Sigmas:
     """Each kind of residual weighs by its own spread as it is now."""
-    longer = _longer_side(block)
+    longer = longest_side(block.cameras)
     return _Sigmas(
-        track_px=max(options.min_sigma_rel * longer, _spread(_track_residuals(block))),
-        control_px=max(options.min_sigma_rel * longer, _spread(_control_residuals(block, control))),
-        surface_m=max(options.min_surface_m, _spread(offset)),
+        track_px=max(least_rel * longer, _spread(_track_residuals(block))),
+        control_px=max(least_rel * longer, _spread(_control_residuals(block, control))),
+        surface_m=max(least_m, _spread(offset)),
     )
-
-
-def _longer_side(block: Block) -> int:
-    return max(max(camera.width, camera.height) for camera in block.cameras)
 
 
 def _spread(residuals: FloatArray) -> float:
@@ -320,20 +325,18 @@ def _state(block: Block, control: Marks, distances: FloatArray) -> dict[str, Any
     }
 
 
-def _gate(
-    block: Block, figures: dict[str, Any], options: AdjustLidarOptions
-) -> tuple[AdjustReason | None, str]:
+def _gate(block: Block, figures: dict[str, Any]) -> tuple[AdjustReason | None, str]:
     before, after = figures["before"], figures["after"]
     if any(_folds_inside(camera) for camera in block.cameras):
         return "LENS", "the adjusted lens would fold the picture's corners"
-    allowed = options.max_control_rel * _longer_side(block)
+    allowed = _MAX_CONTROL_REL * longest_side(block.cameras)
     if after["control_median_px"] > allowed:
         return "CONTROL", (
             f"the frames' correspondences still miss by {after['control_median_px']:.1f} pixels, at most "
             f"{allowed:.1f} are believed"
         )
-    limit = (1.0 + options.max_reprojection_growth) * max(
-        before["reprojection_median_px"], options.reprojection_floor_rel * _longer_side(block)
+    limit = (1.0 + _MAX_REPROJECTION_GROWTH) * max(
+        before["reprojection_median_px"], _REPROJECTION_FLOOR_REL * longest_side(block.cameras)
     )
     if after["reprojection_median_px"] > limit:
         return "REPROJECTION", (

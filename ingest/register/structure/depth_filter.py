@@ -14,34 +14,23 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.render.cloud import PointCloud
 from featuredb.render.rendering import Rendering
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DepthFilterOptions:
-    """Which depths are taken.
-
-    Attributes:
-        max_depth_m: far plane; nothing beyond it is believed. An airborne scan's own accuracy, seen at a
-            shallow angle from further away, is a matter of metres along the ray.
-        max_step_rel: largest change of depth within the window, relative to the depth, over what a tilted
-            plane explains: 1.5 % is 0.6 m at 40 m, above the roughness of grass and kerbs and below an
-            eave.
-        max_grazing_deg: largest angle between ray and normal; at 75 degrees a pixel across the ray is four
-            along the surface.
-        window: samples along each side (odd) of the window around a pixel. They are half a spacing of the
-            scan's points apart, so that the window sees the same number of points whether the scan is denser
-            than the picture or far sparser.
-        min_window_points: different scan points in the window; three make any plane fit.
-        min_window_share: samples of the window that show a scan point near the pixel's own depth, relative
-            to the share of such pixels in the whole picture (a scattered scan leaves gaps between splats
-            everywhere); a window over a hole has fewer.
-    """
-
-    max_depth_m: float = 1000.0
-    max_step_rel: float = 0.015
-    max_grazing_deg: float = 75.0
-    window: int = 7
-    min_window_points: int = 5
-    min_window_share: float = 0.6
+# Far plane; nothing beyond it is believed. An airborne scan's own accuracy, seen at a shallow angle from
+# further away, is a matter of metres along the ray.
+_MAX_DEPTH_M = 1000.0
+# Largest change of depth within the window, relative to the depth, over what a tilted plane explains: 1.5 %
+# is 0.6 m at 40 m, above the roughness of grass and kerbs and below an eave.
+_MAX_STEP_REL = 0.015
+# Largest angle between ray and normal; at 75 degrees a pixel across the ray is four along the surface.
+_MAX_GRAZING_DEG = 75.0
+# Samples along each side (odd) of the window around a pixel. They are half a spacing of the scan's points
+# apart, so that the window sees the same number of points whether the scan is denser than the picture or far
+# sparser.
+_WINDOW = 7
+_MIN_WINDOW_POINTS = 5  # different scan points in the window; three make any plane fit
+# Samples of the window that show a scan point near the pixel's own depth, relative to the share of such
+# pixels in the whole picture (a scattered scan leaves gaps between splats everywhere); a window over a hole
+# has fewer.
+_MIN_WINDOW_SHARE = 0.6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,11 +62,7 @@ class SurfaceHits:
 
 
 def _reliable_at(
-    rendering: Rendering,
-    row: NDArray[np.int64],
-    column: NDArray[np.int64],
-    stride: int,
-    options: DepthFilterOptions,
+    rendering: Rendering, row: NDArray[np.int64], column: NDArray[np.int64], stride: int
 ) -> NDArray[np.bool_]:
     """Whether the depths of pixels are neither across a silhouette nor beyond the far plane.
 
@@ -85,19 +70,19 @@ def _reliable_at(
     plane: its second differences vanish there and stand out at a discontinuity.
     """
     height, width = rendering.depth.shape
-    reach = (options.window // 2 + 1) * stride
+    reach = (_WINDOW // 2 + 1) * stride
 
     def nearness(r: NDArray[np.int64], c: NDArray[np.int64]) -> NDArray[np.float32]:
         # Beyond a border the picture is mirrored about its last pixel.
         r, c = height - 1 - np.abs(height - 1 - np.abs(r)), width - 1 - np.abs(width - 1 - np.abs(c))
         depth = rendering.depth[r, c]
-        seen = depth <= options.max_depth_m  # not where it is NaN
+        seen = depth <= _MAX_DEPTH_M  # not where it is NaN
         return np.where(seen, 1.0 / np.where(seen, depth, 1.0), 0.0).astype(np.float32)
 
     own = nearness(row, column)
     down = np.abs(0.5 * (nearness(row - reach, column) + nearness(row + reach, column)) - own)
     across = np.abs(0.5 * (nearness(row, column - reach) + nearness(row, column + reach)) - own)
-    return np.asarray((own > 0.0) & (np.maximum(down, across) <= options.max_step_rel * own))
+    return np.asarray((own > 0.0) & (np.maximum(down, across) <= _MAX_STEP_REL * own))
 
 
 def sample_stride(rendering: Rendering) -> int:
@@ -110,9 +95,7 @@ def sample_stride(rendering: Rendering) -> int:
     return max(1, round(0.5 * (pixels / points) ** 0.5)) if points else 1
 
 
-def surface_at(
-    rendering: Rendering, cloud: PointCloud, pixels: FloatArray, options: DepthFilterOptions
-) -> SurfaceHits:
+def surface_at(rendering: Rendering, cloud: PointCloud, pixels: FloatArray) -> SurfaceHits:
     """The points where the rays of pixels (n, 2) of the rendering meet planes through the scan's points.
 
     The plane is that of the scan points that the window around the pixel shows, so that the hit lies on the
@@ -121,30 +104,28 @@ def surface_at(
     height, width = rendering.depth.shape
     column, row = np.floor(pixels).astype(np.int64).T
     stride = sample_stride(rendering)
-    reach = options.window // 2 * stride
+    reach = _WINDOW // 2 * stride
     inside = (column >= reach) & (row >= reach) & (column < width - reach) & (row < height - reach)
     rows = np.flatnonzero(inside)
-    rows = rows[_reliable_at(rendering, row[rows], column[rows], stride, options)]
+    rows = rows[_reliable_at(rendering, row[rows], column[rows], stride)]
     offset = np.arange(-reach, reach + 1, stride)
     window = (
         row[rows, None, None] + offset[None, :, None],
         column[rows, None, None] + offset[None, None, :],
     )
-    index = rendering.index[window].reshape(len(rows), options.window**2)
-    depth = rendering.depth[window].reshape(len(rows), options.window**2)
+    index = rendering.index[window].reshape(len(rows), _WINDOW**2)
+    depth = rendering.depth[window].reshape(len(rows), _WINDOW**2)
     centre = rendering.depth[row[rows], column[rows]]
-    near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * options.max_step_rel)
+    near = (index >= 0) & (np.abs(depth / centre[:, None] - 1.0) <= 4 * _MAX_STEP_REL)
     index = np.where(near, index, -1)
     ordered = np.sort(index, axis=1)
     first = np.concatenate(
         [ordered[:, :1] >= 0, (ordered[:, 1:] != ordered[:, :-1]) & (ordered[:, 1:] >= 0)], axis=1
     )
     shown = np.count_nonzero(rendering.index >= 0) / max(int(np.count_nonzero(rendering.valid)), 1)
-    enough = (first.sum(axis=1) >= options.min_window_points) & (
-        near.mean(axis=1) >= options.min_window_share * shown
-    )
+    enough = (first.sum(axis=1) >= _MIN_WINDOW_POINTS) & (near.mean(axis=1) >= _MIN_WINDOW_SHARE * shown)
     rows, ordered, first = rows[enough], ordered[enough], first[enough]
-    return _intersect(rendering, cloud, pixels, rows, ordered, first, options)
+    return _intersect(rendering, cloud, pixels, rows, ordered, first)
 
 
 def _intersect(
@@ -154,7 +135,6 @@ def _intersect(
     rows: NDArray[np.intp],
     index: NDArray[np.int32],
     weight: NDArray[np.bool_],
-    options: DepthFilterOptions,
 ) -> SurfaceHits:
     """Planes through the weighted scan points of each row, met by the rays of `pixels[rows]`."""
     total = len(pixels)
@@ -177,8 +157,8 @@ def _intersect(
     rendered = rendering.depth[tuple(np.floor(pixels[rows]).astype(np.int64).T[::-1])]
     ok = (
         np.isfinite(depth)
-        & (cosine >= np.cos(np.radians(options.max_grazing_deg)))
-        & (np.abs(depth / rendered - 1.0) <= 2 * options.max_step_rel)
+        & (cosine >= np.cos(np.radians(_MAX_GRAZING_DEG)))
+        & (np.abs(depth / rendered - 1.0) <= 2 * _MAX_STEP_REL)
         # A line of points (one scan line in the window) makes no plane.
         & (values[:, 1] > 0.01 * values[:, 2])
     )

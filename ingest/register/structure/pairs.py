@@ -1,7 +1,7 @@
 """3D/3D pairs: points of a map, projected through a registered frame onto the scan."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,34 +12,22 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import skew
 from featuredb.maps.feature_map import FeatureMap, MapImage
+from featuredb.maps.move import full_covariances
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from ingest.register.frame_registration import FrameRegistration
-from ingest.register.structure.depth_filter import DepthFilterOptions, SurfaceHits, surface_at
+from ingest.register.structure.depth_filter import SurfaceHits, surface_at
 from ingest.register.structure.similarity import Pairs
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PointPairOptions:
-    """How pairs are made.
-
-    Attributes:
-        render_width_px: of the depth image; about the resolution at which airborne scans have a point in
-            most pixels of a drone's photo.
-        pixel_sigma_rel: standard deviation of a keypoint against the scan, as a share of the photo's longer
-            side: a pixel in 2000, what lens models leave.
-        scan_sigma_m: of the scan's points across their surface, beyond what the roughness shows.
-        max_point_sigma_rel: map points less certain than this share of their distance are left out.
-        cells: per side of the grid of neighbourhoods in a frame.
-        depth: filter of the depth image.
-    """
-
-    render_width_px: int = 1000
-    pixel_sigma_rel: float = 0.0005
-    scan_sigma_m: float = 0.03
-    max_point_sigma_rel: float = 0.05
-    cells: int = 6
-    depth: DepthFilterOptions = field(default_factory=DepthFilterOptions)
+# Of the depth image; about the resolution at which airborne scans have a point in most pixels of a drone's
+# photo.
+_RENDER_WIDTH_PX = 1000
+# Standard deviation of a keypoint against the scan, as a share of the photo's longer side: a pixel in 2000,
+# what lens models leave.
+_PIXEL_SIGMA_REL = 0.0005
+_SCAN_SIGMA_M = 0.03  # of the scan's points across their surface, beyond what the roughness shows
+_MAX_POINT_SIGMA_REL = 0.05  # map points less certain than this share of their distance are left out
+_CELLS = 6  # per side of the grid of neighbourhoods in a frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,11 +54,7 @@ class RegisteredImage:
 
 
 def structure_pairs(
-    feature_map: FeatureMap,
-    source: FloatArray,
-    registered: Sequence[RegisteredImage],
-    cloud: PointCloud,
-    options: PointPairOptions,
+    feature_map: FeatureMap, source: FloatArray, registered: Sequence[RegisteredImage], cloud: PointCloud
 ) -> Pairs:
     """Pairs of all frames.
 
@@ -84,9 +68,9 @@ def structure_pairs(
     missing = [r.image_id for r in registered if r.image_id not in images]
     if missing:
         raise InvalidValueError(f"structure_pairs: the map {feature_map.map_id} has no images {missing}")
-    uncertainty = _point_covariances(feature_map)
+    uncertainty = full_covariances(feature_map.points.covariance)
     parts = [
-        _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud, options)
+        _pairs_of_frame(feature_map, source, uncertainty, images[r.image_id], r, row, cloud)
         for row, r in enumerate(registered)
     ]
     joined = {
@@ -107,13 +91,12 @@ def _pairs_of_frame(
     registered: RegisteredImage,
     row: int,
     cloud: PointCloud,
-    options: PointPairOptions,
 ) -> Pairs:
     pose, covariance = registered.registration.cam_from_local, registered.registration.covariance
     assert pose is not None
     assert covariance is not None  # accepted
     camera = registered.registration.camera or registered.camera or feature_map.cameras[image.camera_id]
-    width = min(options.render_width_px, camera.width)
+    width = min(_RENDER_WIDTH_PX, camera.width)
     small = camera.scaled_to(width, round(camera.height * width / camera.width))
     rendering = render(cloud, small, pose, RenderOptions(attributes=False))
     observations = feature_map.observations
@@ -123,15 +106,13 @@ def _pairs_of_frame(
         small.width / camera.width,
         small.height / camera.height,
     )
-    hits = surface_at(rendering, cloud, pixels, options.depth)
+    hits = surface_at(rendering, cloud, pixels)
     distance = np.linalg.norm(hits.points - pose.center, axis=1)
     kept = np.flatnonzero(hits.valid)
-    kept = kept[_no_larger(uncertainty[points[kept]], options.max_point_sigma_rel * distance[kept])]
-    own, by_frame = _errors(hits.rows(kept), pose, camera, options)
-    grid = np.minimum(
-        (pixels / (small.width, small.height) * options.cells).astype(np.int64), options.cells - 1
-    )
-    cell = row * options.cells**2 + grid[:, 1] * options.cells + grid[:, 0]
+    kept = kept[_no_larger(uncertainty[points[kept]], _MAX_POINT_SIGMA_REL * distance[kept])]
+    own, by_frame = _errors(hits.rows(kept), pose, camera)
+    grid = np.minimum((pixels / (small.width, small.height) * _CELLS).astype(np.int64), _CELLS - 1)
+    cell = row * _CELLS**2 + grid[:, 1] * _CELLS + grid[:, 0]
     return Pairs(
         point_index=points[kept],
         frame_of=np.full(len(kept), row, dtype=np.int64),
@@ -154,9 +135,7 @@ def _no_larger(covariance: FloatArray, sigma: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(small)
 
 
-def _errors(
-    hits: SurfaceHits, pose: Rigid3, camera: Camera, options: PointPairOptions
-) -> tuple[FloatArray, FloatArray]:
+def _errors(hits: SurfaceHits, pose: Rigid3, camera: Camera) -> tuple[FloatArray, FloatArray]:
     """Covariance (n, 3, 3) of each hit by its own errors, and derivative (n, 3, 6) by the frame's pose.
 
     A ray that turns or shifts by d meets the surface's plane at d - u (n.d)/(n.u), u being its direction.
@@ -165,20 +144,13 @@ def _errors(
     direction = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     facing = np.einsum("ij,ij->i", hits.normals, direction)
     slide = np.eye(3) - direction[:, :, None] * hits.normals[:, None, :] / facing[:, None, None]
-    pixel_m = options.pixel_sigma_rel * max(camera.width, camera.height) / camera.focal_px * hits.depths
+    pixel_m = _PIXEL_SIGMA_REL * max(camera.width, camera.height) / camera.focal_px * hits.depths
     across = np.eye(3) - direction[:, :, None] * direction[:, None, :]
     shifted = slide @ across
     own = (pixel_m**2)[:, None, None] * shifted @ np.swapaxes(shifted, 1, 2)
-    along = hits.sigma_ray_m**2 + (options.scan_sigma_m / facing) ** 2
+    along = hits.sigma_ray_m**2 + (_SCAN_SIGMA_M / facing) ** 2
     own += along[:, None, None] * direction[:, :, None] * direction[:, None, :]
     # T_true = exp(xi) T moves the point at camera coordinates p by -R' (omega x p + nu).
     in_camera = pose.act(hits.points)
     by_pose = np.concatenate([skew(in_camera), np.broadcast_to(-np.eye(3), (len(rays), 3, 3))], axis=2)
     return own, slide @ (pose.rotation.T @ by_pose)
-
-
-def _point_covariances(feature_map: FeatureMap) -> FloatArray:
-    """(n, 3, 3) of the map's points, relative to the map's gauge."""
-    packed = feature_map.points.covariance.astype(np.float64)
-    order: NDArray[np.int64] = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-    return packed[:, order]

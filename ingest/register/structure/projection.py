@@ -2,8 +2,8 @@
 
 Structure-projection paper, 2.4: depth image of the registered frame, the map's visible points projected on
 it, 3D/3D pairs, RANSAC similarity, refinement on SIM(3), ICP against the scan. Here the refinement weighs
-pairs by their own covariance and knows that all pairs of a frame share its pose error; ICP is GICP and may
-not leave the evidence.
+pairs by their own covariance and knows that all pairs of a frame share its pose error. In the place of ICP,
+which slides over flat ground, comes the adjustment by the scan's surface (`adjustment.py`).
 """
 
 from collections.abc import Sequence
@@ -18,19 +18,14 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, Placement
 from featuredb.render.cloud import PointCloud
 from ingest.register.block import block_of_map, map_of_block
-from ingest.register.structure.pairs import PointPairOptions, RegisteredImage, structure_pairs
+from ingest.register.structure.pairs import RegisteredImage, structure_pairs
 from ingest.register.structure.similarity import (
     Pairs,
     SimilarityFit,
-    SimilarityOptions,
     ransac_similarity,
     refine_similarity,
 )
 from ingest.register.structure.surface_fit import (
-    GicpOutcome,
-    SurfaceFitOptions,
-    guarded_gicp,
-    moved,
     plane_distances,
     reach_of,
     surface_near,
@@ -41,36 +36,21 @@ _MAX_BEFORE = 4000  # points whose distance from the scan before the move is loo
 StructureReason = Literal["NO_FRAMES", "TOO_FEW_PAIRS", "NO_SPREAD", "NO_SIMILARITY", "RESIDUALS", "SCALE"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StructureOptions:
-    """Structure projection and its gates.
-
-    Attributes:
-        tolerance_rel: a pair further off, as a share of its distance from the camera, is an outlier of
-            RANSAC: reconstructions bend by up to about a percent of the flying height.
-        min_tolerance_m: but never less than the scan's own noise and spacing explain.
-        min_pairs: inliers; the paper speaks of hundreds. Thirty fix a similarity to a fifth of a pair's
-            sigma.
-        min_inlier_share: of the pairs; with fewer the frame or the map is wrong.
-        min_spread_rel: second singular value of the inliers' spread over their distance from the camera;
-            pairs closer to a line leave the rotation about it open.
-        max_residual_rel: root mean square of the inliers' residuals over their distance.
-        max_scale_change: of the map against its present placement, beyond the sigmas of both. GPS that was
-            accepted knows the scale to a tenth or better.
-        scale_sigmas: how many sigmas of both placements the scale may differ.
-    """
-
-    tolerance_rel: float = 0.015
-    min_tolerance_m: float = 0.15
-    min_pairs: int = 30
-    min_inlier_share: float = 0.3
-    min_spread_rel: float = 0.02
-    max_residual_rel: float = 0.01
-    max_scale_change: float = 0.05
-    scale_sigmas: float = 4.0
-    pairs: PointPairOptions = field(default_factory=PointPairOptions)
-    similarity: SimilarityOptions = field(default_factory=SimilarityOptions)
-    surface: SurfaceFitOptions = field(default_factory=SurfaceFitOptions)
+# A pair further off, as a share of its distance from the camera, is an outlier of RANSAC: reconstructions
+# bend by up to about a percent of the flying height.
+_TOLERANCE_REL = 0.015
+_MIN_TOLERANCE_M = 0.15  # but never less than the scan's own noise and spacing explain
+# Inliers; the paper speaks of hundreds. Thirty fix a similarity to a fifth of a pair's sigma.
+_MIN_PAIRS = 30
+_MIN_INLIER_SHARE = 0.3  # of the pairs; with fewer the frame or the map is wrong
+# Second singular value of the inliers' spread over their distance from the camera; pairs closer to a line
+# leave the rotation about it open.
+_MIN_SPREAD_REL = 0.02
+_MAX_RESIDUAL_REL = 0.01  # root mean square of the inliers' residuals over their distance
+# Of the map against its present placement, beyond the sigmas of both. GPS that was accepted knows the scale
+# to a tenth or better.
+_MAX_SCALE_CHANGE = 0.05
+_SCALE_SIGMAS = 4.0  # how many sigmas of both placements the scale may differ
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -84,19 +64,15 @@ class StructurePlacement:
         covariance: (7, 7) of its left perturbation, None when refused.
         pairs: the 3D/3D pairs, None without frames.
         inliers: (n,) bool of the pairs.
-        before_m, after_m: signed distance of the map's points from the scan's surface; NaN where no scan is
-            near. After: at the new place; before: of a sample of the same points.
         figures: what the decision rests on, JSON-able.
     """
 
     reason: StructureReason | None
     message: str
-    new_from_old: Sim3 | None
-    covariance: FloatArray | None
-    pairs: Pairs | None
-    inliers: NDArray[np.bool_]
-    before_m: FloatArray
-    after_m: FloatArray
+    new_from_old: Sim3 | None = None
+    covariance: FloatArray | None = None
+    pairs: Pairs | None = None
+    inliers: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     figures: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -105,87 +81,67 @@ class StructurePlacement:
 
 
 def project_structure(
-    feature_map: FeatureMap,
-    registered: Sequence[RegisteredImage],
-    cloud: PointCloud,
-    options: StructureOptions | None = None,
+    feature_map: FeatureMap, registered: Sequence[RegisteredImage], cloud: PointCloud
 ) -> StructurePlacement:
     """Place a map on a scan by frames of the map that were registered to it.
 
     Args:
         registered: frames with their poses in the cloud's local frame; one is enough.
     """
-    options = options or StructureOptions()
-    count = len(feature_map.points)
     if not registered:
-        return _refused("NO_FRAMES", "no frame is registered to the scan", count)
+        return StructurePlacement(reason="NO_FRAMES", message="no frame is registered to the scan")
     source = feature_map.points_local(cloud.frame)
-    pairs = structure_pairs(feature_map, source, registered, cloud, options.pairs)
-    if len(pairs) < options.min_pairs:
-        words = f"{len(pairs)} of the map's points meet the scan, at least {options.min_pairs} are needed"
-        return _refused("TOO_FEW_PAIRS", words, count, pairs)
+    pairs = structure_pairs(feature_map, source, registered, cloud)
+    none = np.zeros(len(pairs), dtype=bool)
+    if len(pairs) < _MIN_PAIRS:
+        words = f"{len(pairs)} of the map's points meet the scan, at least {_MIN_PAIRS} are needed"
+        return StructurePlacement(reason="TOO_FEW_PAIRS", message=words, pairs=pairs, inliers=none)
     distances = _distances(pairs, registered)
-    tolerance = np.maximum(options.min_tolerance_m, options.tolerance_rel * distances)
-    start = ransac_similarity(pairs, tolerance, options.similarity)
+    tolerance = np.maximum(_MIN_TOLERANCE_M, _TOLERANCE_REL * distances)
+    start = ransac_similarity(pairs, tolerance)
     if start is None:
-        return _refused("NO_SIMILARITY", "the pairs lie on a line or coincide", count, pairs)
+        words = "the pairs lie on a line or coincide"
+        return StructurePlacement(reason="NO_SIMILARITY", message=words, pairs=pairs, inliers=none)
     near = np.linalg.norm(pairs.target - start.act(pairs.source), axis=1) <= 2 * tolerance
-    reason, message, figures = _gate_of_pairs(pairs, near, distances, options)
+    reason, message, figures = _gate_of_pairs(pairs, near, distances)
     if reason is not None:
-        return _refused(reason, message, count, pairs, figures)
+        return StructurePlacement(reason=reason, message=message, pairs=pairs, inliers=none, figures=figures)
     kept = _rows(pairs, near)
-    fit = refine_similarity(start, kept, options.similarity)
+    fit = refine_similarity(start, kept)
     figures |= _figures_of_fit(fit, kept, feature_map, registered)
-    reason, message = _gate_of_fit(fit, distances[near], figures, options)
+    reason, message = _gate_of_fit(fit, distances[near], figures)
     inliers = near.copy()
     inliers[near] = fit.inliers
     if reason is not None:
-        return _refused(reason, message, count, pairs, figures, inliers)
-    return _onto_surface(source, pairs, inliers, fit, cloud, figures, options)
-
-
-def _onto_surface(
-    source: FloatArray,
-    pairs: Pairs,
-    inliers: NDArray[np.bool_],
-    fit: SimilarityFit,
-    cloud: PointCloud,
-    figures: dict[str, Any],
-    options: StructureOptions,
-) -> StructurePlacement:
-    """The last step of an accepted similarity: GICP under its guard, and the residuals before and after."""
-    sim = fit.target_from_source
-    placed = sim.act(source)
-    before, after = np.full(len(source), np.nan), np.full(len(source), np.nan)
-    # Points far from all others (gross errors of matching) would make the box endless.
-    low, high = np.percentile(placed, [1, 99], axis=0)
-    surface = surface_near(cloud, np.clip(placed, low, high), options.surface)
-    if surface is not None:
-        reach = reach_of(surface, options.surface)
-        after = plane_distances(surface, placed, reach)
-        if options.surface.gicp:
-            evidence = sim.act(pairs.source[inliers])
-            outcome = guarded_gicp(surface, placed, after, evidence, fit.covariance, options.surface)
-            figures["gicp"] = _gicp_figures(outcome)
-            if outcome.accepted:
-                sim = moved(sim, outcome.move)
-                after = plane_distances(surface, sim.act(source), reach)
-        # The nearest neighbour of what is far away costs most; a sample says as much.
-        some = np.flatnonzero(np.isfinite(after))
-        some = some[:: max(1, -(-len(some) // _MAX_BEFORE))]
-        before[some] = plane_distances(surface, source[some], np.inf)
-        figures["surface"] = {"before": _summary(before), "after": _summary(after)}
+        return StructurePlacement(
+            reason=reason, message=message, pairs=pairs, inliers=inliers, figures=figures
+        )
+    figures |= _surface_figures(source, fit.target_from_source, cloud)
     return StructurePlacement(
         reason=None,
         message="placed on the scan",
-        new_from_old=sim,
+        new_from_old=fit.target_from_source,
         covariance=fit.covariance,
         pairs=pairs,
         inliers=inliers,
-        before_m=before,
-        after_m=after,
         figures=figures,
     )
+
+
+def _surface_figures(source: FloatArray, sim: Sim3, cloud: PointCloud) -> dict[str, Any]:
+    """How points (n, 3) lie on the scan's surface before the move, a sample of them, and after it."""
+    placed = sim.act(source)
+    # Points far from all others (gross errors of matching) would make the box endless.
+    low, high = np.percentile(placed, [1, 99], axis=0)
+    surface = surface_near(cloud, np.clip(placed, low, high))
+    if surface is None:
+        return {}
+    after = plane_distances(surface, placed, reach_of(surface))
+    # The nearest neighbour of what is far away costs most; a sample says as much.
+    some = np.flatnonzero(np.isfinite(after))
+    some = some[:: max(1, -(-len(some) // _MAX_BEFORE))]
+    before = plane_distances(surface, source[some], np.inf)
+    return {"surface": {"before": _summary(before), "after": _summary(after)}}
 
 
 def placed_map(feature_map: FeatureMap, structure: StructurePlacement, cloud: PointCloud) -> FeatureMap:
@@ -240,7 +196,7 @@ def _rows(pairs: Pairs, kept: NDArray[np.bool_]) -> Pairs:
 
 
 def _gate_of_pairs(
-    pairs: Pairs, near: NDArray[np.bool_], distances: FloatArray, options: StructureOptions
+    pairs: Pairs, near: NDArray[np.bool_], distances: FloatArray
 ) -> tuple[StructureReason | None, str, dict[str, Any]]:
     """Whether RANSAC's inliers can carry a similarity."""
     used = int(near.sum())
@@ -256,18 +212,18 @@ def _gate_of_pairs(
         "ransac_inlier_share": used / len(pairs),
         "spread_rel": spread,
     }
-    if used < options.min_pairs or used < options.min_inlier_share * len(pairs):
+    if used < _MIN_PAIRS or used < _MIN_INLIER_SHARE * len(pairs):
         return (
             "TOO_FEW_PAIRS",
-            f"{used} of {len(pairs)} pairs agree on a similarity, at least {options.min_pairs} and "
-            f"{options.min_inlier_share:.0%} are needed",
+            f"{used} of {len(pairs)} pairs agree on a similarity, at least {_MIN_PAIRS} and "
+            f"{_MIN_INLIER_SHARE:.0%} are needed",
             figures,
         )
-    if spread < options.min_spread_rel:
+    if spread < _MIN_SPREAD_REL:
         return (
             "NO_SPREAD",
             f"the pairs lie along a line: {spread:.1%} of their distance across it, at least "
-            f"{options.min_spread_rel:.0%} are needed",
+            f"{_MIN_SPREAD_REL:.0%} are needed",
             figures,
         )
     return None, "", figures
@@ -301,12 +257,12 @@ def _figures_of_fit(
 
 
 def _gate_of_fit(
-    fit: SimilarityFit, distances: FloatArray, figures: dict[str, Any], options: StructureOptions
+    fit: SimilarityFit, distances: FloatArray, figures: dict[str, Any]
 ) -> tuple[StructureReason | None, str]:
-    limit = max(options.min_tolerance_m, options.max_residual_rel * float(np.median(distances[fit.inliers])))
-    if figures["inliers"] < options.min_pairs:
+    limit = max(_MIN_TOLERANCE_M, _MAX_RESIDUAL_REL * float(np.median(distances[fit.inliers])))
+    if figures["inliers"] < _MIN_PAIRS:
         return "TOO_FEW_PAIRS", (
-            f"{figures['inliers']} pairs remain after refinement, at least {options.min_pairs} are needed"
+            f"{figures['inliers']} pairs remain after refinement, at least {_MIN_PAIRS} are needed"
         )
     if figures["residual_rms_m"] > limit:
         return "RESIDUALS", (
@@ -315,7 +271,7 @@ def _gate_of_fit(
         )
     change = abs(float(np.log(fit.target_from_source.scale)))
     sigma = float(np.hypot(figures["scale_sigma"], figures["previous_scale_sigma"]))
-    allowed = max(options.max_scale_change, options.scale_sigmas * sigma)
+    allowed = max(_MAX_SCALE_CHANGE, _SCALE_SIGMAS * sigma)
     if change > allowed:
         return "SCALE", (
             f"the map would change its size by {change:.1%}, at most {allowed:.1%} agrees with its present "
@@ -334,30 +290,3 @@ def _summary(distances: FloatArray) -> dict[str, float | int | None]:
         "rms_m": float(np.sqrt((near**2).mean())),
         "p90_m": float(np.percentile(near, 90)),
     }
-
-
-def _gicp_figures(outcome: GicpOutcome) -> dict[str, Any]:
-    return {"accepted": outcome.accepted, "message": outcome.message, **outcome.figures}
-
-
-def _refused(
-    reason: StructureReason,
-    message: str,
-    points: int,
-    pairs: Pairs | None = None,
-    figures: dict[str, Any] | None = None,
-    inliers: NDArray[np.bool_] | None = None,
-) -> StructurePlacement:
-    nothing = np.full(points, np.nan)
-    none = np.zeros(0 if pairs is None else len(pairs), dtype=bool)
-    return StructurePlacement(
-        reason=reason,
-        message=message,
-        new_from_old=None,
-        covariance=None,
-        pairs=pairs,
-        inliers=none if inliers is None else inliers,
-        before_m=nothing,
-        after_m=nothing,
-        figures=figures or {},
-    )

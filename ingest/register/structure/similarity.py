@@ -19,21 +19,10 @@ _CHI2_3_MEDIAN = 2.366
 _SETTLED = 0.003  # standard deviations of a step; rounds that follow add up to a few times as much at most
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SimilarityOptions:
-    """How the similarity is estimated.
-
-    Attributes:
-        samples: of three pairs. With half of the pairs wrong, 300 miss all-inlier samples once in 10^17.
-        score_pairs: pairs that score a sample; more only take longer.
-        rounds: of reweighting; the weights settle within ten.
-        seed: of the samples.
-    """
-
-    samples: int = 300
-    score_pairs: int = 800
-    rounds: int = 20
-    seed: int = 0
+_SAMPLES = 300  # of three pairs. With half of the pairs wrong, 300 miss all-inlier samples once in 10^17.
+_SCORE_PAIRS = 800  # pairs that score a sample; more only take longer
+_ROUNDS = 20  # of reweighting; the weights settle within ten
+_SEED = 0  # of the samples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -91,7 +80,7 @@ class SimilarityFit:
     neighbours_factor: float
 
 
-def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray, options: SimilarityOptions) -> Sim3 | None:
+def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray) -> Sim3 | None:
     """The similarity of three pairs with the smallest truncated sum of squared distances, or None.
 
     Args:
@@ -100,16 +89,14 @@ def ransac_similarity(pairs: Pairs, tolerance_m: FloatArray, options: Similarity
     n = len(pairs)
     if n < 3:
         return None
-    generator = np.random.default_rng(options.seed)
-    samples = generator.integers(0, n, (options.samples, 3))
+    generator = np.random.default_rng(_SEED)
+    samples = generator.integers(0, n, (_SAMPLES, 3))
     samples = samples[(np.diff(np.sort(samples, axis=1), axis=1) > 0).all(axis=1)]
     scale, rotation, translation, usable = similarities(pairs.source[samples], pairs.target[samples])
     if not usable.any():
         return None
     scale, rotation, translation = scale[usable], rotation[usable], translation[usable]
-    rows = (
-        np.arange(n) if n <= options.score_pairs else generator.choice(n, options.score_pairs, replace=False)
-    )
+    rows = np.arange(n) if n <= _SCORE_PAIRS else generator.choice(n, _SCORE_PAIRS, replace=False)
     off = (scale[:, None, None] * rotation).reshape(-1, 3) @ pairs.source[rows].T  # (3 k, n)
     off += translation.reshape(-1, 1)
     off = off.reshape(-1, 3, len(rows))
@@ -146,7 +133,7 @@ def similarities(
     return scale, rotation, translation, usable
 
 
-def refine_similarity(start: Sim3, pairs: Pairs, options: SimilarityOptions) -> SimilarityFit:
+def refine_similarity(start: Sim3, pairs: Pairs) -> SimilarityFit:
     """Robust least squares over the similarity (exp on the left) and, with their priors, the frames' poses.
 
     The frames' pose errors are estimated along with the similarity: pairs of one frame then count for no
@@ -157,7 +144,7 @@ def refine_similarity(start: Sim3, pairs: Pairs, options: SimilarityOptions) -> 
     sim, frames = start, np.zeros((len(pairs.frame_covariance), 6))
     dilution = 1.0
     for _ in range(2):  # the dilution is known after the first
-        for _ in range(options.rounds):
+        for _ in range(_ROUNDS):
             residual = whitened.residuals(_residuals(sim, frames, pairs))
             weights, spread = _weights(residual)
             normal, gradient = _equations(sim, frames, residual, pairs, whitened, weights / dilution)

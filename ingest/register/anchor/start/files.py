@@ -12,6 +12,7 @@ from featuredb.errors import RegistrationError
 from ingest.register.anchor.start.picks import Picks
 from ingest.register.anchor.start.priors import RoughPose, look_at_angles
 
+_HOW_ROUGH = {"roll_deg", "sigma_horizontal_m", "sigma_vertical_m", "sigma_heading_deg", "sigma_tilt_deg"}
 _COLUMNS = ("x", "y", "easting", "northing", "height")
 
 
@@ -148,9 +149,5 @@ def read_pose(path: Path, image: str | None) -> RoughPose:
         utm=utm,
         yaw_deg=yaw,
         pitch_deg=pitch,
-        roll_deg=pose.roll_deg,
-        sigma_horizontal_m=pose.sigma_horizontal_m,
-        sigma_vertical_m=pose.sigma_vertical_m,
-        sigma_heading_deg=pose.sigma_heading_deg,
-        sigma_tilt_deg=pose.sigma_tilt_deg,
+        **pose.model_dump(include=_HOW_ROUGH),
     )

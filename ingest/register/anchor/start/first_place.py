@@ -18,7 +18,7 @@ from featuredb.store import Database
 from featuredb.store.scans import ScanSummary, list_scans
 from ingest.register.anchor.start.files import read_picks, read_pose
 from ingest.register.anchor.start.picks import Picks, focal_sigma_rel, pose_from_picks
-from ingest.register.anchor.start.priors import RoughPose, StartOptions, image_named, prior_from_rough_pose
+from ingest.register.anchor.start.priors import RoughPose, image_named, prior_from_rough_pose
 from ingest.register.frame_registration import FramePrior
 from ingest.register.place_map import place_by_photo
 
@@ -71,7 +71,7 @@ class FirstPlace:
 
 
 def started_images(
-    feature_map: AnyMap, files: StartFiles, frame: LocalFrame, epsg: int, options: StartOptions
+    feature_map: AnyMap, files: StartFiles, frame: LocalFrame, epsg: int
 ) -> list[StartedImage]:
     """The photos that a person's files put somewhere.
 
@@ -84,12 +84,10 @@ def started_images(
     rough = [] if files.pose is None else [read_pose(files.pose, files.image)]
     picks = [] if files.picks is None else read_picks(files.picks, files.image)
     found = [_by_pose(feature_map, pose, frame, epsg, str(files.pose)) for pose in rough]
-    return found + [by_picks(feature_map, p, frame, epsg, options) for p in picks]
+    return found + [by_picks(feature_map, p, frame, epsg) for p in picks]
 
 
-def by_picks(
-    feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int, options: StartOptions
-) -> StartedImage:
+def by_picks(feature_map: AnyMap, picks: Picks, frame: LocalFrame, epsg: int) -> StartedImage:
     """The photo where its picks put it.
 
     Raises:
@@ -102,7 +100,6 @@ def by_picks(
         frame.enu_from_utm(picks.utm, epsg),
         feature_map.cameras[image.camera_id],
         image.cam_from_local if upright else None,
-        options,
         focal_sigma_rel(feature_map, image),
     )
     believed = found.fit.believed
@@ -116,11 +113,7 @@ def by_picks(
 
 
 def first_place(
-    database: Database,
-    unplaced: UnplacedMap,
-    files: StartFiles,
-    scan_ids: Sequence[str],
-    options: StartOptions,
+    database: Database, unplaced: UnplacedMap, files: StartFiles, scan_ids: Sequence[str]
 ) -> FirstPlace:
     """Put a map without a place where a person's photo says, on the scans of the database.
 
@@ -137,7 +130,7 @@ def first_place(
     utm = _spoken_of(files)
     east, north, up = (float(v) for v in np.median(utm, axis=0))
     frame = LocalFrame.from_utm(east, north, up, epsg)
-    started = started_images(unplaced, files, frame, epsg, options)
+    started = started_images(unplaced, files, frame, epsg)
     ids = tuple(scan.scan_id for scan in scans)
     return placed_by_start(database, unplaced, started, frame, ids, files)
 

@@ -24,24 +24,15 @@ _REFINED = 6  # of their poses, best first, that are refined
 _ROUNDS = 15
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PickFitOptions:
-    """How picks are weighed.
+_CHANCE = 0.001  # rate at which right picks are called contradictory: one set in a thousand
+# By how much the squared residuals must grow, in chi-square of one pick, until another explanation is out of
+# the question: one in a hundred.
+_APART = float(chi2.ppf(0.99, 2))
+_MAX_WRONG = 2  # so many wrong picks are looked for
 
-    Attributes:
-        sigma_px: how well a person marks a point in the photo.
-        sigma_m: how well a person reads a point off the scan.
-        chance: rate at which right picks are called contradictory: one set in a thousand.
-        apart: by how much the squared residuals must grow, in chi-square of one pick, until another
-            explanation is out of the question: one in a hundred.
-        max_wrong: so many wrong picks are looked for.
-    """
 
-    sigma_px: float = 3.0
-    sigma_m: float = 0.2
-    chance: float = 0.001
-    apart: float = float(chi2.ppf(0.99, 2))
-    max_wrong: int = 2
+_SIGMA_PX_REL = 0.00075  # how well a person marks a point, over the longer side: 3 pixels in 4000
+_SIGMA_M = 0.2  # how well a person reads a point off the scan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -102,11 +93,13 @@ class _Problem:
     points: FloatArray
     camera: Camera
     focal_sigma_rel: float
-    options: PickFitOptions
+
+    @property
+    def sigma_px(self) -> float:
+        return _SIGMA_PX_REL * max(self.camera.width, self.camera.height)
 
     def noise(self, by_point: FloatArray) -> FloatArray:
-        o = self.options
-        return o.sigma_px**2 * np.eye(2) + o.sigma_m**2 * by_point @ by_point.transpose(0, 2, 1)
+        return self.sigma_px**2 * np.eye(2) + _SIGMA_M**2 * by_point @ by_point.transpose(0, 2, 1)
 
     def linear(
         self, pose: Rigid3, camera: Camera, rows: list[int]
@@ -134,7 +127,6 @@ def fit_picks(
     points: FloatArray,
     camera: Camera,
     focal_sigma_rel: float,
-    options: PickFitOptions | None = None,
 ) -> PickFit | None:
     """The pose of four or more picks, or None where no pose has all of a triple in front of the camera.
 
@@ -142,10 +134,7 @@ def fit_picks(
         pixels: (n, 2) full-size pixels. points: (n, 3) local frame, metres.
         camera: the lens; its focal length is a prior with `focal_sigma_rel`.
     """
-    options = options or PickFitOptions()
-    problem = _Problem(
-        pixels=pixels, points=points, camera=camera, focal_sigma_rel=focal_sigma_rel, options=options
-    )
+    problem = _Problem(pixels=pixels, points=points, camera=camera, focal_sigma_rel=focal_sigma_rel)
     starts = _starts(problem)
     if not starts:
         return None
@@ -176,16 +165,16 @@ def _explanation(
     """State, picks believed, picks in doubt, and whether they agree: the fewest wrong picks that explain."""
     everything = _best(problem, starts, rows)
     # Of n picks, k wrong ones are told from right ones if 4 + k of these agree.
-    for count in range(min(problem.options.max_wrong, (len(rows) - 4) // 2) + 1):
+    for count in range(min(_MAX_WRONG, (len(rows) - 4) // 2) + 1):
         tries = []
         for left_out in combinations(_suspects(problem, starts, rows, count), count):
             kept = [i for i in rows if i not in left_out]
             state = everything if not left_out else _best(problem, starts, kept)
-            if state is not None and state.cost <= chi2.ppf(1 - problem.options.chance, 2 * len(kept) - 6):
+            if state is not None and state.cost <= chi2.ppf(1 - _CHANCE, 2 * len(kept) - 6):
                 tries.append((state.cost, left_out, kept, state))
         if tries:
             tries.sort(key=lambda t: t[0])
-            rivals = [t for t in tries if t[0] < tries[0][0] + problem.options.apart] if count else []
+            rivals = [t for t in tries if t[0] < tries[0][0] + _APART] if count else []
             doubtful = sorted({i for t in rivals for i in t[1]}) if len(rivals) > 1 else []
             _, _, kept, state = tries[0]
             return state, kept, tuple(doubtful), True
@@ -230,12 +219,12 @@ def _starts(problem: _Problem) -> list[tuple[Rigid3, Camera]]:
 def _rough_cost(problem: _Problem, pose: Rigid3, camera: Camera) -> float:
     """Truncated, so that a wrong pick counts for no more than a bad one."""
     in_camera = pose.act(problem.points)
-    if (in_camera[:, 2] <= 0).sum() > problem.options.max_wrong:
+    if (in_camera[:, 2] <= 0).sum() > _MAX_WRONG:
         return float("inf")
     off = np.nan_to_num(camera.project(in_camera) - problem.pixels, nan=1e6)
     sigma = np.hypot(
-        problem.options.sigma_px,
-        problem.options.sigma_m * camera.focal_px / np.maximum(in_camera[:, 2], 1e-3),
+        problem.sigma_px,
+        _SIGMA_M * camera.focal_px / np.maximum(in_camera[:, 2], 1e-3),
     )
     return float(np.minimum((off**2).sum(axis=1) / (3 * sigma) ** 2, 25.0).sum())
 
@@ -248,7 +237,6 @@ def _best(problem: _Problem, starts: list[tuple[Rigid3, Camera]], rows: list[int
         points=problem.points[rows],
         camera=problem.camera,
         focal_sigma_rel=problem.focal_sigma_rel,
-        options=problem.options,
     )
     ranked = sorted(few, key=lambda start: _rough_cost(sub, *start))[:1]
     states = [s for s in (_refined(problem, *start, rows) for start in ranked) if s is not None]
@@ -331,7 +319,7 @@ def _normalised(problem: _Problem, state: _State, kept: list[int]) -> FloatArray
 
 def _another(problem: _Problem, starts: list[tuple[Rigid3, Camera]], kept: list[int], state: _State) -> bool:
     """Whether a pose that is clearly elsewhere explains the picks nearly as well."""
-    limit = max(state.cost + problem.options.apart, 0.0)
+    limit = max(state.cost + _APART, 0.0)
     spread = np.linalg.pinv(state.information, hermitian=True)[:6, :6]
     far_m = 6.0 * float(np.sqrt(np.linalg.eigvalsh(spread[3:, 3:])[-1]))
     tried: list[Rigid3] = [state.pose]

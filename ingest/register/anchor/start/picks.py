@@ -10,12 +10,22 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.maps.feature_map import MapImage
 from featuredb.maps.unplaced_map import AnyMap
-from ingest.register.anchor.start.pick_fit import PickFit, PickFitOptions, fit_picks
-from ingest.register.anchor.start.priors import StartOptions
+from ingest.register.anchor.start.pick_fit import PickFit, fit_picks
+from ingest.register.anchor.start.priors import (
+    MIN_SIGMA_ANGLE_DEG,
+    MIN_SIGMA_HORIZONTAL_M,
+    MIN_SIGMA_VERTICAL_M,
+)
 from ingest.register.frame_registration import FramePrior
 
 KNOWN_FOCAL_REL = 0.03  # EXIF rounds, and reconstructions over flat ground drift from it by as much
 UNKNOWN_FOCAL_REL = 0.3
+# Picks on a line or close together leave the pose open.
+_MAX_PICK_SIGMA_M = 20.0
+_MAX_PICK_SIGMA_DEG = 10.0
+# Between the vertical by the picks and by the map: reconstructions placed by GPS know it to degrees, and
+# swapped columns turn the ground upside down.
+_MAX_PICK_TILT_DEG = 45.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -86,7 +96,6 @@ def pose_from_picks(
     points: FloatArray,
     camera: Camera,
     present: Rigid3 | None,
-    options: StartOptions,
     focal_rel: float = KNOWN_FOCAL_REL,
 ) -> PickedPose:
     """Pose by picked correspondences, if they determine it and do not contradict each other.
@@ -107,14 +116,12 @@ def pose_from_picks(
             f"picks of {picks.image}: expected at least {least}{unknown}, found {count}; "
             "add well-spread points"
         )
-    sigma_px = options.pick_sigma_px_rel * max(camera.width, camera.height)
-    settings = PickFitOptions(sigma_px=sigma_px, sigma_m=options.pick_sigma_m)
-    fit = fit_picks(picks.pixels, points, camera, focal_rel, settings)
-    _check(picks, points, fit, present, options)
+    fit = fit_picks(picks.pixels, points, camera, focal_rel)
+    _check(picks, points, fit, present)
     assert fit is not None
-    prior = _prior(fit.cam_from_local, fit.covariance, options)
+    prior = _prior(fit.cam_from_local, fit.covariance)
     widest_deg = max(prior.sigma_tilt_deg, prior.sigma_heading_deg)
-    if prior.sigma_horizontal_m > options.max_pick_sigma_m or widest_deg > options.max_pick_sigma_deg:
+    if prior.sigma_horizontal_m > _MAX_PICK_SIGMA_M or widest_deg > _MAX_PICK_SIGMA_DEG:
         raise RegistrationError(
             f"picks of {picks.image}: they leave the pose open to {prior.sigma_horizontal_m:.0f} m and "
             f"{widest_deg:.0f} degrees; spread them over the photo"
@@ -125,9 +132,7 @@ def pose_from_picks(
     )
 
 
-def _check(
-    picks: Picks, points: FloatArray, fit: PickFit | None, present: Rigid3 | None, options: StartOptions
-) -> None:
+def _check(picks: Picks, points: FloatArray, fit: PickFit | None, present: Rigid3 | None) -> None:
     """Refuse what contradicts itself or the map.
 
     Raises:
@@ -160,20 +165,20 @@ def _check(
         return
     cosine = fit.cam_from_local.rotation[:, 2] @ present.rotation[:, 2]
     tilt = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    if tilt > options.max_pick_tilt_deg:
+    if tilt > _MAX_PICK_TILT_DEG:
         raise RegistrationError(
             f"picks of {picks.image}: they turn the camera's vertical by {tilt:.0f} degrees against the map; "
             "are easting and northing, or pixel x and y, swapped?"
         )
 
 
-def _prior(pose: Rigid3, covariance: FloatArray, options: StartOptions) -> FramePrior:
+def _prior(pose: Rigid3, covariance: FloatArray) -> FramePrior:
     """From a covariance of rotation about the local axes and centre."""
     sigma = np.sqrt(np.diag(covariance))
     return FramePrior(
         cam_from_local=pose,
-        sigma_horizontal_m=max(float(sigma[3:5].max()), options.min_sigma_horizontal_m),
-        sigma_vertical_m=max(float(sigma[5]), options.min_sigma_vertical_m),
-        sigma_heading_deg=max(float(np.degrees(sigma[2])), options.min_sigma_angle_deg),
-        sigma_tilt_deg=max(float(np.degrees(sigma[:2].max())), options.min_sigma_angle_deg),
+        sigma_horizontal_m=max(float(sigma[3:5].max()), MIN_SIGMA_HORIZONTAL_M),
+        sigma_vertical_m=max(float(sigma[5]), MIN_SIGMA_VERTICAL_M),
+        sigma_heading_deg=max(float(np.degrees(sigma[2])), MIN_SIGMA_ANGLE_DEG),
+        sigma_tilt_deg=max(float(np.degrees(sigma[:2].max())), MIN_SIGMA_ANGLE_DEG),
     )

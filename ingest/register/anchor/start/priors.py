@@ -16,39 +16,16 @@ from featuredb.maps.unplaced_map import AnyMap
 from featuredb.render.cloud import PointCloud
 from ingest.register.frame_registration import FramePrior
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartOptions:
-    """How far a start is trusted.
-
-    Attributes:
-        min_sigma_horizontal_m: scans and maps of different makers disagree by that much without anyone's
-            fault (datum realisations, plate motion).
-        min_sigma_vertical_m: after the heights of map and scan have been compared.
-        min_sigma_angle_deg: bent reconstructions turn single frames by some tenths of a degree.
-        shift_reach_m: a map point that finds no scan point within this horizontal distance says nothing of
-            the height; a few times the spacing of sparse airborne scans.
-        min_shift_points: fewer give no height.
-        max_shift_points: more only take longer.
-        pick_sigma_px_rel: how well a person marks a point, as a share of the image's longer side: 3 pixels
-            in 4000.
-        pick_sigma_m: how well a person reads a coordinate off a scan.
-        max_pick_sigma_m, max_pick_sigma_deg: picks on a line or close together leave the pose open.
-        max_pick_tilt_deg: between the vertical by the picks and by the map: reconstructions placed by GPS
-            know it to degrees, and swapped columns turn the ground upside down.
-    """
-
-    min_sigma_horizontal_m: float = 1.0
-    min_sigma_vertical_m: float = 1.0
-    min_sigma_angle_deg: float = 1.0
-    shift_reach_m: float = 3.0
-    min_shift_points: int = 30
-    max_shift_points: int = 5000
-    pick_sigma_px_rel: float = 0.00075
-    pick_sigma_m: float = 0.2
-    max_pick_sigma_m: float = 20.0
-    max_pick_sigma_deg: float = 10.0
-    max_pick_tilt_deg: float = 45.0
+# Scans and maps of different makers disagree by that much without anyone's fault (datum realisations, plate
+# motion).
+MIN_SIGMA_HORIZONTAL_M = 1.0
+MIN_SIGMA_VERTICAL_M = 1.0  # after the heights of map and scan have been compared
+MIN_SIGMA_ANGLE_DEG = 1.0  # bent reconstructions turn single frames by some tenths of a degree
+# A map point that finds no scan point within this horizontal distance says nothing of the height; a few times
+# the spacing of sparse airborne scans.
+_SHIFT_REACH_M = 3.0
+_MIN_SHIFT_POINTS = 30  # fewer give no height
+_MAX_SHIFT_POINTS = 5000  # more only take longer
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,16 +37,14 @@ class HeightShift:
         sigma_m: robust standard deviation of one point's difference (roughness, slope times horizontal
             error, vegetation).
         points: map points that had a scan point near.
-        share: of the map's points.
     """
 
     shift_m: float
     sigma_m: float
     points: int
-    share: float
 
 
-def height_shift(feature_map: FeatureMap, cloud: PointCloud, options: StartOptions) -> HeightShift | None:
+def height_shift(feature_map: FeatureMap, cloud: PointCloud) -> HeightShift | None:
     """Compare heights where map points and scan points lie above each other; None where they hardly do.
 
     The surface at a place is the scan point nearest in plan. Horizontal errors of some metres only widen the
@@ -78,19 +53,19 @@ def height_shift(feature_map: FeatureMap, cloud: PointCloud, options: StartOptio
     if not len(cloud):
         return None
     points = feature_map.points_local(cloud.frame)
-    step = max(1, len(points) // options.max_shift_points)
+    step = max(1, len(points) // _MAX_SHIFT_POINTS)
     points = points[::step]
     low, high = points.min(axis=0)[:2], points.max(axis=0)[:2]
-    near = (
-        (cloud.xyz[:, :2] >= low - options.shift_reach_m) & (cloud.xyz[:, :2] <= high + options.shift_reach_m)
-    ).all(axis=1)
+    near = ((cloud.xyz[:, :2] >= low - _SHIFT_REACH_M) & (cloud.xyz[:, :2] <= high + _SHIFT_REACH_M)).all(
+        axis=1
+    )
     if not near.any():
         return None
     scan = cloud.xyz[near].astype(np.float64)
     scan = scan[:: max(1, len(scan) // 1_000_000)]  # a point in half a metre is enough for a height
-    distance, nearest = cKDTree(scan[:, :2]).query(points[:, :2], distance_upper_bound=options.shift_reach_m)
+    distance, nearest = cKDTree(scan[:, :2]).query(points[:, :2], distance_upper_bound=_SHIFT_REACH_M)
     found = np.isfinite(distance)
-    if found.sum() < options.min_shift_points:
+    if found.sum() < _MIN_SHIFT_POINTS:
         return None
     difference = scan[np.asarray(nearest)[found], 2] - points[found, 2]
     median = float(np.median(difference))
@@ -98,16 +73,10 @@ def height_shift(feature_map: FeatureMap, cloud: PointCloud, options: StartOptio
         shift_m=median,
         sigma_m=float(1.4826 * np.median(np.abs(difference - median))),
         points=int(found.sum()),
-        share=float(found.mean()),
     )
 
 
-def prior_from_map(
-    feature_map: FeatureMap,
-    image: MapImage,
-    shift: HeightShift | None,
-    options: StartOptions,
-) -> FramePrior:
+def prior_from_map(feature_map: FeatureMap, image: MapImage, shift: HeightShift | None) -> FramePrior:
     """The pose that the map's present placement gives, with the placement's uncertainty.
 
     Args:
@@ -126,12 +95,12 @@ def prior_from_map(
     return FramePrior(
         cam_from_local=pose,
         sigma_horizontal_m=max(
-            float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])), options.min_sigma_horizontal_m
+            float(np.sqrt(np.linalg.eigvalsh(spread[:2, :2])[-1])), MIN_SIGMA_HORIZONTAL_M
         ),
-        sigma_vertical_m=max(vertical, options.min_sigma_vertical_m),
-        sigma_heading_deg=max(float(np.degrees(np.sqrt(covariance[3, 3]))), options.min_sigma_angle_deg),
+        sigma_vertical_m=max(vertical, MIN_SIGMA_VERTICAL_M),
+        sigma_heading_deg=max(float(np.degrees(np.sqrt(covariance[3, 3]))), MIN_SIGMA_ANGLE_DEG),
         sigma_tilt_deg=max(
-            float(np.degrees(np.sqrt(max(covariance[1, 1], covariance[2, 2])))), options.min_sigma_angle_deg
+            float(np.degrees(np.sqrt(max(covariance[1, 1], covariance[2, 2])))), MIN_SIGMA_ANGLE_DEG
         ),
     )
 

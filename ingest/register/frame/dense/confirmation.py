@@ -7,7 +7,7 @@ its pieces at the middle; a wrong one, even when it was fitted to the same pictu
 six free parameters give. The evidence is the binomial tail. It does not ask how the pose was found.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -19,9 +19,14 @@ from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view, with_margin
-from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture
+from ingest.register.frame.dense.pictures import (
+    PinholeView,
+    finest_side_px,
+    oriented_gradients,
+    pinhole_view,
+    source_picture,
+    with_margin,
+)
 from ingest.register.frame.dense.score_maps import (
     ScoreMaps,
     TemplateOptions,
@@ -34,49 +39,38 @@ from ingest.register.frame_registration import RenderSource
 _OVERLAP = 2  # pieces that overlap by half say about half as much as ones that do not
 
 
+# Where the line between confirmed and not is; docs/registration.md shows the distributions behind it.
+_SIDE_PX = 480  # longer side of the view on which pieces are compared, where the scan is dense enough
+_SEARCH_PX = 16  # radius of the window in which a piece is searched
+_NEAR_PX = 3.0  # a piece agrees with the pose when its best place is this near
+_MIN_PIECES = 25  # fewer pieces with structure cannot confirm anything
+# Side of a piece, as a share of the view's longer side, between these.
+_PIECE_SHARE = 0.21
+_MIN_PIECE_PX = 40
+_MAX_PIECE_PX = 40
+# A pose is refused when less than that share of the lower half of the pieces, by height, agrees while of the
+# upper half that many times as many do, and the halves lie that far apart: then what stands on the ground was
+# matched, which an ortho image shows displaced, and not the ground.
+_MIN_LOW_AGREEING = 0.2
+_MAX_LAYER_RATIO = 1.5
+_MIN_LAYER_M = 2.0
+# Smallest evidence, -log10 of the probability that chance puts as many so near, less six free parameters'
+# worth.
+MIN_LOG_NFA = 5.0
+_MIN_CELLS = 4  # of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConfirmOptions:
     """Where the line between confirmed and not is; docs/registration.md shows the distributions behind it.
 
     Attributes:
-        side_px: longer side of the view on which pieces are compared, where the scan is dense enough:
         finest_spacing: a pixel is at least this share of the mean distance between scan points.
-        search_px: radius of the window in which a piece is searched.
-        near_px: a piece agrees with the pose when its best place is this near.
-        min_pieces: fewer pieces with structure cannot confirm anything.
-        piece_share, min_piece_px, max_piece_px: side of a piece, as a share of the view's longer side,
-            between these.
         min_agreeing: smallest share of pieces that agree.
-        min_low_agreeing, max_layer_ratio, min_layer_m: a pose is refused when less than that share of the
-            lower half of the pieces, by height, agrees while of the upper half that many times as many do,
-            and the halves lie that far apart: then what stands on the ground was matched, which an ortho
-            image shows displaced, and not the ground.
-        min_log_nfa: smallest evidence, -log10 of the probability that chance puts as many so near, less six
-            free parameters' worth.
-        min_cells: of 16 parts of the photo, how many must hold a piece that agrees: a pose needs width.
     """
 
-    side_px: int = 480
     finest_spacing: float = 1.2
-    search_px: int = 16
-    near_px: float = 3.0
-    min_pieces: int = 25
-    piece_share: float = 0.21
-    min_piece_px: int = 40
-    max_piece_px: int = 40
     min_agreeing: float = 0.18
-    min_low_agreeing: float = 0.2
-    max_layer_ratio: float = 1.5
-    min_layer_m: float = 2.0
-    min_log_nfa: float = 5.0
-    min_cells: int = 4
-    gradients: GradientOptions = field(default_factory=GradientOptions)
-
-    def pieces_of(self, camera: Camera) -> TemplateOptions:
-        """Pieces for a view, overlapping by half."""
-        size = round(self.piece_share * max(camera.width, camera.height) / 2.0) * 2
-        size = int(np.clip(size, self.min_piece_px, self.max_piece_px))
-        return TemplateOptions(size_px=size, spacing_px=size // 2, max_count=600)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,22 +112,22 @@ def confirm_pose(
         photo_gray: (h, w) uint8 of `camera`'s size.
     """
     finest = finest_side_px(camera, cam_from_local, cloud, options.finest_spacing)
-    view = pinhole_view(photo_gray, camera, min(options.side_px, finest))
+    view = pinhole_view(photo_gray, camera, min(_SIDE_PX, finest))
     maps = _maps(view, cam_from_local, cloud, source, options)
     n = len(maps)
-    if n < options.min_pieces:
+    if n < _MIN_PIECES:
         return PictureConfirmation(
             confirmed=False,
             pieces=n,
             agreeing=0,
             log_nfa=0.0,
             cells=0,
-            message=f"only {n} pieces of the picture have structure, {options.min_pieces} are needed",
+            message=f"only {n} pieces of the picture have structure, {_MIN_PIECES} are needed",
         )
     places, _ = peaks(maps.maps)
-    off = places - options.search_px
-    near = np.linalg.norm(off, axis=1) <= options.near_px
-    chance = np.pi * (options.near_px + 0.5) ** 2 / (2 * options.search_px + 1) ** 2
+    off = places - _SEARCH_PX
+    near = np.linalg.norm(off, axis=1) <= _NEAR_PX
+    chance = np.pi * (_NEAR_PX + 0.5) ** 2 / (2 * _SEARCH_PX + 1) ** 2
     agreeing = int(near.sum())
     # Six parameters can bring three pieces into place whatever they show.
     free, total = max(agreeing // _OVERLAP - 3, 0), n // _OVERLAP - 3
@@ -155,13 +149,16 @@ def confirm_pose(
 def _maps(
     view: PinholeView, pose: Rigid3, cloud: PointCloud, source: RenderSource, options: ConfirmOptions
 ) -> ScoreMaps:
-    pieces = options.pieces_of(view.camera)
+    # Overlapping by half.
+    size = round(_PIECE_SHARE * max(view.camera.width, view.camera.height) / 2.0) * 2
+    size = int(np.clip(size, _MIN_PIECE_PX, _MAX_PIECE_PX))
+    pieces = TemplateOptions(size_px=size, spacing_px=size // 2, max_count=600)
     margin = pieces.size_px // 2
     rendering = render(cloud, with_margin(view.camera, margin), pose, RenderOptions(threads=1))
-    channels = oriented_gradients(source_picture(rendering, source), rendering.valid, options.gradients)
+    channels = oriented_gradients(source_picture(rendering, source), rendering.valid)
     templates = cut_templates(channels, rendering, pieces)
-    photo = oriented_gradients(view.image, view.valid, options.gradients)
-    return search_around(templates, photo, view.camera, pose, options.search_px)
+    photo = oriented_gradients(view.image, view.valid)
+    return search_around(templates, photo, view.camera, pose, _SEARCH_PX)
 
 
 class _Layers(NamedTuple):
@@ -185,13 +182,11 @@ def _objection(share: float, log_nfa: float, cells: int, layers: _Layers, option
         return (
             f"{share:.0%} of the pieces lie where the pose puts them, {options.min_agreeing:.0%} are needed"
         )
-    if log_nfa < options.min_log_nfa:
-        return f"evidence of 10^-{log_nfa:.1f} against chance, 10^-{options.min_log_nfa:g} is needed"
-    if cells < options.min_cells:
-        return f"agreement in {cells} of 16 parts of the picture, {options.min_cells} are needed"
-    ground_differs = (
-        layers.low < options.min_low_agreeing and layers.high > options.max_layer_ratio * layers.low
-    )
-    if ground_differs and layers.apart_m > options.min_layer_m:
+    if log_nfa < MIN_LOG_NFA:
+        return f"evidence of 10^-{log_nfa:.1f} against chance, 10^-{MIN_LOG_NFA:g} is needed"
+    if cells < _MIN_CELLS:
+        return f"agreement in {cells} of 16 parts of the picture, {_MIN_CELLS} are needed"
+    ground_differs = layers.low < _MIN_LOW_AGREEING and layers.high > _MAX_LAYER_RATIO * layers.low
+    if ground_differs and layers.apart_m > _MIN_LAYER_M:
         return f"{layers.low:.0%} of the lower pieces agree and {layers.high:.0%} of the upper ones"
     return ""

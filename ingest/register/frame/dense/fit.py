@@ -6,7 +6,7 @@ A single piece is off by a pixel or two where laser intensity and photo show an 
 three hundred average.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,41 +14,25 @@ from numpy.typing import NDArray
 
 from featuredb.geometry.camera import Camera
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.dense.scan_pictures import source_picture
+from ingest.register.frame.dense.confirmation import PictureConfirmation, confirm_pose
+from ingest.register.frame.dense.pictures import oriented_gradients, source_picture
 from ingest.register.frame.dense.score_maps import TemplateOptions, cut_templates, peaks, search_around
+from ingest.register.frame.dense.search import register_dense, searched_near
 from ingest.register.frame.features.matching import FrameMatches
-from ingest.register.frame_registration import RenderSource
+from ingest.register.frame.features.search import FrameHypothesis, independent, unmatched
+from ingest.register.frame.options import DenseFitOptions
+from ingest.register.frame.prior_fit import fitted_under_prior
+from ingest.register.frame.views import MIN_SIDE_PX, FrameViews
+from ingest.register.frame_registration import FramePrior, RenderSource
+from reloc.localise.options import PoseOptions
+from reloc.localise.pose import refine_pose
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DenseFitOptions:
-    """How pieces are matched; lengths in pixels of the render.
-
-    Attributes:
-        spacing_px: distance of neighbouring scan points in the renders, round by round: finer than the scan,
-            since edges between splats are known better than their spacing.
-        piece_px: side of a piece, round by round.
-        more_rounds: at most, like the last one, until the pose moves less than settled_px.
-        near_px: a piece's place is looked for this near, round by round: the first takes up what the search
-            left.
-        window_px: radius of the score map against whose spread a place is judged.
-        min_score: height of a place in standard deviations of its map. Low: the robust loss weighs them, and
-            a piece that has structure along one direction only still says where it is across.
-        tolerance_px: of an inlier.
-        max_pieces: per round.
-    """
-
-    spacing_px: tuple[float, ...] = (2.4, 3.75, 3.75)
-    piece_px: tuple[int, ...] = (28, 40, 40)
-    more_rounds: int = 8
-    settled_px: float = 0.2
-    near_px: tuple[int, ...] = (10, 6, 6)
-    window_px: int = 12
-    min_score: float = 1.5
-    tolerance_px: float = 4.0
-    max_pieces: int = 400
-    gradients: GradientOptions = field(default_factory=GradientOptions)
+_WINDOW_PX = 12  # radius of the score map against whose spread a place is judged
+# Height of a place in standard deviations of its map. Low: the robust loss weighs them, and a piece that has
+# structure along one direction only still says where it is across.
+_MIN_SCORE = 1.5
+_TOLERANCE_PX = 4.0  # of an inlier
+_MAX_PIECES = 400  # per round
 
 
 def near_places(
@@ -58,28 +42,123 @@ def near_places(
     source: RenderSource,
     piece_px: int,
     near_px: int,
-    options: DenseFitOptions,
 ) -> FrameMatches:
     """Pieces of a render, and where in the photo they fit best near where the render's pose puts them.
 
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size. rendering: made with that camera, shrunk.
     """
-    channels = oriented_gradients(source_picture(rendering, source), rendering.valid, options.gradients)
-    pieces = TemplateOptions(size_px=piece_px, spacing_px=piece_px // 2, max_count=options.max_pieces)
+    channels = oriented_gradients(source_picture(rendering, source), rendering.valid)
+    pieces = TemplateOptions(size_px=piece_px, spacing_px=piece_px // 2, max_count=_MAX_PIECES)
     templates = cut_templates(channels, rendering, pieces)
     size = (rendering.camera.width, rendering.camera.height)
     small = np.asarray(cv2.resize(photo_gray, size, interpolation=cv2.INTER_AREA))
-    photo = oriented_gradients(small, None, options.gradients)
-    maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, options.window_px)
+    photo = oriented_gradients(small, None)
+    maps = search_around(templates, photo, rendering.camera, rendering.cam_from_local, _WINDOW_PX)
     if len(maps) == 0:
         return FrameMatches(pixels=np.empty((0, 2)), points=np.empty((0, 3)))
-    cut = options.window_px - near_px
+    cut = _WINDOW_PX - near_px
     inner = np.ascontiguousarray(maps.maps[:, cut : maps.maps.shape[1] - cut, cut : maps.maps.shape[2] - cut])
     places, scores = peaks(inner)
     # A place on the rim has its top outside: the piece saw nothing here.
-    good = (scores >= options.min_score) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
+    good = (scores >= _MIN_SCORE) & (np.abs(places - near_px).max(axis=1) < near_px - 0.6)
     scale = np.array([camera.width / size[0], camera.height / size[1]])
     return FrameMatches(
         pixels=(maps.origin + cut + places)[good] * scale, points=np.asarray(maps.points_local)[good]
+    )
+
+
+_MIN_PLACES = 12  # twice what six parameters need
+_FINALISTS = 3  # their scores are often nearly equal; pieces on their own tell them apart
+_MAX_SIDE_PX = 1200  # beyond, pieces of 40 px are too small a part of the picture to have structure
+
+
+def dense_hypotheses(views: FrameViews, prior: FramePrior, source: RenderSource) -> list[FrameHypothesis]:
+    """The best few poses that dense templates find around the prior; no matches behind them yet."""
+    found = register_dense(views.gray, views.camera, prior, views.cloud, source)
+    return [
+        replace(unmatched(pose.cam_from_local, views.camera, source, "dense"), candidates=pose.pieces)
+        for pose in found[:_FINALISTS]
+    ]
+
+
+def dense_fitted(
+    views: FrameViews, prior: FramePrior, start: FrameHypothesis, options: DenseFitOptions
+) -> FrameHypothesis | None:
+    """The pose fitted to all pieces near it, under the prior, coarse to fine; None with too few."""
+    found: FrameHypothesis | None = start
+    rounds = list(zip(options.spacing_px, options.piece_px, options.near_px, strict=True))
+    for sizes in rounds:
+        found = found and _fit_round(views, prior, found, *sizes)
+    # A pose that is still on its way may look right already: the pieces that lie near have made it.
+    for _ in range(options.more_rounds):
+        before = found
+        found = found and _fit_round(views, prior, found, *rounds[-1])
+        if before is None or found is None or _moved_px(views, before, found) < 0.2:
+            break
+    return found
+
+
+def searched_again(views: FrameViews, prior: FramePrior, found: FrameHypothesis) -> FrameHypothesis | None:
+    """The dense search's own maximum next to a pose that was fitted; None where there is none."""
+    pose = found.pose.cam_from_local
+    near = searched_near(views.gray, found.pose.camera, pose, prior, views.cloud, found.source)
+    if near is None:
+        return None
+    return replace(found, pose=replace(found.pose, cam_from_local=near.cam_from_local))
+
+
+def _fit_round(
+    views: FrameViews,
+    prior: FramePrior,
+    start: FrameHypothesis,
+    spacing_px: float,
+    piece_px: int,
+    near_px: int,
+) -> FrameHypothesis | None:
+    renderings = views.renders([start.pose.cam_from_local], dense_side_px(views, spacing_px))
+    if not renderings:
+        return None
+    matches = near_places(views.gray, views.camera, renderings[0], start.source, piece_px, near_px)
+    if len(matches) < _MIN_PLACES:
+        return None
+    settings = dense_pose_options(views, spacing_px)
+    pose = refine_pose(matches.pixels, matches.points, start.pose, settings)
+    pose = fitted_under_prior(matches, pose, prior, settings)
+    inliers = independent(views.camera, matches.take(pose.inliers))
+    return replace(start, pose=pose, matches=matches, inliers=inliers)
+
+
+def _moved_px(views: FrameViews, before: FrameHypothesis, after: FrameHypothesis) -> float:
+    """How far the fit moved its matches in the picture, in the middle, pixels of the render."""
+    here, there = (
+        views.camera.project(found.pose.cam_from_local.act(after.matches.points)) for found in (before, after)
+    )
+    scale = dense_side_px(views, views.options.dense_fit.spacing_px[-1]) / max(
+        views.camera.width, views.camera.height
+    )
+    return float(np.median(np.linalg.norm(here - there, axis=1))) * scale
+
+
+def dense_pose_options(views: FrameViews, spacing_px: float) -> PoseOptions:
+    """Inlier tolerance of the fit, as a share of the longer side."""
+    return PoseOptions(tolerance_rel=_TOLERANCE_PX / dense_side_px(views, spacing_px))
+
+
+def dense_side_px(views: FrameViews, spacing_px: float) -> int:
+    """Longer side of renders in which neighbouring scan points are `spacing_px` apart."""
+    side = max(views.camera.width, views.camera.height)
+    wanted = round(spacing_px * side / max(views.spacing_full_px, 1e-6))
+    return int(np.clip(wanted, min(MIN_SIDE_PX, side), min(_MAX_SIDE_PX, side)))
+
+
+def confirmed(views: FrameViews, found: FrameHypothesis) -> PictureConfirmation:
+    """What the pictures say of a pose."""
+    return confirm_pose(
+        views.gray,
+        found.pose.camera,
+        found.pose.cam_from_local,
+        views.cloud,
+        found.source,
+        views.options.confirm,
     )

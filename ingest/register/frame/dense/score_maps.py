@@ -15,9 +15,15 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.dense.oriented_gradients import FloatImage
+from ingest.register.frame.dense.pictures import FloatImage
 
 _MIN_OVERLAP = 0.6  # of a piece that lies over the photo's border
+
+
+_MIN_VALID = 0.6  # share of the piece that must show the scan
+# Mean squared length of its channels; below it there is no edge to hold on to. White noise has 0.1, a kerb
+# through the piece 0.3.
+_MIN_STRUCTURE = 0.05
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,16 +34,11 @@ class TemplateOptions:
         size_px: side of a square piece. Larger ones are more distinct and bear less change of view; 40 pixels
             found airborne intensity from far off where 28 did not.
         spacing_px: between neighbours on the grid; half the size, so that each edge is in the middle of one.
-        min_valid: share of the piece that must show the scan.
-        min_structure: mean squared length of its channels; below it there is no edge to hold on to. White
-            noise has 0.1, a kerb through the piece 0.3.
         max_count: the ones with most structure are kept; bounds the time.
     """
 
     size_px: int = 40
     spacing_px: int = 20
-    min_valid: float = 0.6
-    min_structure: float = 0.05
     max_count: int = 260
 
 
@@ -92,7 +93,7 @@ def cut_templates(channels: FloatImage, rendering: Rendering, options: TemplateO
     rows, columns = (axis.ravel() for axis in grid)
     valid = _window_means(rendering.valid.astype(np.float32), size)[rows, columns]
     structure = _window_means(np.einsum("khw,khw->hw", channels, channels), size)[rows, columns]
-    keep = np.flatnonzero((valid >= options.min_valid) & (structure >= options.min_structure))
+    keep = np.flatnonzero((valid >= _MIN_VALID) & (structure >= _MIN_STRUCTURE))
     keep = np.sort(keep[np.argsort(-structure[keep], kind="stable")[: options.max_count]])
     rows, columns = rows[keep], columns[keep]
     points, known = _centre_points(rendering, rows + size / 2.0, columns + size / 2.0)

@@ -8,7 +8,7 @@ poses at low resolution, then by downhill simplex, rendering anew at each octave
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,15 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
-from ingest.register.frame.dense.oriented_gradients import GradientOptions, oriented_gradients
-from ingest.register.frame.dense.pinhole_view import PinholeView, pinhole_view, with_margin
-from ingest.register.frame.dense.scan_pictures import finest_side_px, source_picture, viewing_distance_m
+from ingest.register.frame.dense.pictures import (
+    PinholeView,
+    finest_side_px,
+    oriented_gradients,
+    pinhole_view,
+    source_picture,
+    viewing_distance_m,
+    with_margin,
+)
 from ingest.register.frame.dense.score_maps import (
     ScoreMaps,
     TemplateOptions,
@@ -34,47 +40,31 @@ from ingest.register.frame.dense.score_maps import (
 from ingest.register.frame.prior_fit import prior_sigmas
 from ingest.register.frame_registration import FramePrior, RenderSource
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DenseOptions:
-    """Settings of the coarse-to-fine search.
-
-    Attributes:
-        sides_px: longer side of the photo's view at each octave, coarse to fine. Octaves finer than the
-            scan's points allow (`finest_spacing`) are left out.
-        finest_spacing: a pixel of the finest view is at least this share of the scan's point spacing; below,
-            splats are larger than details.
-        reach_sigma: how far from the prior is searched.
-        max_margin: the render reaches at most this share of the view's longer side beyond it, on each side;
-            bounds the time when a prior is nearly unknown.
-        turn_step_deg: renders are made for turns about the optical axis this far apart; pieces bear 6
-            degrees.
-        grid_step_px: of pan and tilt in the vote; half the width of a score map's peak.
-        parallax_step_px: positions are tried so close that neighbours differ by this in the picture after pan
-            and tilt have taken up the common shift.
-        candidates: poses from the vote that are refined; kept: those that go on to the next octave.
-        separation_px: two candidates are different if they predict pixels this far apart.
-        refine_radius_px: of the score maps at the finer octaves.
-        score_clip: a single piece counts no more than this many standard deviations.
-        score_weight: of the summed scores against the prior; pieces overlap, so each says less than it seems.
-    """
-
-    sides_px: tuple[int, ...] = (128, 256, 512)
-    finest_spacing: float = 1.2
-    reach_sigma: float = 2.5
-    max_margin: float = 1.6
-    turn_step_deg: float = 6.0
-    grid_step_px: float = 2.0
-    parallax_step_px: float = 5.0
-    max_positions_per_axis: int = 5
-    candidates: int = 12
-    kept: int = 6
-    separation_px: float = 5.0
-    refine_radius_px: int = 12
-    score_clip: float = 6.0
-    score_weight: float = 0.3
-    gradients: GradientOptions = field(default_factory=GradientOptions)
-    templates: TemplateOptions = field(default_factory=TemplateOptions)
+# Longer side of the photo's view at each octave, coarse to fine. Octaves finer than the scan's points allow
+# (_FINEST_SPACING) are left out.
+_SIDES_PX = (128, 256, 512)
+# A pixel of the finest view is at least this share of the scan's point spacing; below, splats are larger than
+# details.
+_FINEST_SPACING = 1.2
+REACH_SIGMA = 2.5  # how far from the prior is searched
+# The render reaches at most this share of the view's longer side beyond it, on each side; bounds the time
+# when a prior is nearly unknown.
+_MAX_MARGIN = 1.6
+# Renders are made for turns about the optical axis this far apart; pieces bear 6 degrees.
+_TURN_STEP_DEG = 6.0
+_GRID_STEP_PX = 2.0  # of pan and tilt in the vote; half the width of a score map's peak
+# Positions are tried so close that neighbours differ by this in the picture after pan and tilt have taken up
+# the common shift.
+_PARALLAX_STEP_PX = 5.0
+# Poses from the vote that are refined; kept: those that go on to the next octave.
+_CANDIDATES = 12
+_KEPT = 6
+_SEPARATION_PX = 5.0  # two candidates are different if they predict pixels this far apart
+_REFINE_RADIUS_PX = 12  # of the score maps at the finer octaves
+_SCORE_CLIP = 6.0  # a single piece counts no more than this many standard deviations
+_SCORE_WEIGHT = 0.3  # of the summed scores against the prior; pieces overlap, so each says less than it seems
+_MAX_POSITIONS_PER_AXIS = 5
+_MIN_PIECES = 12  # fewer pieces are not to win by chance
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,16 +82,12 @@ class DensePose:
     pieces: int
 
 
-_MIN_PIECES = 12  # fewer pieces are not to win by chance
-
-
 def register_dense(
     photo_gray: NDArray[np.uint8],
     camera: Camera,
     prior: FramePrior,
     cloud: PointCloud,
-    source: RenderSource = "intensity",
-    options: DenseOptions = DenseOptions(),
+    source: RenderSource,
 ) -> list[DensePose]:
     """Poses of a photo, best first; empty where the scan shows nothing that could be searched for.
 
@@ -110,14 +96,14 @@ def register_dense(
     Args:
         photo_gray: (h, w) uint8 of `camera`'s size.
     """
-    views = [pinhole_view(photo_gray, camera, side) for side in _sides(camera, prior, cloud, options)]
-    poses = _vote(views[0], prior, cloud, source, options)
+    views = [pinhole_view(photo_gray, camera, side) for side in _sides(camera, prior, cloud)]
+    poses = _vote(views[0], prior, cloud, source)
     for octave, view in enumerate(views):
-        refined = [_refined(view, pose, prior, cloud, source, options) for pose in poses]
+        refined = [_refined(view, pose, prior, cloud, source) for pose in poses]
         found = sorted((p for p in refined if p is not None), key=lambda p: -p.score)
-        distinct = _distinct(found, view.camera, prior, options)
+        distinct = _distinct(found, view.camera, prior)
         last = octave == len(views) - 1
-        poses = [p.cam_from_local for p in distinct[: max(1, options.kept // 2**octave)]]
+        poses = [p.cam_from_local for p in distinct[: max(1, _KEPT // 2**octave)]]
         if last or not poses:
             return distinct
     return []
@@ -130,11 +116,10 @@ def searched_near(
     prior: FramePrior,
     cloud: PointCloud,
     source: RenderSource,
-    options: DenseOptions = DenseOptions(),
 ) -> DensePose | None:
     """The highest sum of score maps near a pose, at the finest octave; None where it shows too little."""
-    view = pinhole_view(photo_gray, camera, _sides(camera, prior, cloud, options)[-1])
-    return _refined(view, pose, prior, cloud, source, options)
+    view = pinhole_view(photo_gray, camera, _sides(camera, prior, cloud)[-1])
+    return _refined(view, pose, prior, cloud, source)
 
 
 def score_maps_of(
@@ -143,56 +128,53 @@ def score_maps_of(
     margin_px: int,
     cloud: PointCloud,
     source: RenderSource,
-    options: DenseOptions,
     radius_px: int | None,
 ) -> ScoreMaps:
     """Renders at a pose and searches the pieces in the photo, all over it if `radius_px` is None."""
     rendering = render(cloud, with_margin(view.camera, margin_px), cam_from_local, RenderOptions(threads=1))
     picture = source_picture(rendering, source)
-    channels = oriented_gradients(picture, rendering.valid, options.gradients)
-    templates = cut_templates(channels, rendering, options.templates)
-    photo = oriented_gradients(view.image, view.valid, options.gradients)
+    channels = oriented_gradients(picture, rendering.valid)
+    templates = cut_templates(channels, rendering, TemplateOptions())
+    photo = oriented_gradients(view.image, view.valid)
     if radius_px is None:
         return search_everywhere(templates, photo, view.camera)
     return search_around(templates, photo, view.camera, cam_from_local, radius_px)
 
 
-def _vote(
-    view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource, options: DenseOptions
-) -> list[Rigid3]:
+def _vote(view: PinholeView, prior: FramePrior, cloud: PointCloud, source: RenderSource) -> list[Rigid3]:
     """The best poses of a grid around the prior, at the coarsest octave."""
-    tilt = options.reach_sigma * np.radians(prior.sigma_tilt_deg)
+    tilt = REACH_SIGMA * np.radians(prior.sigma_tilt_deg)
     focal, longer = view.camera.params[0], max(view.camera.width, view.camera.height)
     first = render(cloud, view.camera, prior.cam_from_local, RenderOptions(threads=1, attributes=False))
     depth = first.depth[first.valid].astype(np.float64)
     if len(depth) < 100:
         depth = np.array([viewing_distance_m(cloud, prior.cam_from_local)])
     distance = float(np.median(depth))
-    sideways = options.reach_sigma * prior.sigma_horizontal_m / distance
+    sideways = REACH_SIGMA * prior.sigma_horizontal_m / distance
     reach_px = focal * (np.tan(min(tilt, 1.0)) + sideways)
-    margin = int(min(reach_px, options.max_margin * longer))
-    offsets = _position_offsets(prior, view.camera, depth, options)
-    turns = _turns(prior, options)
-    pans = _pan_tilts(reach_px, view.camera, options)
+    margin = int(min(reach_px, _MAX_MARGIN * longer))
+    offsets = _position_offsets(prior, view.camera, depth)
+    turns = _turns(prior)
+    pans = _pan_tilts(reach_px, view.camera)
     found: list[tuple[float, Rigid3]] = []
     for turn in turns:
         start = Rigid3(rotation=so3_exp([0, 0, turn]), translation=np.zeros(3)) @ prior.cam_from_local
-        maps = score_maps_of(view, start, margin, cloud, source, options, None)
+        maps = score_maps_of(view, start, margin, cloud, source, None)
         if len(maps) < 4:
             continue
         for offset in offsets:
             moved = Rigid3(rotation=start.rotation, translation=start.translation - start.rotation @ offset)
-            scores = _grid_scores(maps, moved, pans, options)
+            scores = _grid_scores(maps, moved, pans)
             for best in np.argsort(-scores)[:3]:
                 turned = Rigid3(rotation=pans[best], translation=np.zeros(3)) @ moved
                 found.append((float(scores[best]), turned))
     found.sort(key=lambda item: -item[0])
     poses = [DensePose(cam_from_local=p, score=s, pieces=0) for s, p in found]
-    distinct = _distinct(poses, view.camera, prior, options)
+    distinct = _distinct(poses, view.camera, prior)
     return [p.cam_from_local for p in distinct]
 
 
-def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray, options: DenseOptions) -> FloatArray:
+def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray) -> FloatArray:
     """Score (m,) of a pose followed by each of m turns (m, 3, 3)."""
     points = pose.act(maps.points_local).astype(np.float32)
     focal, cx, cy = maps.camera.params
@@ -208,14 +190,12 @@ def _grid_scores(maps: ScoreMaps, pose: Rigid3, turns: FloatArray, options: Dens
         row = (cam[..., 1] / z * focal + (cy - y0 + 0.5)).astype(np.int32)
         inside = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (cam[..., 2] > 1e-3)
         value = flat[base + np.where(inside, row * width + column, 0)]
-        value = np.where(inside, np.clip(value, -options.score_clip, options.score_clip), 0.0)
+        value = np.where(inside, np.clip(value, -_SCORE_CLIP, _SCORE_CLIP), 0.0)
         scores[first : first + step] = value.sum(1) / np.sqrt(np.maximum(inside.sum(1), _MIN_PIECES))
     return scores
 
 
-def _position_offsets(
-    prior: FramePrior, camera: Camera, depth: FloatArray, options: DenseOptions
-) -> list[FloatArray]:
+def _position_offsets(prior: FramePrior, camera: Camera, depth: FloatArray) -> list[FloatArray]:
     """Displacements of the camera (3,), metres, local axes: those that no turn can stand for."""
     focal = camera.params[0]
     radius = 0.4 * float(np.hypot(camera.width, camera.height))
@@ -227,8 +207,8 @@ def _position_offsets(
 
     def steps(sigma_m: float, effect_px: float) -> FloatArray:
         reach = 1.6  # sigmas: nine tenths; what lies beyond is within reach of the nearest step
-        count = int(np.ceil(2 * reach * effect_px / options.parallax_step_px))
-        count = min(count | 1, options.max_positions_per_axis)
+        count = int(np.ceil(2 * reach * effect_px / _PARALLAX_STEP_PX))
+        count = min(count | 1, _MAX_POSITIONS_PER_AXIS)
         return np.linspace(-reach, reach, count) * sigma_m if count > 1 else np.zeros(1)
 
     level = steps(prior.sigma_horizontal_m, sideways_px)
@@ -237,24 +217,24 @@ def _position_offsets(
     return [np.array([x, y, z]) for z in upward for y in level for x in level]
 
 
-def _turns(prior: FramePrior, options: DenseOptions) -> list[float]:
+def _turns(prior: FramePrior) -> list[float]:
     """Turns about the optical axis, radians."""
     steepness = abs(float(prior.cam_from_local.rotation[2, 2]))  # 1 when looking straight down
     sigma = float(np.hypot(prior.sigma_heading_deg * steepness, prior.sigma_tilt_deg))
-    reach = min(options.reach_sigma * sigma, 180.0)
-    if reach >= 180.0 - options.turn_step_deg / 2:
-        count = int(np.ceil(360.0 / options.turn_step_deg))
+    reach = min(REACH_SIGMA * sigma, 180.0)
+    if reach >= 180.0 - _TURN_STEP_DEG / 2:
+        count = int(np.ceil(360.0 / _TURN_STEP_DEG))
         return [float(a) for a in 2.0 * np.pi * np.arange(count) / count]
-    side = int(np.ceil(max(0.0, reach - options.turn_step_deg / 2) / options.turn_step_deg))
-    return [float(np.radians(i * options.turn_step_deg)) for i in range(-side, side + 1)]
+    side = int(np.ceil(max(0.0, reach - _TURN_STEP_DEG / 2) / _TURN_STEP_DEG))
+    return [float(np.radians(i * _TURN_STEP_DEG)) for i in range(-side, side + 1)]
 
 
-def _pan_tilts(reach_px: float, camera: Camera, options: DenseOptions) -> FloatArray:
+def _pan_tilts(reach_px: float, camera: Camera) -> FloatArray:
     """Rotations (m, 3, 3) that shift the picture's middle over a disc of the given radius."""
     focal = camera.params[0]
     reach = min(np.arctan(reach_px / focal), np.radians(40.0))
-    side = int(np.ceil(reach * focal / options.grid_step_px))
-    steps = np.arange(-side, side + 1) * (options.grid_step_px / focal)
+    side = int(np.ceil(reach * focal / _GRID_STEP_PX))
+    steps = np.arange(-side, side + 1) * (_GRID_STEP_PX / focal)
     pan, tilt = (axis.ravel() for axis in np.meshgrid(steps, steps))
     angle = np.hypot(pan, tilt)
     pan, tilt, angle = (values[angle <= reach + 1e-9] for values in (pan, tilt, angle))
@@ -270,16 +250,11 @@ def _pan_tilts(reach_px: float, camera: Camera, options: DenseOptions) -> FloatA
 
 
 def _refined(
-    view: PinholeView,
-    pose: Rigid3,
-    prior: FramePrior,
-    cloud: PointCloud,
-    source: RenderSource,
-    options: DenseOptions,
+    view: PinholeView, pose: Rigid3, prior: FramePrior, cloud: PointCloud, source: RenderSource
 ) -> DensePose | None:
     """Downhill simplex on the score maps of a render made at the pose."""
-    radius = options.refine_radius_px
-    maps = score_maps_of(view, pose, radius, cloud, source, options, radius)
+    radius = _REFINE_RADIUS_PX
+    maps = score_maps_of(view, pose, radius, cloud, source, radius)
     if len(maps) < 4:
         return None
     depth = float(np.median(pose.act(maps.points_local)[:, 2]))
@@ -289,8 +264,8 @@ def _refined(
 
     def cost(step: FloatArray) -> float:
         moved = Rigid3.exp(step * scale) @ pose
-        total, _ = _summed(maps, moved, options)
-        return -options.score_weight * total + 0.5 * prior_sigmas(prior, moved) ** 2
+        total, _ = _summed(maps, moved)
+        return -_SCORE_WEIGHT * total + 0.5 * prior_sigmas(prior, moved) ** 2
 
     simplex = np.vstack([np.zeros(6), np.eye(6)])
     result = minimize(
@@ -300,7 +275,7 @@ def _refined(
         options={"initial_simplex": simplex, "maxfev": 300, "xatol": 0.02, "fatol": 0.02, "adaptive": True},
     )
     moved = Rigid3.exp(result.x * scale) @ pose
-    total, pieces = _summed(maps, moved, options)
+    total, pieces = _summed(maps, moved)
     return DensePose(
         cam_from_local=moved,
         score=total / float(np.sqrt(max(pieces, _MIN_PIECES))),
@@ -308,18 +283,16 @@ def _refined(
     )
 
 
-def _summed(maps: ScoreMaps, pose: Rigid3, options: DenseOptions) -> tuple[float, int]:
+def _summed(maps: ScoreMaps, pose: Rigid3) -> tuple[float, int]:
     cam = pose.act(maps.points_local)
     focal, cx, cy = maps.camera.params
     z = np.maximum(cam[:, 2:], 1e-3)
     pixels = cam[:, :2] / z * focal + (cx, cy)
     scores, inside = scores_at(maps, pixels[None])
-    return float(np.clip(scores[0], -options.score_clip, options.score_clip).sum()), int(inside.sum())
+    return float(np.clip(scores[0], -_SCORE_CLIP, _SCORE_CLIP).sum()), int(inside.sum())
 
 
-def _distinct(
-    poses: Sequence[DensePose], camera: Camera, prior: FramePrior, options: DenseOptions
-) -> list[DensePose]:
+def _distinct(poses: Sequence[DensePose], camera: Camera, prior: FramePrior) -> list[DensePose]:
     """The first of those that show something else than every better one, as many as are looked into."""
     kept: list[DensePose] = []
     corners = np.array([(x, y) for y in (0.1, 0.5, 0.9) for x in (0.1, 0.5, 0.9)]) * (
@@ -333,16 +306,16 @@ def _distinct(
         # Compared on a plane across the optical axis, far away beside the step between positions.
         here = cam_from_prior.inverse().act(rays * 100.0)
         pixels = here[:, :2] / np.maximum(here[:, 2:], 1e-3) * camera.params[0]
-        if not seen or np.abs(np.array(seen) - pixels).max(axis=(1, 2)).min() > options.separation_px:
+        if not seen or np.abs(np.array(seen) - pixels).max(axis=(1, 2)).min() > _SEPARATION_PX:
             kept.append(pose)
             seen.append(pixels)
-        if len(kept) == options.candidates:
+        if len(kept) == _CANDIDATES:
             break
     return kept
 
 
-def _sides(camera: Camera, prior: FramePrior, cloud: PointCloud, options: DenseOptions) -> list[int]:
+def _sides(camera: Camera, prior: FramePrior, cloud: PointCloud) -> list[int]:
     """Longer sides of the octaves that photo and scan can fill."""
-    most = finest_side_px(camera, prior.cam_from_local, cloud, options.finest_spacing)
-    sides = [side for side in options.sides_px if side <= 1.2 * most]
-    return sides or [options.sides_px[0]]
+    most = finest_side_px(camera, prior.cam_from_local, cloud, _FINEST_SPACING)
+    sides = [side for side in _SIDES_PX if side <= 1.2 * most]
+    return sides or [_SIDES_PX[0]]

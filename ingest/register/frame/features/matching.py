@@ -1,18 +1,122 @@
-"""Matches between a photo and pooled features of renders, without and with a pose to look from."""
+"""Features of renders, pooled with the scan points that they show, and their matches with a photo."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from featuredb.errors import InvalidValueError
+from featuredb.features.extractor import ExtractorOptions, extract
 from featuredb.features.features import Features
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.nearest import nearest
-from ingest.register.frame.features.pool import Pool
+from featuredb.render.rendering import Rendering
+from featuredb.render.shading import shaded_relief
+from ingest.register.frame_registration import RenderSource
+
+# The product's, with a lower contrast threshold than photos get, since renders are smooth.
+_EXTRACTOR = ExtractorOptions(max_side_px=1600, oversample=1.5, contrast_threshold=0.008)
+# A feature whose surroundings differ by more than this share in depth lies on a silhouette: what it shows is
+# two things, and its depth is a guess.
+_MAX_DEPTH_STEP = 0.04
+_CLEAR_OF_VOID = 0.75  # a feature must keep so many of its radii away from where the render is empty
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pool:
+    """Features of renders with their scan points.
+
+    Attributes:
+        points: (n, 3) local frame, metres.
+        descriptors: (n, 128) uint8.
+    """
+
+    points: FloatArray
+    descriptors: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def pool_features(rendering: Rendering, source: RenderSource, upright: bool, most: int) -> Pool:
+    """At most so many features of a render, lifted to the scan by its depth.
+
+    Raises:
+        InvalidValueError: the scan does not have `source`.
+    """
+    image = filled(source_image(rendering, source), rendering.valid)
+    features = extract(image, replace(_EXTRACTOR, max_features=most, upright=upright))
+    points, good = lift(rendering, features.xy, _MAX_DEPTH_STEP)
+    clear = cv2.distanceTransform(np.pad(rendering.valid, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    column = np.clip(features.xy[:, 0].astype(np.int64), 0, image.shape[1] - 1)
+    row = np.clip(features.xy[:, 1].astype(np.int64), 0, image.shape[0] - 1)
+    good &= clear[row, column] >= _CLEAR_OF_VOID * 0.5 * features.scale
+    return Pool(points=points[good], descriptors=features.descriptors[good])
+
+
+def source_image(rendering: Rendering, source: RenderSource) -> NDArray[np.uint8]:
+    """(h, w) uint8, what the render shows by one of the scan's properties.
+
+    Raises:
+        InvalidValueError: the scan does not have it.
+    """
+    if source == "shaded":
+        return shaded_relief(rendering)
+    if source == "rgb" and rendering.rgb is not None:
+        return np.asarray(cv2.cvtColor(rendering.rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if source == "intensity" and rendering.intensity is not None:
+        return rendering.intensity
+    raise InvalidValueError(f"source_image: expected a scan with {source}, found one without")
+
+
+def filled(image: NDArray[np.uint8], valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """The image with its empty parts filled by what lies around them, so that their borders are no edges."""
+    if valid.all():
+        return image
+    weight, value = valid.astype(np.float32), np.where(valid, image, 0).astype(np.float32)
+    result = value
+    missing = ~valid
+    for size in (15, 61, 241):
+        w = cv2.blur(weight, (size, size))
+        guess = cv2.blur(value, (size, size)) / np.maximum(w, 1e-6)
+        use = missing & (w > 1e-3)
+        result = np.where(use, guess, result)
+        missing &= ~use
+    rest = float(value[valid].mean()) if valid.any() else 0.0
+    return np.asarray(np.clip(np.where(missing, rest, result), 0, 255), dtype=np.uint8)
+
+
+def lift(
+    rendering: Rendering, xy: NDArray[np.floating], max_depth_step: float
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """Scan points (n, 3) under pixels (n, 2) of a render, and which of them can be trusted.
+
+    Not trusted: nothing seen, a closed hole, or a silhouette among the pixel and its neighbours. Points that
+    are not trusted are zero.
+    """
+    height, width = rendering.depth.shape
+    column = np.floor(xy[:, 0]).astype(np.int64)
+    row = np.floor(xy[:, 1]).astype(np.int64)
+    good = (column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1)
+    column, row = np.clip(column, 1, width - 2), np.clip(row, 1, height - 2)
+    around = np.stack(
+        [rendering.depth[row + dy, column + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], axis=1
+    )
+    depth = rendering.depth[row, column].astype(np.float64)
+    good &= np.isfinite(around).all(axis=1) & (rendering.index[row, column] >= 0)
+    span = np.where(good, np.ptp(np.where(np.isfinite(around), around, 0.0), axis=1), np.inf)
+    good &= span <= max_depth_step * np.where(good, depth, 1.0)
+    rays = np.column_stack([rendering.camera.unproject(xy), np.ones(len(xy))])
+    good &= np.isfinite(rays).all(axis=1)
+    in_camera = np.where(good[:, None], rays * np.where(good, depth, 0.0)[:, None], 0.0)
+    points = rendering.cam_from_local.inverse().act(in_camera)
+    return np.where(good[:, None], points, 0.0), good
+
 
 _NEIGHBOURS = 8  # one place is in as many renders of the star; the next place must be among them
 

@@ -9,18 +9,35 @@ import numpy as np
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.render.rendering import Rendering
-from ingest.register.frame.features.consistency import ConsistencyOptions, consistent_matches
-from ingest.register.frame.features.matching import FrameMatches, guided_matches, joined, pooled_matches
-from ingest.register.frame.features.pool import Pool
-from ingest.register.frame.features.star import fan_headings_deg, star_poses, turned_about_vertical
-from ingest.register.frame.options import FrameOptions
+from ingest.register.frame.features.consistency import MAX_TURN_DEG, consistent_matches
+from ingest.register.frame.features.matching import FrameMatches, Pool, guided_matches, joined, pooled_matches
 from ingest.register.frame.prior_fit import fitted_under_prior
-from ingest.register.frame.views import FrameViews
+from ingest.register.frame.views import (
+    FULL_CIRCLE_SIGMA_DEG,
+    FrameViews,
+    fan_headings_deg,
+    star_poses,
+    turned_about_vertical,
+)
 from ingest.register.frame_registration import FramePrior, RenderSource
 from reloc.localise.acceptance import independent_inliers, log_nfa
 from reloc.localise.lens_prior import LensPriors
 from reloc.localise.options import PoseOptions
 from reloc.localise.pose import PoseHypothesis, estimate_pose, refine_pose, reprojection_errors
+
+# Longer side of the renders of the first round and of those from the pose found, at most.
+_SEARCH_SIDE_PX = 960
+_FINAL_SIDE_PX = 1600
+# Per render, and of the photo.
+_SEARCH_FEATURES = 3000
+_FINAL_FEATURES = 6000
+_PHOTO_FEATURES = 5000
+_MAX_RATIO = 0.97  # of descriptor distances, best to next place. Loose: true ones are among the bad.
+_SAME_PLACE = 0.01  # pool points nearer than this share of their distance from the camera are one place
+# Inlier tolerance as a share of the longer side (4 pixels at 1600), where points are denser than pixels;
+# where they are sparser, it grows up to the other.
+_TOLERANCE_REL = 0.0025
+_MAX_TOLERANCE_REL = 0.006
 
 MatchKind = Literal["upright", "oriented", "dense"]
 
@@ -67,23 +84,19 @@ class RenderGroup:
 
 def star_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
     """Renders of the star around the prior: for features with orientation, and upright ones."""
-    options = views.options
-    poses = star_poses(prior, views.look.depth_m, views.camera, options.star)
-    turn = 180.0 if _any_heading(prior, options) else options.consistency.max_turn_deg
-    renderings = views.renders(poses, views.side_px(options.search_side_px))
+    poses = star_poses(prior, views.look.depth_m, views.camera)
+    turn = 180.0 if _any_heading(prior) else MAX_TURN_DEG
+    renderings = views.renders(poses, views.side_px(_SEARCH_SIDE_PX))
     return [RenderGroup(reference=prior.cam_from_local, renderings=renderings, max_turn_deg=turn)]
 
 
 def fan_groups(views: FrameViews, prior: FramePrior) -> list[RenderGroup]:
     """Renders at the headings that the star leaves out, one view each; none where the heading is known."""
-    options = views.options
     groups = []
-    for angle in fan_headings_deg(prior.sigma_heading_deg, options.star)[1:]:
+    for angle in fan_headings_deg(prior.sigma_heading_deg)[1:]:
         pose = turned_about_vertical(prior.cam_from_local, angle)
-        renderings = views.renders([pose], views.side_px(options.search_side_px))
-        groups.append(
-            RenderGroup(reference=pose, renderings=renderings, max_turn_deg=options.consistency.max_turn_deg)
-        )
+        renderings = views.renders([pose], views.side_px(_SEARCH_SIDE_PX))
+        groups.append(RenderGroup(reference=pose, renderings=renderings, max_turn_deg=MAX_TURN_DEG))
     return groups
 
 
@@ -96,20 +109,15 @@ def search(
     views: FrameViews, groups: Sequence[RenderGroup], source: RenderSource, upright: bool
 ) -> FrameHypothesis | None:
     """A pose from one source and one kind of features, or None where no pose has matches behind it."""
-    options = views.options
-    features = views.photo_features(
-        upright, round(1.25 * views.side_px(options.search_side_px)), options.photo_features
-    )
+    features = views.photo_features(upright, round(1.25 * views.side_px(_SEARCH_SIDE_PX)), _PHOTO_FEATURES)
     raw, kept = [], []
     for group in groups:
-        pools = views.pools(group.renderings, source, upright, options.search_features)
+        pools = views.pools(group.renderings, source, upright, _SEARCH_FEATURES)
         if not pools:
             continue
-        matches = pooled_matches(
-            features, joined_pools(pools), options.same_place * views.look.depth_m, options.max_ratio
-        )
+        matches = pooled_matches(features, joined_pools(pools), _SAME_PLACE * views.look.depth_m, _MAX_RATIO)
         raw.append(matches)
-        kept.append(_consistent(views, matches, group, options.consistency))
+        kept.append(_consistent(views, matches, group))
     return _hypothesis(views, joined(raw), joined(kept), source, upright)
 
 
@@ -117,41 +125,62 @@ def guided(
     views: FrameViews, prior: FramePrior, start: FrameHypothesis, radius_px: float
 ) -> FrameHypothesis | None:
     """The pose from matches looked for where `start` predicts them, on a render from its pose."""
-    options = views.options
-    side_px = views.side_px(options.final_side_px)
+    side_px = views.side_px(_FINAL_SIDE_PX)
     renderings = views.renders([start.pose.cam_from_local], side_px)
     if not renderings:
         return None
-    pool = joined_pools(views.pools(renderings, start.source, True, options.final_features))
-    features = views.photo_features(True, round(1.25 * side_px), options.final_features)
+    pool = joined_pools(views.pools(renderings, start.source, True, _FINAL_FEATURES))
+    features = views.photo_features(True, round(1.25 * side_px), _FINAL_FEATURES)
     matches = guided_matches(
         features,
         pool,
         start.pose.camera,
         start.pose.cam_from_local,
         radius_px,
-        options.same_place * views.look.depth_m,
-        options.max_ratio,
+        _SAME_PLACE * views.look.depth_m,
+        _MAX_RATIO,
     )
     settings = pose_options(views)
     pose = estimate_pose(matches.pixels, matches.points, start.pose.camera, "request", settings)
     if pose is None:
         return None
     pose = refine_pose(matches.pixels, matches.points, pose, settings)
-    pose = fitted_under_prior(matches, pose, prior, settings, options.correlated_inliers)
+    pose = fitted_under_prior(matches, pose, prior, settings)
     return replace(
         start, pose=pose, matches=matches, inliers=independent(views.camera, matches.take(pose.inliers))
     )
 
 
+def unmatched(
+    cam_from_local: Rigid3, camera: Camera, source: RenderSource, kind: MatchKind
+) -> FrameHypothesis:
+    """A pose that no matches stand behind yet."""
+    pose = PoseHypothesis(
+        cam_from_local=cam_from_local,
+        camera=camera,
+        camera_source="request",
+        inliers=np.zeros(0, dtype=bool),
+        prior_focal_px=camera.focal_px,
+    )
+    return FrameHypothesis(
+        pose=pose,
+        source=source,
+        kind=kind,
+        matches=joined([]),
+        inliers=joined([]),
+        candidates=0,
+        log_nfa=0.0,
+        rival_share=0.0,
+    )
+
+
 def pose_options(views: FrameViews) -> PoseOptions:
     """Tolerance by the density of the scan: a keypoint on splats is no better located than these."""
-    options = views.options
     side = max(views.camera.width, views.camera.height)
     by_scan = views.spacing_full_px / side
-    tolerance = float(np.clip(by_scan, options.tolerance_rel, options.max_tolerance_rel))
+    tolerance = float(np.clip(by_scan, _TOLERANCE_REL, _MAX_TOLERANCE_REL))
     # A frame on a scan has too few matches for more of a lens.
-    return PoseOptions(tolerance_rel=tolerance, lens=LensPriors(whole_lens=False), seed=options.seed)
+    return PoseOptions(tolerance_rel=tolerance, lens=LensPriors(whole_lens=False))
 
 
 def joined_pools(pools: Sequence[Pool]) -> Pool:
@@ -159,13 +188,10 @@ def joined_pools(pools: Sequence[Pool]) -> Pool:
     return Pool(
         points=np.concatenate([p.points for p in pools]),
         descriptors=np.concatenate([p.descriptors for p in pools]),
-        fingerprint=pools[0].fingerprint,
     )
 
 
-def _consistent(
-    views: FrameViews, matches: FrameMatches, group: RenderGroup, options: ConsistencyOptions
-) -> FrameMatches:
+def _consistent(views: FrameViews, matches: FrameMatches, group: RenderGroup) -> FrameMatches:
     camera = views.camera
     reference = camera.project(group.reference.act(matches.points))
     found = consistent_matches(
@@ -173,9 +199,9 @@ def _consistent(
         reference,
         float(max(camera.width, camera.height)),
         float(camera.width * camera.height),
-        replace(options, max_turn_deg=group.max_turn_deg),
+        group.max_turn_deg,
     )
-    return matches.take(found.kept)
+    return matches.take(found)
 
 
 def _hypothesis(
@@ -221,5 +247,5 @@ def independent(camera: Camera, inliers: FrameMatches) -> FrameMatches:
     return inliers.take(independent_inliers(inliers.pixels, inliers.points, gap))
 
 
-def _any_heading(prior: FramePrior, options: FrameOptions) -> bool:
-    return prior.sigma_heading_deg >= options.star.full_circle_sigma_deg
+def _any_heading(prior: FramePrior) -> bool:
+    return prior.sigma_heading_deg >= FULL_CIRCLE_SIGMA_DEG

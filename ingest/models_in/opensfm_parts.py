@@ -1,16 +1,23 @@
-"""Observations of OpenSfM's `tracks.csv`: image, track, feature, x, y, scale, colour; tab-separated."""
+"""Observations of OpenSfM's `tracks.csv`, and its lenses as this system's.
+
+Reference: OpenSfM, doc/source/geometry.rst. Lengths are over the longer side of the image, the principal
+point counts from its middle; `featuredb.export.formats.opensfm_camera` is the way back.
+"""
 
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import IngestError
+from featuredb.errors import IngestError, InvalidValueError
 from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from ingest.models_in.json_values import member, number
 
 _HEADER = "OPENSFM_TRACKS_VERSION_v"
 _COLUMNS = {"1": 9, "2": 11}  # version 2 adds segmentation and instance
@@ -77,17 +84,17 @@ def _rows(
     lines: Iterator[str], columns: int, path: Path
 ) -> Iterator[tuple[str, str, tuple[float, float, float]]]:
     """Image, track and x, y, scale of each line, checked."""
-    for number, line in zip(count(2), lines, strict=False):
+    for row, line in zip(count(2), lines, strict=False):
         parts = line.rstrip("\r\n").split("\t")
         if len(parts) != columns:
             raise IngestError(
-                f"{path}, line {number}: expected {columns} columns, found {len(parts)}: the file is cut "
+                f"{path}, line {row}: expected {columns} columns, found {len(parts)}: the file is cut "
                 "off or broken; copy or export it again"
             )
         image, track, feature = parts[:3]
         if not (track.isdecimal() and feature.isdecimal()):
             raise IngestError(
-                f"{path}, line {number}: expected the numbers of a track and a feature, from 0, found "
+                f"{path}, line {row}: expected the numbers of a track and a feature, from 0, found "
                 f"{track[:40]!r} and {feature[:40]!r}; export the tracks again"
             )
         try:
@@ -96,8 +103,61 @@ def _rows(
             x = y = scale = math.nan
         if not (abs(x) <= _MOST and abs(y) <= _MOST and 0.0 < scale <= 1.0):  # false for NaN too
             raise IngestError(
-                f"{path}, line {number}: expected x and y within -0.5 and 0.5 and a scale in (0, 1], over "
+                f"{path}, line {row}: expected x and y within -0.5 and 0.5 and a scale in (0, 1], over "
                 f"the longer side of the image, found {', '.join(p[:40] for p in parts[3:6])}; export the "
                 "tracks again"
             )
         yield image, track, (x, y, scale)
+
+
+_ONE_FOCAL = ("perspective", "fisheye")
+_TWO_FOCALS = ("brown", "radial", "simple_radial", "fisheye_opencv")
+
+
+def camera_from_opensfm(entry: Mapping[str, Any], where: str) -> Camera:
+    """An entry of `cameras` in reconstruction.json.
+
+    Raises:
+        IngestError: values that are missing or cannot be, or a lens that maps do not have.
+    """
+    kind = entry.get("projection_type", "perspective")
+    if kind not in (*_ONE_FOCAL, *_TWO_FOCALS):
+        raise IngestError(
+            f"{where}: expected a lens of {', '.join((*_ONE_FOCAL, *_TWO_FOCALS))}, found {kind!r}; "
+            "undistort the images to a simpler camera first"
+        )
+    width, height = (number(member(entry, name, where), f"{where}, {name}") for name in ("width", "height"))
+    size = max(width, height)
+
+    def given(name: str) -> float:
+        return number(entry.get(name, 0.0), f"{where}, {name}")
+
+    def required(name: str) -> float:
+        return number(member(entry, name, where), f"{where}, {name}")
+
+    k = [given(f"k{i}") for i in range(1, 5)]
+    if kind in _ONE_FOCAL:
+        focal = required("focal") * size
+        model = "RADIAL" if kind == "perspective" else "RADIAL_FISHEYE"
+        return _camera(model, width, height, (focal, width / 2.0, height / 2.0, k[0], k[1]), where)
+    pinhole = (
+        required("focal_x") * size,
+        required("focal_y") * size,
+        given("c_x") * size + width / 2.0,
+        given("c_y") * size + height / 2.0,
+    )
+    if kind == "fisheye_opencv":
+        return _camera("OPENCV_FISHEYE", width, height, (*pinhole, *k), where)
+    lens = (*pinhole, k[0], k[1], given("p1"), given("p2"))
+    if k[2]:
+        return _camera("FULL_OPENCV", width, height, (*lens, k[2], 0.0, 0.0, 0.0), where)
+    return _camera("OPENCV", width, height, lens, where)
+
+
+def _camera(model: str, width: float, height: float, params: tuple[float, ...], where: str) -> Camera:
+    try:
+        if width != int(width) or height != int(height):
+            raise InvalidValueError(f"expected whole pixels, found {width}x{height}")
+        return Camera(model=model, width=int(width), height=int(height), params=params)
+    except InvalidValueError as error:
+        raise IngestError(f"{where}: {error}; export the model again") from error

@@ -1,0 +1,157 @@
+"""Files of an anchoring: the photos of a map, and what was proposed for a person to confirm."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from featuredb.errors import IngestError, RegistrationError
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.maps.feature_map import MapImage
+from featuredb.maps.photo_files import PhotoFolder
+from featuredb.maps.unplaced_map import AnyMap
+from ingest.register.frame_registration import FrameRegistration
+from ingest.workspace import read_json, write_json
+
+PROPOSALS = "proposals.json"
+_VERSION = 1
+
+
+State = tuple[str, str, str]
+"""Ids of a map, of its state (another one has other poses), and of the scan."""
+
+
+def save_proposals(folder: Path, state: State, registrations: Mapping[int, FrameRegistration]) -> None:
+    """Write folder/proposals.json, atomically: accepted registrations by image id."""
+    names = dict(zip(("map_id", "write_id", "scan_id"), state, strict=True))
+    frames = {str(i): _plain(r) for i, r in registrations.items() if r.accepted}
+    write_json(folder / PROPOSALS, {"version": _VERSION, **names, "frames": frames})
+
+
+def load_proposals(folder: Path, state: State) -> Mapping[int, FrameRegistration]:
+    """Read them back for the same map, in the same state, and the same scan.
+
+    Raises:
+        RegistrationError: there are none, or they belong to something else.
+    """
+    path = folder / PROPOSALS
+    if not path.is_file():
+        raise RegistrationError(
+            f"{path}: nothing has been proposed there; run the command without --confirm first, with "
+            "the same --out"
+        )
+    try:
+        document = read_json(path)
+        if document["version"] != _VERSION:
+            raise RegistrationError(
+                f"{path}: expected version {_VERSION}, found {document['version']}; propose anew"
+            )
+        found = (document["map_id"], document["write_id"], document["scan_id"])
+        frames = {int(i): _registration(entry) for i, entry in document["frames"].items()}
+    except (IngestError, KeyError, TypeError, ValueError) as error:
+        raise RegistrationError(f"{path}: cannot be read as proposals ({error!r}); propose anew") from error
+    if found != state:
+        raise RegistrationError(
+            f"{path}: proposed for map {found[0]}, state {found[1]}, scan {found[2]}; the map is now in "
+            f"state {state[1]} with scan {state[2]}; run the command without --confirm again"
+        )
+    return frames
+
+
+def _plain(registration: FrameRegistration) -> dict[str, Any]:
+    pose, covariance, camera = registration.cam_from_local, registration.covariance, registration.camera
+    assert pose is not None
+    assert covariance is not None
+    return {
+        "cam_from_local": pose.matrix().tolist(),
+        "covariance": covariance.tolist(),
+        "camera": None if camera is None else asdict(camera),
+        "source": registration.source,
+        "points_local": registration.points_local.tolist(),
+        "pixels": registration.pixels.tolist(),
+        "evidence": registration.evidence,
+        "seconds": registration.seconds,
+    }
+
+
+def _registration(entry: dict[str, Any]) -> FrameRegistration:
+    camera = entry["camera"]
+    return FrameRegistration(
+        cam_from_local=Rigid3.from_matrix(entry["cam_from_local"]),
+        covariance=np.array(entry["covariance"]),
+        reason=None,
+        message="",
+        camera=None if camera is None else Camera(**camera | {"params": tuple(camera["params"])}),
+        source=entry["source"],
+        points_local=np.array(entry["points_local"]).reshape(-1, 3),
+        pixels=np.array(entry["pixels"]).reshape(-1, 2),
+        evidence=entry["evidence"],
+        seconds=entry["seconds"],
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoFiles:
+    """Where the photos of a map lie.
+
+    Attributes:
+        folder: that was searched.
+        paths: file of each image that was found, by image id.
+        missing: image id and why, in words, of the others.
+    """
+
+    folder: Path
+    paths: dict[int, Path]
+    missing: dict[int, str]
+
+    def path(self, image: MapImage) -> Path:
+        """The file of one image.
+
+        Raises:
+            RegistrationError: it was not found.
+        """
+        if image.image_id not in self.paths:
+            raise RegistrationError(
+                f"photo {image.name}: {self.missing.get(image.image_id, 'not searched for')}; "
+                f"--photos must name the folder that the map was made of, searched: {self.folder}"
+            )
+        return self.paths[image.image_id]
+
+
+def find_photos(feature_map: AnyMap, folder: Path) -> PhotoFiles:
+    """Find the photos of a map by name, and where that fails by content, anywhere under the folder.
+
+    A file counts only if its SHA-256 is the map's: another photo of the same name would be registered to the
+    scan in place of the one that the map knows.
+
+    Raises:
+        RegistrationError: no such folder, or none of the photos is there.
+    """
+    if not folder.is_dir():
+        raise RegistrationError(
+            f"--photos: expected the folder of the map's photos, found no folder {folder}"
+        )
+    search = PhotoFolder(folder)
+    paths: dict[int, Path] = {}
+    missing: dict[int, str] = {}
+    for image in feature_map.images:
+        path, reason = search.by_name(image)
+        if path is None:
+            missing[image.image_id] = reason
+        else:
+            paths[image.image_id] = path
+    for image in feature_map.images:
+        if image.image_id in missing and (path := search.by_content(image)) is not None:
+            paths[image.image_id] = path
+            del missing[image.image_id]
+    if not paths:
+        reasons = sorted(set(missing.values()))
+        raise RegistrationError(
+            f"none of the {len(feature_map.images)} photos of map {feature_map.map_id} "
+            f"(such as {feature_map.images[0].name if feature_map.images else 'none'}) is in {folder}: "
+            f"{'; '.join(reasons) or 'the map has no photos'}; name the folder that the map was made of"
+        )
+    return PhotoFiles(folder=folder, paths=paths, missing=missing)

@@ -1,0 +1,342 @@
+"""Control points place a reconstruction that is no map yet, a map that has a place, and one that has none;
+evidence and a table of what they leave.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from featuredb.adjust.block import Block
+from featuredb.geo.datum import check_datum
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.sim3 import Sim3, point_jacobian
+from featuredb.maps.feature_map import FeatureMap, GeoPrior, Placement
+from featuredb.maps.unplaced_map import UnplacedMap
+from ingest.colmap.bridge import Model
+from ingest.photos.photo import Photo
+from ingest.register.block import block_of_map, block_of_model, map_of_block, model_of_block
+from ingest.register.control.control_file import ControlFile
+from ingest.register.control.fit import Vertical
+from ingest.register.control.marks import Control, control_frame, meet
+from ingest.register.control.placement import GcpOptions, GcpPlacement, place_by_gcp
+from ingest.register.gps import GpsPlacement
+from ingest.register.place_map import placed_map
+from ingest.sfm.extract import PhotoFeatures
+
+# A local frame is good for tens of kilometres; a new one further away keeps coordinates small.
+_MAX_FRAME_DISTANCE_M = 2_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GcpRegistration:
+    """A map placed anew by control points, or why not.
+
+    Attributes:
+        placement: with residuals; its reason is None where it was accepted.
+        control: what met the map's photos, and what did not.
+        frame: local frame of the placement.
+        feature_map: to be committed in the old one's place, None where it was refused.
+        moved_m: (3,) median of how far the map's points moved, east, north, up; None without a map, and where
+            it had no place before.
+    """
+
+    placement: GcpPlacement
+    control: Control
+    frame: LocalFrame
+    feature_map: FeatureMap | None
+    moved_m: FloatArray | None
+
+
+def register_by_gcp(
+    feature_map: FeatureMap,
+    file: ControlFile,
+    options: GcpOptions,
+    height_datum: str = "unknown",
+) -> GcpRegistration:
+    """Place a map by control points; nothing is written.
+
+    Args:
+        height_datum: of the surveyed heights, where the file's reference system does not say it.
+    """
+    check_datum(height_datum)
+    frame = _frame(feature_map, file)
+    block = block_of_map(feature_map)
+    control = meet(file, block, frame)
+    frame_from_map = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
+    gps, sigma = gps_in(frame, [image.gps for image in feature_map.images])
+    placement = place_by_gcp(
+        block,
+        control,
+        options,
+        vertical=_vertical_of_map(feature_map, block.xyz, frame_from_map),
+        gps_local=gps,
+        gps_sigma_m=sigma,
+    )
+    if placement.reason is not None or placement.block is None or placement.covariance is None:
+        return GcpRegistration(
+            placement=placement, control=control, frame=frame, feature_map=None, moved_m=None
+        )
+    assert placement.local_from_block is not None
+    placed = map_of_block(
+        feature_map,
+        placement.block,
+        frame,
+        Placement(
+            method="gcp",
+            local_from_sfm=placement.local_from_block @ feature_map.placement.local_from_sfm,
+            covariance=placement.covariance,
+            residual_rms_m=placement.residual_rms_m,
+            evidence=gcp_evidence(placement, control),
+        ),
+        datum_of(file, control, feature_map.height_datum, height_datum),
+    )
+    moved = np.median(placement.block.xyz - frame_from_map.act(block.xyz), axis=0)
+    return GcpRegistration(
+        placement=placement, control=control, frame=frame, feature_map=placed, moved_m=moved
+    )
+
+
+def place_unplaced_by_gcp(
+    unplaced: UnplacedMap,
+    file: ControlFile,
+    options: GcpOptions,
+    height_datum: str = "unknown",
+) -> GcpRegistration:
+    """Place a map that has no place by control points; arguments as in `register_by_gcp`.
+
+    The points say everything: its own frame only starts at them, and counts for nothing.
+    """
+    at_the_points = Placement(
+        method="gcp",
+        local_from_sfm=Sim3.identity(),
+        covariance=np.zeros((7, 7)),
+        residual_rms_m=0.0,
+    )
+    start = placed_map(unplaced, at_the_points, control_frame(file), "unknown")
+    return replace(register_by_gcp(start, file, options, height_datum), moved_m=None)
+
+
+def datum_of(file: ControlFile, control: Control, before: str, said: str) -> str:
+    """Datum of the placed map's heights: the survey's where it gives heights, else what it was."""
+    if np.isfinite(control.surveyed[:, 2]).sum() < 3:
+        return before
+    return file.crs.height_datum if file.crs.height_datum != "unknown" else said
+
+
+def vertical_of(
+    local_from_block: Sim3, covariance: FloatArray, points_block: FloatArray, source: str
+) -> Vertical:
+    """What a placement says about tilt, and height in the middle of its points (n, 3)."""
+    anchor = np.median(points_block, axis=0)
+    by_rotation = np.array([[0.0, 1.0], [-1.0, 0.0]])  # a turn about east tilts north, and so on
+    height = point_jacobian(local_from_block.act(anchor))[2]
+    return Vertical(
+        up_block=local_from_block.rotation.T @ [0.0, 0.0, 1.0],
+        tilt_covariance=by_rotation @ covariance[1:3, 1:3] @ by_rotation.T + np.eye(2) * 1e-10,
+        anchor_block=anchor,
+        anchor_up_m=float(local_from_block.act(anchor)[2]),
+        sigma_up_m=float(np.sqrt(height @ covariance @ height)) + 1e-4,
+        source=source,
+    )
+
+
+def gps_in(frame: LocalFrame, priors: Sequence[GeoPrior | None]) -> tuple[FloatArray, tuple[float, float]]:
+    """The photos' own positions (k, 3) in a frame, NaN where not known, and the medians of their sigmas."""
+    gps = np.full((len(priors), 3), np.nan)
+    for row, prior in enumerate(priors):
+        if prior is not None:
+            height = frame.height_m if prior.height_m is None else prior.height_m
+            gps[row] = frame.enu_from_geodetic((prior.latitude_deg, prior.longitude_deg, height))
+            if prior.height_m is None:
+                gps[row, 2] = np.nan
+    sigmas = [(prior.sigma_horizontal_m, prior.sigma_vertical_m) for prior in priors if prior is not None]
+    horizontal, vertical = np.median(sigmas, axis=0).tolist() if sigmas else (0.0, 0.0)
+    return gps, (horizontal, vertical)
+
+
+def _frame(feature_map: FeatureMap, file: ControlFile) -> LocalFrame:
+    """The map's own frame unless its photos have no GPS and the control points lie elsewhere."""
+    middle = control_frame(file)
+    away = np.linalg.norm(feature_map.frame.enu_from(middle).translation)
+    has_gps = any(image.gps is not None for image in feature_map.images)
+    return feature_map.frame if has_gps or away <= _MAX_FRAME_DISTANCE_M else middle
+
+
+def _vertical_of_map(feature_map: FeatureMap, points: FloatArray, frame_from_map: Sim3) -> Vertical | None:
+    """What the map's present placement says; None where control points made it, which would count twice."""
+    method = feature_map.placement.method
+    if method == "gcp":
+        return None
+    covariance = frame_from_map.compose_covariance(np.zeros((7, 7)), feature_map.placement.covariance)
+    return vertical_of(frame_from_map, covariance, points, f"the map's placement by {method}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Survey:
+    """A control point file and how it is used."""
+
+    file: ControlFile
+    options: GcpOptions = field(default_factory=GcpOptions)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ControlledPlacement:
+    """A reconstruction placed by control points, or why not.
+
+    Attributes:
+        placement: with residuals.
+        control: what met the photos, and what did not.
+        model: adjusted where the placement was accepted, in the reconstruction's own frame.
+        frame: local frame of the placement.
+        map_placement: for the map, None where it was refused.
+        file: the control points.
+        evidence: figures and residuals, JSON-able.
+    """
+
+    placement: GcpPlacement
+    control: Control
+    model: Model
+    frame: LocalFrame
+    map_placement: Placement | None
+    file: ControlFile
+    evidence: dict[str, Any]
+
+    def height_datum(self, said: str) -> str:
+        """Datum of the map's heights; `said` is that of the heights that the caller knows of."""
+        return datum_of(self.file, self.control, said, said)
+
+
+def place_by_survey(
+    model: Model,
+    photos: Sequence[Photo],
+    features: Sequence[PhotoFeatures],
+    frame: LocalFrame | None,
+    by_gps: GpsPlacement,
+    survey: Survey,
+) -> ControlledPlacement:
+    """Place and adjust a reconstruction.
+
+    Args:
+        photos, features: of its registered photos, in the order of `model.rows`.
+        frame: at the photos' GPS, None where they have none.
+        by_gps: what GPS says, accepted or not.
+    """
+    where = frame or control_frame(survey.file)
+    block = block_of_model(model, photos, features)
+    control = meet(survey.file, block, where)
+    vertical = None
+    if by_gps.reason is None and by_gps.local_from_sfm is not None and by_gps.covariance is not None:
+        vertical = vertical_of(by_gps.local_from_sfm, by_gps.covariance, block.xyz, "the photos' GPS")
+    gps, sigma = gps_in(where, [photo.gps for photo in photos])
+    placement = place_by_gcp(
+        block, control, survey.options, vertical=vertical, gps_local=gps, gps_sigma_m=sigma
+    )
+    evidence = gcp_evidence(placement, control) | {"file_notes": list(survey.file.notes)}
+    return ControlledPlacement(
+        placement=placement,
+        control=control,
+        model=_adjusted_model(model, block, placement),
+        frame=where,
+        map_placement=_map_placement(placement, evidence),
+        file=survey.file,
+        evidence=evidence,
+    )
+
+
+def _adjusted_model(model: Model, block: Block, placement: GcpPlacement) -> Model:
+    if placement.reason is not None or placement.block is None or placement.local_from_block is None:
+        return model
+    return model_of_block(model, placement.block.moved(placement.local_from_block.inverse()))
+
+
+def _map_placement(placement: GcpPlacement, evidence: dict[str, Any]) -> Placement | None:
+    if placement.reason is not None or placement.local_from_block is None or placement.covariance is None:
+        return None
+    return Placement(
+        method="gcp",
+        local_from_sfm=placement.local_from_block,
+        covariance=placement.covariance,
+        residual_rms_m=placement.residual_rms_m,
+        evidence=evidence,
+    )
+
+
+def gcp_evidence(placement: GcpPlacement, control: Control) -> dict[str, Any]:
+    """Figures, residuals of every point and mark, and notes; JSON-able."""
+    return {
+        **placement.figures,
+        "notes": list(placement.notes),
+        "points": [
+            {
+                "name": p.name,
+                "residual_enu_m": _numbers(p.residual_m),
+                "leave_one_out_enu_m": _numbers(p.leave_one_out_m),
+                "marks": p.marks,
+                "used": p.used,
+                "remark": p.remark,
+            }
+            for p in placement.points
+        ],
+        "marks": [
+            {
+                "point": m.mark.point,
+                "photo": m.mark.photo,
+                "line": m.mark.line,
+                "residual_px": _numbers(m.residual_px),
+                "used": m.used,
+                "remark": m.remark,
+            }
+            for m in placement.marks
+        ],
+        "unused_marks": [f"line {mark.line}: {reason}" for mark, reason in control.unused],
+        "unmarked_points": list(control.unmarked),
+    }
+
+
+def residual_table(placement: GcpPlacement, control: Control) -> str:
+    """Residuals of every point, what is odd, and what was assumed, as lines of text."""
+    lines = [
+        "control point        marks  east m  north m    up m  horizontal m  without it m",
+        "-------------------  -----  ------  -------  ------  ------------  ------------",
+    ]
+    for p in placement.points:
+        alone = float(np.hypot(*p.leave_one_out_m[:2]))
+        lines.append(
+            f"{p.name[:19]:19s}  {f'{p.marks}/{p.marks_given}':>5s}  {_cell(p.residual_m[0], 6)}  "
+            f"{_cell(p.residual_m[1], 7)}  {_cell(p.residual_m[2], 6)}  {_cell(p.horizontal_m, 12)}  "
+            f"{_cell(alone, 12)}{'' if p.used else '  not used'}"
+        )
+    used = [p.horizontal_m for p in placement.points if p.used]
+    if used:
+        marks = [m.error_px for m in placement.marks if m.used]
+        lines.append(
+            f"{len(used)} of {len(placement.points)} points used: median horizontal residual "
+            f"{np.median(used):.3f} m; {len(marks)} of {len(placement.marks)} marks, median "
+            f"{np.median(marks):.2f} px"
+        )
+    return "\n".join([*lines, *remarks(placement, control)]) + "\n"
+
+
+def remarks(placement: GcpPlacement, control: Control) -> list[str]:
+    """What is odd about points and marks, what could not be used, and what was assumed."""
+    return [
+        *(p.remark for p in placement.points if p.remark),
+        *(m.remark for m in placement.marks if m.remark),
+        *(
+            f"mark of {mark.point} in {mark.photo} (line {mark.line}) is not used: {reason}"
+            for mark, reason in control.unused
+        ),
+        *(f"{name} has no mark in the map's photos" for name in control.unmarked),
+        *(f"note: {note}" for note in placement.notes),
+    ]
+
+
+def _numbers(values: FloatArray) -> list[float | None]:
+    return [round(float(v), 4) if np.isfinite(v) else None for v in values]
+
+
+def _cell(value: float, width: int) -> str:
+    return f"{value:{width}.3f}" if np.isfinite(value) else "-".rjust(width)
