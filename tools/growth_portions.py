@@ -40,9 +40,9 @@ from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
 from ingest.growth.graph.joint.in_database import adjust_maps
 from ingest.growth.growth_report import GrowthReport
-from ingest.growth.run import GrowthOptions, grow
+from ingest.growth.run import grow
+from ingest.growth.run_record import GrowthOptions
 from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.growth.trust.promotion import PromotionOptions
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, require_usable, scan_folder
@@ -60,9 +60,7 @@ _MADE_UP_FRAME = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0
 _MADE_UP_DISTANCE_M = 50.0
 _EXTENT_M = 100.0  # of the camera centres of a set without GPS, when the two are compared
 _OWNER = "portions"
-_GROWTH = GrowthOptions(
-    promotion=PromotionOptions(confirmation=ConfirmationOptions(trusted_owners=(_OWNER,)))
-)
+_GROWTH = GrowthOptions(confirmation=ConfirmationOptions(trusted_owners=(_OWNER,)))
 _NO_BUDGET_M = 1e6
 
 

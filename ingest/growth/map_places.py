@@ -54,6 +54,13 @@ def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
     return dict(evidence.get(GROWTH) or {})
 
 
+def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
+    """The map with these figures in what growth has noted of it, in place of earlier ones."""
+    placement = feature_map.placement
+    growth = {**growth_of(placement.evidence), **figures}
+    return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
+
+
 def inflated(feature_map: FeatureMap) -> FeatureMap:
     """The map with its placement's covariance `isotropic_inflation`."""
     placement = feature_map.placement

@@ -14,7 +14,8 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapStatus, Placement
 from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import move_map
-from ingest.growth.graph.map_graph import StoredEdge, place_of
+from ingest.growth.graph.map_graph import place_of
+from ingest.growth.values import Edge
 from tests.support.scenes import (
     EASTING,
     EPSG,
@@ -94,7 +95,7 @@ def strip_map(
 def grown(feature_map: FeatureMap, parents: Sequence[FeatureMap], drift_m: float = 0.1) -> FeatureMap:
     """The map as if these had placed it where it is."""
     edges = [
-        StoredEdge(
+        Edge(
             map_id=parent.map_id, place=place_of(parent), other_from_map=Sim3.identity(), covariance=EDGE,
             shared_points=500, photos=8,
         )

@@ -20,27 +20,17 @@ from scipy.stats import chi2, norm
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from ingest.growth.gates import SIGMAS
 from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode, PoseGraphFit
 
 _NAMED = 8  # overlaps that a message names
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseGraphOptions:
-    """When a graph is believed.
-
-    Attributes:
-        contradiction_p: probability of a worse chi-square by chance below which something contradicts;
-            0.0027 is 3 sigma of a normal error, the line of all gates of growth.
-        clear_lead: an edge is left out when it takes with it so many times more of chi-square than the next
-            one; where several explain the contradiction alike, nobody can tell which is wrong.
-        max_variance_factor: where no edge stands out, all covariances grow by chi-square over its degrees,
-            up to this: deviations five times those claimed are no longer noise.
-    """
-
-    contradiction_p: float = 0.0027
-    clear_lead: float = 2.0
-    max_variance_factor: float = 25.0
+_CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
+# An edge is left out when it takes with it so many times more of chi-square than the next one; where several
+# explain the contradiction alike, nobody can tell which is wrong.
+_CLEAR_LEAD = 2.0
+# Where no edge stands out, all covariances grow by chi-square over its degrees, up to this: deviations five
+# times those claimed are no longer noise.
+_MOST_VARIANCE_FACTOR = 25.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +38,6 @@ class EdgeFit:
     """How an edge agrees with the rest.
 
     Attributes:
-        distance_m: what the edge misses at the origin of the graph's frame, metres.
         chi_square: by how much the graph's chi-square falls without the edge.
         redundancy: number of its seven directions that others check, 0 to 7.
         sigmas: of a normal error that is as unlikely; NaN where nothing checks it.
@@ -56,7 +45,6 @@ class EdgeFit:
     """
 
     edge: GraphEdge
-    distance_m: float
     chi_square: float
     redundancy: int
     sigmas: float
@@ -92,15 +80,12 @@ class GraphSolution:
         return tuple(fit for fit in self.edges if fit.left_out)
 
 
-def solve_pose_graph(
-    nodes: Sequence[GraphNode], edges: Sequence[GraphEdge], options: PoseGraphOptions | None = None
-) -> GraphSolution:
+def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> GraphSolution:
     """The most likely places of all maps; edges that contradict the rest are named and left out.
 
     Raises:
         InvalidValueError: map ids repeat, or an edge names an unknown map.
     """
-    options = options or PoseGraphOptions()
     _check(nodes, edges)
     left_out: list[EdgeFit] = []
     remaining = list(edges)
@@ -109,23 +94,22 @@ def solve_pose_graph(
         reached = _anchored(nodes, remaining)
         if not reached:
             return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
-        fitted = PoseGraphFit.of([n for n in nodes if n.map_id in reached], remaining)
+        fitted = PoseGraphFit([n for n in nodes if n.map_id in reached], remaining)
         fits = _edge_fits(fitted)
-        worst = _contradicting(fitted, fits, options)
+        worst = _contradicting(fitted, fits)
         if worst is None or _anchored(nodes, [e for e in remaining if e is not worst.edge]) != anchored_first:
             break
         left_out.append(replace(worst, left_out=True))
         remaining.remove(worst.edge)
-    return _solution(fitted, (*fits, *left_out), options)
+    return _solution(fitted, (*fits, *left_out))
 
 
-def _solution(fitted: "PoseGraphFit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions) -> GraphSolution:
+def _solution(fitted: PoseGraphFit, fits: tuple[EdgeFit, ...]) -> GraphSolution:
     factor = 1.0
-    unlikely = fitted.degrees > 0 and chi2.sf(fitted.chi_square, fitted.degrees) < options.contradiction_p
-    if unlikely:
+    if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    if factor > options.max_variance_factor:
+    if factor > _MOST_VARIANCE_FACTOR:
         worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
         named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
         return GraphSolution(
@@ -151,43 +135,29 @@ def _solution(fitted: "PoseGraphFit", fits: tuple[EdgeFit, ...], options: PoseGr
 
 
 def _edge_fits(fitted: PoseGraphFit) -> tuple[EdgeFit, ...]:
-    fits = []
-    for edge, (statistic, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True):
-        a, b = fitted.corrections[edge.a], fitted.corrections[edge.b]
-        miss = b.inverse() @ a @ edge.b_from_a.inverse()
-        fits.append(
-            EdgeFit(
-                edge=edge,
-                distance_m=float(np.linalg.norm(miss.translation)),
-                chi_square=statistic,
-                redundancy=rank,
-                sigmas=equivalent_sigmas(statistic, rank),
-            )
-        )
-    return tuple(fits)
+    return tuple(
+        EdgeFit(edge=edge, chi_square=chi, redundancy=rank, sigmas=equivalent_sigmas(chi, rank))
+        for edge, (chi, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True)
+    )
 
 
-def _contradicting(
-    fitted: "PoseGraphFit", fits: Sequence[EdgeFit], options: PoseGraphOptions
-) -> EdgeFit | None:
+def _likely(chi_square: float, degrees: int) -> bool:
+    return bool(chi2.sf(chi_square, degrees) >= _CHANCE)
+
+
+def _contradicting(fitted: PoseGraphFit, fits: Sequence[EdgeFit]) -> EdgeFit | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
-    if fitted.degrees == 0 or chi2.sf(fitted.chi_square, fitted.degrees) >= options.contradiction_p:
-        return None
     checked = sorted((f for f in fits if f.redundancy), key=lambda f: -f.chi_square)
-    if not checked:
+    if fitted.degrees == 0 or _likely(fitted.chi_square, fitted.degrees) or not checked:
         return None
     worst = checked[0]
-    if chi2.sf(worst.chi_square, worst.redundancy) >= options.contradiction_p:
+    if _likely(worst.chi_square, worst.redundancy):
         return None
     rivals = [f.chi_square for f in checked[1:]] + [t for t, _ in fitted.priors_judged()]
     # Of two measurements of one loop the same part of chi-square goes with either.
-    alone = all(worst.chi_square > options.clear_lead * other for other in rivals)
-    rest = fitted.chi_square - worst.chi_square
-    clean = chi2.sf(rest, max(fitted.degrees - worst.redundancy, 1)) >= options.contradiction_p
-    others_clean = any(
-        chi2.sf(fitted.chi_square - other, max(fitted.degrees - 7, 1)) >= options.contradiction_p
-        for other in rivals
-    )
+    alone = all(worst.chi_square > _CLEAR_LEAD * other for other in rivals)
+    clean = _likely(fitted.chi_square - worst.chi_square, max(fitted.degrees - worst.redundancy, 1))
+    others_clean = any(_likely(fitted.chi_square - other, max(fitted.degrees - 7, 1)) for other in rivals)
     return worst if alone or (clean and not others_clean) else None
 
 

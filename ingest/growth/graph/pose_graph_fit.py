@@ -4,13 +4,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.place.similarity_fit import left_jacobian
 
 # Standard deviations that nothing is known better than: log scale and radians, metres. They keep a covariance
 # of zero, an anchor that is the truth by decree, invertible.
@@ -69,32 +70,18 @@ class PoseGraphFit:
         chi_square, degrees: of the fit.
     """
 
-    def __init__(
-        self,
-        nodes: Sequence[GraphNode],
-        edges: Sequence[GraphEdge],
-        places: Sequence[Sim3],
-        jacobian: csr_array,
-        residuals: FloatArray,
-    ) -> None:
-        self._nodes, self.edges = nodes, edges
-        self._rows = {node.map_id: i for i, node in enumerate(nodes)}
-        self._jacobian, self._residuals = jacobian, residuals
-        self.corrections = {node.map_id: place for node, place in zip(nodes, places, strict=True)}
-        self.chi_square = float(residuals @ residuals)
-        self.degrees = len(residuals) - 7 * len(nodes)
-        wanted = [(i, i) for i in range(len(nodes))]
-        wanted += [(self._rows[e.a], self._rows[e.b]) for e in edges]
-        self._blocks = _inverse_blocks(jacobian, wanted)
-
-    @classmethod
-    def of(cls, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> "PoseGraphFit":
-        rows = {node.map_id: i for i, node in enumerate(nodes)}
-        held = [e for e in edges if e.a in rows and e.b in rows]
-        problem = _Problem(nodes, held, rows)
+    def __init__(self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
+        self._nodes, self._rows = nodes, {node.map_id: i for i, node in enumerate(nodes)}
+        self.edges = [e for e in edges if e.a in self._rows and e.b in self._rows]
+        problem = _Problem(nodes, self.edges, self._rows)
         places = problem.solve()
-        residuals, jacobian = problem.linearise(places)
-        return cls(nodes, held, places, jacobian, residuals)
+        self._residuals, self._jacobian = problem.linearise(places)
+        self.corrections = dict(zip(self._rows, places, strict=True))
+        self.chi_square = float(self._residuals @ self._residuals)
+        self.degrees = len(self._residuals) - 7 * len(nodes)
+        wanted = [(i, i) for i in range(len(nodes))]
+        wanted += [(self._rows[e.a], self._rows[e.b]) for e in self.edges]
+        self._blocks = _inverse_blocks(self._jacobian, wanted)
 
     def edges_judged(self) -> list[tuple[float, int]]:
         """What each edge takes of chi-square, and in how many directions others check it."""
@@ -150,16 +137,15 @@ class PoseGraphFit:
         rows = slice(7 * k, 7 * k + 7)
         columns = (7 * np.array(nodes)[:, None] + np.arange(7)).ravel()
         part = self._jacobian[rows][:, columns].toarray()
-        covariance = np.block([[_block(self._blocks, i, j) for j in nodes] for i in nodes])
+        blocks = self._blocks
+        covariance = np.block(
+            [[blocks[i, j] if (i, j) in blocks else blocks[j, i].T for j in nodes] for i in nodes]
+        )
         spread = np.eye(7) - part @ covariance @ part.T
         values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
         free = values > _FREE
         along = vectors[:, free].T @ self._residuals[rows]
         return float((along**2 / values[free]).sum()), int(free.sum())
-
-
-def _block(blocks: Mapping[tuple[int, int], FloatArray], i: int, j: int) -> FloatArray:
-    return blocks[i, j] if (i, j) in blocks else blocks[j, i].T
 
 
 def _inverse_blocks(
@@ -267,3 +253,25 @@ def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns:
 def _whitening(covariance: FloatArray) -> FloatArray:
     """W (7, 7) with W C W^T = I."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + _FLOOR)), dtype=np.float64)
+
+
+def small_adjoint(tangent: FloatArray) -> FloatArray:
+    """(7, 7) matrix of the Lie bracket with (sigma, omega, nu), the derivative of Sim3.adjoint."""
+    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
+    ad = np.zeros((7, 7))
+    ad[1:4, 1:4] = skew(omega)
+    ad[4:, 0] = -nu
+    ad[4:, 1:4] = skew(nu)
+    ad[4:, 4:] = sigma * np.eye(3) + skew(omega)
+    return ad
+
+
+def left_jacobian(tangent: FloatArray) -> FloatArray:
+    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
+
+    The integral of exp(t ad) over t in [0, 1]: the corner of one matrix exponential (Van Loan 1978).
+    """
+    both = np.zeros((14, 14))
+    both[:7, :7] = small_adjoint(tangent)
+    both[:7, 7:] = np.eye(7)
+    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

@@ -2,55 +2,39 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database, MapSummary, Snapshot
+from ingest.growth import gates
 from ingest.growth.gates import Gate
-from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, run_canaries
+from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, confirm
-from ingest.growth.trust.corroboration import CorroborationOptions, NewPhotos, corroborate
+from ingest.growth.trust.corroboration import NewPhotos, corroborate
 from ingest.growth.trust.examined import question, recall, remember
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
 _AROUND_M = 100.0  # boxes of maps that come this close may show the same
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PromotionOptions:
-    """What a promotion needs.
-
-    Attributes:
-        answer_with: "confirmed": only points that independent sources have seen keep their descriptors and
-            answer queries; "all": a photo that is altered in one part brings that part in.
-    """
-
-    answer_with: Literal["confirmed", "all"] = "confirmed"
-    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
-    corroboration: CorroborationOptions = field(default_factory=CorroborationOptions)
-    canaries: CanaryOptions = field(default_factory=CanaryOptions)
+PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb.store.changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """What others say of a map; `feature_map` has descriptors where they confirm it."""
+    """What others say of a map, and the write id of its state in the database.
+
+    Attributes:
+        feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
+            part in otherwise.
+    """
 
     feature_map: FeatureMap
     confirmation: Confirmation
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Ready:
-    """A map that only the canaries may still refuse, and the write id of its state in the database."""
-
-    map_id: str
     write_id: str
-    found: ExaminedMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,18 +59,19 @@ class Promotion:
             "promoted": self.promoted,
             "reason_code": self.reason_code,
             "reason": self.reason,
-            "gates": {gate.name: gate.as_json() for gate in self.gates},
+            "gates": gates.figures(self.gates),
         }
 
 
 def promote_confirmed(
     database: Database,
     localiser: Localiser,
-    options: PromotionOptions | None = None,
+    confirmation: ConfirmationOptions | None = None,
     new: NewPhotos | None = None,
     *,
     budget_m: float,
     work: Path | None = None,
+    threads: int = 1,
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made.
 
@@ -99,40 +84,39 @@ def promote_confirmed(
     Raises:
         StoreError
     """
-    options = options or PromotionOptions()
+    confirmation = confirmation or ConfirmationOptions()
     snapshot = database.snapshot()
-    asked = question(database, snapshot, _digests(new), options)
-    waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
-    ready: list[_Ready] = []
+    digests = [] if new is None else [new.photos[row].sha256 for row in new.rows]
+    asked = question(database, snapshot, digests, confirmation)
+    ready: list[ExaminedMap] = []
     outcomes: list[Promotion] = []
-    for summary in waiting:
+    for summary in snapshot.maps():
+        if summary.status != "quarantined" or summary.method != "map":
+            continue
+        map_id = summary.map_id
         held_back = _held_back(summary, snapshot, budget_m)
+        known = None if held_back else recall(work, map_id, asked)
         if held_back is not None:
             outcomes.append(held_back)
             continue
-        known = recall(work, summary.map_id, asked)
         if known is not None:
-            outcomes.append(_stays(summary.map_id, *known))
+            outcomes.append(_stays(map_id, *known))
             continue
-        found = examine(snapshot.load_map(summary.map_id), snapshot, options, new)
+        found = examine(snapshot.load_map(map_id), snapshot, confirmation, new, threads)
         gate = found.confirmation.gate
-        if not gate.passes:
-            outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
-            remember(work, summary.map_id, asked, gate.reason, gate.message, (gate,))
-        else:
+        if gate.passes:
             ready.append(_committed(database, summary, found))
+        else:
+            outcomes.append(_stays(map_id, gate.reason, gate.message, (gate,)))
+            remember(work, map_id, asked, gate.reason, gate.message, (gate,))
     if ready:
-        decided = _promote(database, localiser, ready, options)
-        after = question(database, database.snapshot(), _digests(new), options)
+        decided = _promote(database, localiser, ready)
+        after = question(database, database.snapshot(), digests, confirmation)
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
                 remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
         outcomes += decided
     return outcomes
-
-
-def _digests(new: NewPhotos | None) -> list[str]:
-    return [] if new is None else [new.photos[row].sha256 for row in new.rows]
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -148,8 +132,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
         return Promotion(map_id=map_id, promoted=True, reason_code="", reason="it was active already")
     if summary.status == "retired":
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
-    before = Localiser.open(database)
-    gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], PromotionOptions()))
+    gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
     if not gate.passes and not force:
         return _stays(map_id, gate.reason, gate.message, (gate,))
     text = f"{reason} (by hand; {gate.message})"
@@ -158,62 +141,38 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
 
 
 def examine(
-    feature_map: FeatureMap, snapshot: Snapshot, options: PromotionOptions, new: NewPhotos | None
+    feature_map: FeatureMap,
+    snapshot: Snapshot,
+    by: ConfirmationOptions,
+    new: NewPhotos | None,
+    threads: int = 1,
 ) -> ExaminedMap:
     """How far others confirm a map: photos of its own, and from outside."""
-    heard = corroborate(
-        feature_map,
-        _others(feature_map.map_id, snapshot),
-        new,
-        options.confirmation,
-        options.corroboration,
-        write_id=snapshot.get(feature_map.map_id).write_id,
-    )
-    confirmation = confirm(feature_map, options.confirmation, heard.corroborating, heard.contradictions)
-    part = feature_map
-    if options.answer_with == "confirmed":
-        points = confirmed_points(feature_map, options.confirmation, heard.corroborating)
-        part = answering_with(feature_map, points)
-    return ExaminedMap(feature_map=part, confirmation=confirmation)
-
-
-def canary_gate(run: CanaryRun) -> Gate:
-    """Whether no known answer got worse."""
-    return Gate(
-        name="canaries",
-        reason="CANARY",
-        figure=len(run.regressions),
-        limit=0,
-        passes=not run.regressions,
-        message=run.message,
+    write_id = snapshot.get(feature_map.map_id).write_id
+    others = _others(feature_map.map_id, snapshot)
+    heard = corroborate(feature_map, others, new, by, write_id=write_id, threads=threads)
+    points = confirmed_points(feature_map, by, heard.corroborating)
+    return ExaminedMap(
+        feature_map=answering_with(feature_map, points),
+        confirmation=confirm(feature_map, by, heard.corroborating, heard.contradictions),
+        write_id=write_id,
     )
 
 
 def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
-    if "was placed anew" in summary.status_reason:
-        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason, ())
-    inactive = [p for p in summary.parents if not _active(snapshot, p)]
-    if len(inactive) == len(summary.parents):
-        return _stays(
-            summary.map_id, "NO_PARENT", f"no active map holds it: {', '.join(inactive)} is not active", ()
-        )
-    if summary.drift_m is not None and summary.drift_m > budget_m:
-        return _stays(
-            summary.map_id,
-            "DRIFT_BUDGET",
-            f"it may have drifted {summary.drift_m:.2f} m from its anchors, {budget_m:.2f} m are allowed",
-            (),
-        )
-    return None
+    if PARENT_MOVED in summary.status_reason:
+        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason)
+    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
+    if not active.intersection(summary.parents):
+        text = f"no active map holds it: {', '.join(summary.parents)} is not active"
+        return _stays(summary.map_id, "NO_PARENT", text)
+    gate = gates.drift(summary.drift_m or 0.0, budget_m)
+    return None if gate.passes else _stays(summary.map_id, gate.reason, gate.message)
 
 
-def _active(snapshot: Snapshot, map_id: str) -> bool:
-    return any(m.map_id == map_id and m.status == "active" for m in snapshot.maps())
-
-
-def _stays(map_id: str, code: str, reason: str, gates: tuple[Gate, ...]) -> Promotion:
-    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=gates)
+def _stays(map_id: str, code: str, reason: str, asked: tuple[Gate, ...] = ()) -> Promotion:
+    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=asked)
 
 
 def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
@@ -221,75 +180,62 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
     me = snapshot.get(map_id)
     if me.box is None:
         return []
-    box = me.box
     near = snapshot.maps_in(
         me.epsg,
-        box.min_easting - _AROUND_M,
-        box.min_northing - _AROUND_M,
-        box.max_easting + _AROUND_M,
-        box.max_northing + _AROUND_M,
+        me.box.min_easting - _AROUND_M,
+        me.box.min_northing - _AROUND_M,
+        me.box.max_easting + _AROUND_M,
+        me.box.max_northing + _AROUND_M,
     )
     same = [m for m in near if m.map_id != map_id and m.extractor_fingerprint == me.extractor_fingerprint]
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> _Ready:
+def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> ExaminedMap:
     """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    seen, described = found.feature_map.observations, summary.descriptors
-    if int(seen.has_descriptor.sum()) == described:
-        return _Ready(map_id=summary.map_id, write_id=summary.write_id, found=found)
+    if int(found.feature_map.observations.has_descriptor.sum()) == summary.descriptors:
+        return found
     result = database.commit_map(
         found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
     )
-    return _Ready(map_id=summary.map_id, write_id=result.write_id, found=found)
+    return replace(found, write_id=result.write_id)
 
 
-def _promote(
-    database: Database,
-    before: Localiser,
-    ready: Sequence[_Ready],
-    options: PromotionOptions,
-) -> list[Promotion]:
+def _promote(database: Database, before: Localiser, ready: Sequence[ExaminedMap]) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression."""
-    together = _tried(database, before, [r.found.feature_map for r in ready], options)
+    together = _tried(database, before, [found.feature_map for found in ready])
     if not together.regressions or len(ready) == 1:
         return _decide(database, before, ready, together)
     outcomes: list[Promotion] = []
-    localiser = before
-    for item in ready:
-        run = _tried(database, localiser, [item.found.feature_map], options)
-        decided = _decide(database, localiser, [item], run)
-        outcomes += decided
-        if decided[0].promoted:
-            localiser = Localiser.open(database, previous=localiser)
+    for found in ready:
+        run = _tried(database, before, [found.feature_map])
+        outcomes += _decide(database, before, [found], run)
+        if outcomes[-1].promoted:
+            before = Localiser.open(database, previous=before)
     return outcomes
 
 
-def _tried(
-    database: Database, before: Localiser, maps: Sequence[FeatureMap], options: PromotionOptions
-) -> CanaryRun:
+def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
     after = Localiser.open(database, previous=before, also=[m.map_id for m in maps])
-    return run_canaries(database, before, after, maps, options.canaries)
+    return run_canaries(database, before, after, maps)
 
 
 def _decide(
-    database: Database, before: Localiser, ready: Sequence[_Ready], run: CanaryRun
+    database: Database, before: Localiser, ready: Sequence[ExaminedMap], run: CanaryRun
 ) -> list[Promotion]:
-    gate = canary_gate(run)
-    ids = [r.map_id for r in ready]
-    gates = {r.map_id: (r.found.confirmation.gate, gate) for r in ready}
-    if not gate.passes:
-        return [_stays(m, gate.reason, gate.message, gates[m]) for m in ids]
-    confirmed = "; ".join(dict.fromkeys(r.found.confirmation.message for r in ready))
+    asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
+    if not run.gate.passes:
+        return [_stays(m, run.gate.reason, run.message, of) for m, of in asked.items()]
+    confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
-    asked = database.snapshot(before.snapshot)
-    active = [m.write_id for m in asked.maps() if m.status == "active"]
+    active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
+    based_on = {found.feature_map.map_id: found.write_id for found in ready}
     try:
-        database.set_status(
-            ids, "active", reason, based_on={r.map_id: r.write_id for r in ready}, active=active
-        )
+        database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
-        _LOG.info("promotion of %s waits: %s", ids, error)
-        return [_stays(m, "CONFLICT", str(error), gates[m]) for m in ids]
-    _LOG.info("promoted %s: %s", ids, reason)
-    return [Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=gates[m]) for m in ids]
+        _LOG.info("promotion of %s waits: %s", list(asked), error)
+        return [_stays(m, "CONFLICT", str(error), of) for m, of in asked.items()]
+    _LOG.info("promoted %s: %s", list(asked), reason)
+    return [
+        Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=of) for m, of in asked.items()
+    ]

@@ -1,7 +1,8 @@
 """A map made anew of the reconstruction in which it was adjusted with others."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,33 @@ from ingest.colmap.anchored import Anchored
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise, point_covariances, residual_variance, upper_triangle
 from ingest.growth.graph.joint.joined import JoinedMaps, MapRows, observed_pixels
-from ingest.growth.graph.joint.values import JOINT, AdjustedMap
+
+JOINT = "joint"  # key of Placement.evidence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedMap:
+    """What became of one map.
+
+    Attributes:
+        held: it was not to move.
+        shape_m: root mean square of what its camera centres moved against each other: what no similarity of
+            the map explains. move_m: largest way of a camera centre from where the map has it.
+        sigma_before_px, sigma_px: of its reprojection errors, before and after.
+        kept: share of its observations that still fit.
+    """
+
+    map_id: str
+    held: bool
+    photos: int
+    shape_m: float
+    move_m: float
+    sigma_before_px: float
+    sigma_px: float
+    kept: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(self).items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
