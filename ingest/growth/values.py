@@ -1,11 +1,13 @@
 """The values that pass between the steps of growth: localised photos, overlaps, placements, maps."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
@@ -31,6 +33,15 @@ TOLERANCE_PX = 8.0
 def pixel_scale(*cameras: Camera) -> float:
     """Pixels of the longest side for one of an image of 1600, on which SIFT locates keypoints; at least 1."""
     return max(1.0, max(max(camera.width, camera.height) for camera in cameras) / 1600.0)
+
+
+def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
+    """For each node the number of its group: of those that a chain of pairs ties together."""
+    row = {node: k for k, node in enumerate(nodes)}
+    ends = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(len(nodes), len(nodes)))
+    labels: list[int] = connected_components(graph, directed=False)[1].tolist()
+    return labels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -23,7 +23,7 @@ from featuredb.store.tables import BOUNDS
 from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
 from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode
 from ingest.growth.map_places import growth_of
-from ingest.growth.values import Edge
+from ingest.growth.values import Edge, tied_together
 
 OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has moved it
 
@@ -123,17 +123,10 @@ def place_of(feature_map: FeatureMap) -> str:
 
 def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
     """Maps that are connected with those of `start` by edges, those among them."""
-    neighbours: dict[str, set[str]] = {}
-    for a, b in edges:
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
-    found, queue = set(start) & set(maps), list(set(start) & set(maps))
-    while queue:
-        for other in neighbours.get(queue.pop(), ()):
-            if other in maps and other not in found:
-                found.add(other)
-                queue.append(other)
-    return found
+    nodes = list(maps)
+    group_of = dict(zip(nodes, tied_together(nodes, [e for e in edges if set(e) <= set(maps)]), strict=True))
+    groups = {group_of[m] for m in start if m in maps}
+    return {m for m in nodes if group_of[m] in groups}
 
 
 def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:

@@ -13,8 +13,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
 from featuredb.errors import InvalidValueError
@@ -22,6 +20,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.gates import SIGMAS
 from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode, PoseGraphFit
+from ingest.growth.values import tied_together
 
 _NAMED = 8  # overlaps that a message names
 _CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
@@ -172,12 +171,9 @@ def _check(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
 
 def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str]:
     """Maps with a chain of edges to an anchor."""
-    row = {node.map_id: i for i, node in enumerate(nodes)}
-    a, b = [row[e.a] for e in edges], [row[e.b] for e in edges]
-    graph = coo_array((np.ones(len(edges)), (a, b)), shape=(len(nodes), len(nodes)))
-    _, label = connected_components(graph, directed=False)
-    held = {int(label[i]) for i, node in enumerate(nodes) if node.prior is not None}
-    return {node.map_id for i, node in enumerate(nodes) if int(label[i]) in held}
+    labels = tied_together([node.map_id for node in nodes], [(e.a, e.b) for e in edges])
+    held = {label for node, label in zip(nodes, labels, strict=True) if node.prior is not None}
+    return {node.map_id for node, label in zip(nodes, labels, strict=True) if label in held}
 
 
 def equivalent_sigmas(chi_square: float, degrees: int) -> float:

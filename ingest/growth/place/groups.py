@@ -9,8 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
@@ -24,7 +22,7 @@ from ingest.colmap.anchored import (
 )
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.place.localised import in_frame
-from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale
+from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale, tied_together
 from ingest.sfm.matching import MatchOptions, mutual_matches
 
 _PARTNERS = 6  # photos that each one is compared with, those first that share most existing points
@@ -82,7 +80,9 @@ def lone_groups(
             geometries[a, b] = view
     reasons = dict.fromkeys(photos, "ALONE: no other photo bears its pose out")
     groups: list[Model] = []
-    for rows in _connected(sorted(photos), list(geometries)):
+    group_of = dict(zip(photos, tied_together(list(photos), geometries), strict=True))
+    for group in sorted(set(group_of.values())):
+        rows = [r for r in photos if group_of[r] == group]
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
             groups.append(_triangulated(rows, photos, own, features_of))
@@ -173,14 +173,6 @@ def _rays(camera: Camera, pose: Rigid3, pixels: FloatArray) -> FloatArray:
     xy = np.nan_to_num(camera.unproject(pixels))
     rays = np.column_stack([xy, np.ones(len(xy))]) @ pose.rotation
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-
-
-def _connected(rows: Sequence[int], pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    place = {r: k for k, r in enumerate(rows)}
-    ends = ([place[p] for p, _ in pairs], [place[q] for _, q in pairs])
-    graph = coo_array((np.ones(len(pairs)), ends), shape=(len(rows), len(rows)))
-    count, label = connected_components(graph, directed=False)
-    return [tuple(r for r, of in zip(rows, label, strict=True) if of == c) for c in range(count)]
 
 
 def _triangulated(

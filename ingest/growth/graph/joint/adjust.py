@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
@@ -29,6 +27,7 @@ from ingest.growth.graph.joint.joined import JoinedMaps, join_maps
 from ingest.growth.graph.joint.judge import describe, placement_sigma_m, refusal
 from ingest.growth.graph.joint.links import find_links
 from ingest.growth.place.refine import in_metres
+from ingest.growth.values import tied_together
 
 _AS_SURE = 2.0  # anchors up to so many times as uncertain as the surest hold the place of all
 # Points in common from which on two maps are connected: an accepted pose has 15 inliers, and an overlap is
@@ -161,11 +160,9 @@ def _check(maps: Sequence[FeatureMap], held: Collection[str]) -> None:
 
 def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64]) -> list[str]:
     """Maps outside the largest group of maps with enough points in common."""
-    _, label = connected_components(
-        sparse.csr_array((shared >= _LEAST_SHARED).astype(np.int8)), directed=False
-    )
-    largest = int(np.argmax(np.bincount(label)))
-    return [m.map_id for m, group in zip(maps, label.tolist(), strict=True) if group != largest]
+    groups = tied_together(range(len(maps)), zip(*np.nonzero(shared >= _LEAST_SHARED), strict=True))
+    largest = int(np.argmax(np.bincount(groups)))
+    return [m.map_id for m, group in zip(maps, groups, strict=True) if group != largest]
 
 
 def _back(maps: Sequence[FeatureMap], joined: JoinedMaps, adjusted: Model) -> Sim3:

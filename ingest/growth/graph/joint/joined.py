@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -21,6 +19,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.links import Links
+from ingest.growth.values import tied_together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +120,7 @@ class _Photos:
         self._focals_px: dict[int, list[float]] = {}
         camera_name = _same_cameras(maps)
         photo_row: dict[tuple[str, ...], int] = {}
-        camera_row: dict[tuple[str, ...], int] = {}
+        camera_row: dict[int, int] = {}
         self.rows: list[NDArray[np.int64]] = []
         for feature_map in maps:
             to_frame = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
@@ -159,26 +158,19 @@ def _tells_focal(key: str) -> bool:
     return re.search(r"\|f\d+(\||$)", key) is not None
 
 
-def _same_cameras(maps: Sequence[FeatureMap]) -> dict[tuple[str, int], tuple[str, ...]]:
-    """A name for each map's cameras; those of one EXIF key with focal length, and of one photo, have one."""
+def _same_cameras(maps: Sequence[FeatureMap]) -> dict[tuple[str, int], int]:
+    """A number for each map's cameras; those of one EXIF key with focal length, or of one photo, have one."""
     nodes = [(m.map_id, c) for m in maps for c in range(len(m.cameras))]
-    place = {node: k for k, node in enumerate(nodes)}
-    groups: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[tuple[str, ...], list[tuple[str, int]]] = {}
     for feature_map in maps:
         for image in feature_map.images:
-            node = place[feature_map.map_id, image.camera_id]
+            node = feature_map.map_id, image.camera_id
             groups.setdefault(("photo", *_photo_name(feature_map, image)), []).append(node)
             key, camera = _key(feature_map, image.camera_id), feature_map.cameras[image.camera_id]
             if _tells_focal(key):
                 groups.setdefault(("key", key, f"{camera.width}x{camera.height}"), []).append(node)
-    pairs = np.array(
-        [(group[0], other) for group in groups.values() for other in group] or [(0, 0)], dtype=np.int64
-    )
-    graph = sparse.csr_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes))
-    )
-    _, label = connected_components(graph, directed=False)
-    return {node: (str(label[k]),) for node, k in place.items()}
+    pairs = [(group[0], other) for group in groups.values() for other in group]
+    return dict(zip(nodes, tied_together(nodes, pairs), strict=True))
 
 
 def _photo_of(feature_map: FeatureMap, photos: NDArray[np.int64]) -> NDArray[np.int64]:
