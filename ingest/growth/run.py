@@ -27,14 +27,7 @@ from ingest.growth.not_found import NotFound, NotFoundRows
 from ingest.growth.place.component import AT_SEVERAL_PLACES, grow_component, split
 from ingest.growth.place.groups import lone_groups
 from ingest.growth.place.localised import localise_photos, with_shared_lenses
-from ingest.growth.run_record import (
-    GrowthOptions,
-    GrowthPhotos,
-    Run,
-    fates_of,
-    grown_entry,
-    split_reason,
-)
+from ingest.growth.run_record import GrowthOptions, GrowthPhotos, Run, fates_of, grown_entry, split_reason
 from ingest.growth.trust.corroboration import NewPhotos
 from ingest.growth.trust.promotion import promote_confirmed
 from ingest.growth.trust.scan_check import checked_by_scan

@@ -1,9 +1,9 @@
 """A pose graph over maps: where all of them lie best, given anchors and measured overlaps.
 
 Nodes are corrections of the maps' present places, similarities in one local frame; edges are measured
-similarities between maps that overlap; anchors are held by their own covariance. scipy's least squares on
-the tangent of SIM(3) solves it. With x' = X_i x for the points of map i and Z that carries what map i says to
-where map j says it, X_i = X_j Z in truth, so an edge's residual is log(X_j^-1 X_i Z^-1).
+similarities between maps that overlap; anchors are held by their own covariance. With x' = X_i x for the
+points of map i and Z that carries what map i says to where map j says it, X_i = X_j Z in truth, so an edge's
+residual is log(X_j^-1 X_i Z^-1).
 
 Marginal covariances come from the normal matrix of the whole graph, not from sums along one path. An edge is
 judged by how much of chi-square goes with it (the block form of Baarda's test).
@@ -94,7 +94,10 @@ def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> 
         if not reached:
             return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
         fitted = PoseGraphFit([n for n in nodes if n.map_id in reached], remaining)
-        fits = _edge_fits(fitted)
+        fits = tuple(
+            EdgeFit(edge=edge, chi_square=chi, redundancy=rank, sigmas=equivalent_sigmas(chi, rank))
+            for edge, (chi, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True)
+        )
         worst = _contradicting(fitted, fits)
         if worst is None or _anchored(nodes, [e for e in remaining if e is not worst.edge]) != anchored_first:
             break
@@ -108,35 +111,24 @@ def _solution(fitted: PoseGraphFit, fits: tuple[EdgeFit, ...]) -> GraphSolution:
     if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    if factor > _MOST_VARIANCE_FACTOR:
-        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
-        named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
-        return GraphSolution(
-            reason="CONTRADICTION",
-            message=f"the overlaps contradict each other and no single one stands out ({figures}): {named}",
-            chi_square=fitted.chi_square,
-            degrees=fitted.degrees,
-            variance_factor=factor,
-            edges=fits,
-        )
-    on_earth, relative = fitted.marginals(), fitted.relative_marginals()
-    return GraphSolution(
+    found = GraphSolution(
         reason=None,
         message=figures,
-        corrections=fitted.corrections,
-        covariance={m: factor * c for m, c in on_earth.items()},
-        covariance_relative={m: factor * c for m, c in relative.items()},
         chi_square=fitted.chi_square,
         degrees=fitted.degrees,
         variance_factor=factor,
         edges=fits,
     )
-
-
-def _edge_fits(fitted: PoseGraphFit) -> tuple[EdgeFit, ...]:
-    return tuple(
-        EdgeFit(edge=edge, chi_square=chi, redundancy=rank, sigmas=equivalent_sigmas(chi, rank))
-        for edge, (chi, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True)
+    if factor > _MOST_VARIANCE_FACTOR:
+        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
+        named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
+        text = f"the overlaps contradict each other and no single one stands out ({figures}): {named}"
+        return replace(found, reason="CONTRADICTION", message=text)
+    return replace(
+        found,
+        corrections=fitted.corrections,
+        covariance={m: factor * c for m, c in fitted.marginals().items()},
+        covariance_relative={m: factor * c for m, c in fitted.relative_marginals().items()},
     )
 
 

@@ -19,13 +19,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
-from ingest.colmap.anchored import (
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    block_and_marks,
-    with_observations,
-)
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, block_and_marks, with_observations
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import design_effect
 

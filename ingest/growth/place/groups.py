@@ -13,13 +13,7 @@ import numpy as np
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap.anchored import (
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    adjust_anchored,
-    triangulate_posed,
-)
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.place.localised import in_frame
 from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale, tied_together
@@ -190,9 +184,7 @@ def _triangulated(
     cameras = list(dict.fromkeys(photos[r].camera for r in rows))
     sfm = [
         SfmPhoto(
-            name=str(r),
-            camera_row=cameras.index(photos[r].camera),
-            keypoints=features_of(r).features.xy,
+            name=str(r), camera_row=cameras.index(photos[r].camera), keypoints=features_of(r).features.xy
         )
         for r in rows
     ]

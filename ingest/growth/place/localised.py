@@ -86,11 +86,7 @@ def localise_each(
 
 
 def localise_photo(
-    photo: Photo,
-    row: int,
-    features: Features,
-    areas: Sequence[IndexedArea],
-    camera: Camera | None = None,
+    photo: Photo, row: int, features: Features, areas: Sequence[IndexedArea], camera: Camera | None = None
 ) -> LocalisedPhoto | str:
     """One photo, or the reason why it is not localised.
 

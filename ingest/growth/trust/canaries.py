@@ -10,7 +10,7 @@ and, asked of the new map alone, a new map that shows their place somewhere else
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +39,6 @@ from reloc.wire.query import LocaliseWireRequest
 _OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
-
 
 _OWN_NEAR, _OWN_ELSEWHERE = 8, 4  # images of active maps that are asked, around the new one and elsewhere
 # Of an own image's answer; the drift budget's order, and well above what new points within their sigma move a
@@ -112,12 +111,12 @@ class _Miss:
     degrees: float
     sigma_m: float
 
+    def __str__(self) -> str:
+        return f"{self.metres:.2f} m and {self.degrees:.2f} degrees"
+
 
 def run_canaries(
-    database: Database,
-    before: Localiser,
-    after: Localiser,
-    new_maps: Sequence[FeatureMap],
+    database: Database, before: Localiser, after: Localiser, new_maps: Sequence[FeatureMap]
 ) -> CanaryRun:
     """Ask all known queries and images of the maps, before and after.
 
@@ -151,14 +150,7 @@ def check_known(database: Database, canary: Canary, before: Localiser, after: Lo
     else:
         limits = (canary.pose.tolerance_m, canary.pose.tolerance_deg)
         verdicts = [_verdict(miss, *limits) for miss in misses]
-    return CanaryCheck(
-        name=canary.name,
-        before=verdicts[0],
-        after=verdicts[1],
-        error_before_m=_metres(misses[0]),
-        error_m=_metres(misses[1]),
-        regression=_regression(verdicts[0], verdicts[1], misses[1], results[1]),
-    )
+    return _checked(canary.name, verdicts, misses, results[1])
 
 
 def answer_now(
@@ -215,11 +207,7 @@ def own_canaries(before: Localiser, new_maps: Sequence[FeatureMap]) -> list[tupl
 
 
 def _check_own(
-    feature_map: FeatureMap,
-    image: MapImage,
-    before: Localiser,
-    after: Localiser,
-    new_ids: tuple[str, ...],
+    feature_map: FeatureMap, image: MapImage, before: Localiser, after: Localiser, new_ids: tuple[str, ...]
 ) -> CanaryCheck:
     """Ask an image of a map of both, and of the new maps alone."""
     features, _ = features_and_points(feature_map, image)
@@ -230,21 +218,10 @@ def _check_own(
     verdicts = [_verdict(miss, _TOLERANCE_M, _TOLERANCE_DEG) for miss in misses[:2]]
     may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
     alone = _verdict(misses[2], max(_TOLERANCE_M, may_miss_m), _TOLERANCE_DEG)
-    regression = _regression(verdicts[0], verdicts[1], misses[1], results[1])
-    if not regression and alone == "moved" and misses[2] is not None:
-        regression = (
-            f"the new map alone has it {misses[2].metres:.2f} m and {misses[2].degrees:.2f} degrees "
-            "from where it is"
-        )
-    return CanaryCheck(
-        name=f"{image.name} of map {feature_map.map_id}",
-        before=verdicts[0],
-        after=verdicts[1],
-        alone=alone,
-        error_before_m=_metres(misses[0]),
-        error_m=_metres(misses[1]),
-        regression=regression,
-    )
+    check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
+    if check.regression or alone != "moved":
+        return replace(check, alone=alone)
+    return replace(check, alone=alone, regression=f"the new map alone has it {misses[2]} from where it is")
 
 
 def _ask(
@@ -256,14 +233,26 @@ def _ask(
     return localise_features(features, request, areas, options).result
 
 
-def _regression(before: Verdict, after: Verdict, miss: _Miss | None, result: LocaliseResult) -> str:
-    if after in ("right", "not_found") or before not in ("right", "not_found"):
-        return ""
-    if after == "found":
-        return "a photo of elsewhere now finds a place"
-    if miss is None:
-        return f"no longer localised: {result.reason}: {result.detail}"
-    return f"now {miss.metres:.2f} m and {miss.degrees:.2f} degrees off"
+def _checked(
+    name: str, verdicts: Sequence[Verdict], misses: Sequence[_Miss | None], result: LocaliseResult
+) -> CanaryCheck:
+    """What became of an answer: verdicts and misses before and after, and the result after."""
+    (before, after), regression = verdicts, ""
+    if before in ("right", "not_found") and after not in ("right", "not_found"):
+        regression = f"now {misses[1]} off"
+        if after == "found":
+            regression = "a photo of elsewhere now finds a place"
+        elif misses[1] is None:
+            regression = f"no longer localised: {result.reason}: {result.detail}"
+    errors = [float("nan") if miss is None else miss.metres for miss in misses[:2]]
+    return CanaryCheck(
+        name=name,
+        before=before,
+        after=after,
+        error_before_m=errors[0],
+        error_m=errors[1],
+        regression=regression,
+    )
 
 
 def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:
@@ -280,10 +269,6 @@ def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: M
         return None
     expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
     return _miss(pose, expected.center, expected.rotation)
-
-
-def _metres(miss: _Miss | None) -> float:
-    return float("nan") if miss is None else miss.metres
 
 
 def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:

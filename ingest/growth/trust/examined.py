@@ -44,8 +44,7 @@ def remember(
         return
     told = [{**asdict(gate), "passes": bool(gate.passes), "figure": float(gate.figure)} for gate in gates]
     write_json(
-        _file(work, map_id),
-        {"question": asked, "reason_code": reason_code, "reason": reason, "gates": told},
+        _file(work, map_id), {"question": asked, "reason_code": reason_code, "reason": reason, "gates": told}
     )
 
 

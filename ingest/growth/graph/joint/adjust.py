@@ -66,10 +66,7 @@ class JointAdjustment:
 
 
 def adjust_together(
-    maps: Sequence[FeatureMap],
-    held: Collection[str] = (),
-    *,
-    free: Collection[str] = (),
+    maps: Sequence[FeatureMap], held: Collection[str] = (), *, free: Collection[str] = ()
 ) -> JointAdjustment:
     """Adjust maps that overlap, all at once.
 

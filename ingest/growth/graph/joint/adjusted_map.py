@@ -46,16 +46,8 @@ class AdjustedMap:
         return {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(self).items()}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Precision:
+def precision_of(joined: JoinedMaps, model: Model) -> tuple[FloatArray, FloatArray]:
     """Of all points of the model: covariances (n, 3, 3) in its frame, mean errors (n,) in pixels."""
-
-    covariance: FloatArray
-    error_px: FloatArray
-
-
-def precision_of(joined: JoinedMaps, model: Model) -> Precision:
-    """Of the points of an adjusted model."""
     linear = linearise(
         model.cameras,
         model.camera_of,
@@ -65,21 +57,18 @@ def precision_of(joined: JoinedMaps, model: Model) -> Precision:
         model.photo_of,
         observed_pixels(joined, model),
     )
-    variance = residual_variance(linear, len(model.rows), len(model.xyz))
-    errors = np.bincount(
-        model.point_of, weights=np.linalg.norm(linear.residual, axis=1), minlength=len(model.xyz)
-    )
-    return Precision(
-        covariance=point_covariances(linear, len(model.xyz), variance),
-        error_px=errors / np.maximum(model.track_lengths(), 1),
-    )
+    count = len(model.xyz)
+    variance = residual_variance(linear, len(model.rows), count)
+    off = np.linalg.norm(linear.residual, axis=1)
+    errors = np.bincount(model.point_of, weights=off, minlength=count) / np.maximum(model.track_lengths(), 1)
+    return point_covariances(linear, count, variance), errors
 
 
 def adjusted_map(
     feature_map: FeatureMap,
     rows: MapRows,
     result: Anchored,
-    precision: Precision,
+    precision: tuple[FloatArray, FloatArray],
     frame: LocalFrame,
     together: Sequence[FeatureMap],
     report: AdjustedMap,
@@ -98,12 +87,9 @@ def adjusted_map(
     index, joint = index.reshape(-1).astype(np.int64), joint_point[first]
     places = to_own.act(model.xyz[joint])
     move = similarity_closed_form(feature_map.points_local()[points], places) if len(points) >= 3 else None
-    turned = to_own.rotation @ precision.covariance[joint] @ to_own.rotation.T
+    turned = to_own.rotation @ precision[0][joint] @ to_own.rotation.T
     placement = feature_map.placement
-    evidence = {
-        **placement.evidence,
-        JOINT: {"with": sorted(m.map_id for m in together), **report.as_json()},
-    }
+    told = {JOINT: {"with": sorted(m.map_id for m in together), **report.as_json()}}
     return replace(
         feature_map,
         cameras=tuple(cameras),
@@ -112,14 +98,14 @@ def adjusted_map(
             utm=feature_map.frame.utm_from_enu(places, feature_map.epsg),
             rgb=old.rgb[points],
             track_length=np.bincount(index, minlength=len(points)).astype(np.int32),
-            error_px=precision.error_px[joint].astype(np.float32),
+            error_px=precision[1][joint].astype(np.float32),
             covariance=upper_triangle(turned),
         ),
         observations=replace(take_observations(seen, kept), point_index=index),
         placement=replace(
             placement,
             local_from_sfm=(move or Sim3.identity()) @ placement.local_from_sfm,
-            evidence=evidence,
+            evidence={**placement.evidence, **told},
         ),
     )
 

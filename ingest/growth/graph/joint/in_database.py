@@ -48,11 +48,7 @@ class DatabaseAdjustment:
 
 
 def adjust_maps(
-    database: Database,
-    named: Sequence[str],
-    *,
-    free: Collection[str] = (),
-    dry_run: bool = False,
+    database: Database, named: Sequence[str], *, free: Collection[str] = (), dry_run: bool = False
 ) -> DatabaseAdjustment:
     """Adjust active maps together, with all active maps that hang on them, held by the parents of them all.
 

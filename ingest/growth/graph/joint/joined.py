@@ -111,34 +111,32 @@ def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Jo
 
 
 class _Photos:
-    """Photos and cameras of all maps, each once."""
+    """Photos and cameras of all maps, each once; rows of the photos (i,) of each map's images."""
 
     def __init__(self, maps: Sequence[FeatureMap], frame: LocalFrame) -> None:
         self.poses: list[Rigid3] = []
         self.camera_of: list[int] = []
         self.cameras: list[Camera] = []
+        self.rows: list[NDArray[np.int64]] = []
         self._focals_px: dict[int, list[float]] = {}
-        camera_name = _same_cameras(maps)
+        same = _same_cameras(maps)
         photo_row: dict[tuple[str, ...], int] = {}
         camera_row: dict[int, int] = {}
-        self.rows: list[NDArray[np.int64]] = []
         for feature_map in maps:
             to_frame = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-            mine = []
             for image in feature_map.images:
-                name = _photo_name(feature_map, image)
-                if name not in photo_row:
-                    photo_row[name] = len(self.poses)
-                    self.poses.append(to_frame.act_on_pose(image.cam_from_local))
-                    camera = camera_name[feature_map.map_id, image.camera_id]
-                    if camera not in camera_row:
-                        camera_row[camera] = len(self.cameras)
-                        self.cameras.append(feature_map.cameras[image.camera_id])
-                    self.camera_of.append(camera_row[camera])
-                    if _tells_focal(_key(feature_map, image.camera_id)):
-                        focals = self._focals_px.setdefault(camera_row[camera], [])
-                        focals.append(feature_map.cameras[image.camera_id].focal_px)
-                mine.append(photo_row[name])
+                name, camera = _photo_name(feature_map, image), feature_map.cameras[image.camera_id]
+                if name in photo_row:
+                    continue
+                photo_row[name] = len(self.poses)
+                self.poses.append(to_frame.act_on_pose(image.cam_from_local))
+                row = camera_row.setdefault(same[feature_map.map_id, image.camera_id], len(self.cameras))
+                if row == len(self.cameras):
+                    self.cameras.append(camera)
+                self.camera_of.append(row)
+                if _tells_focal(_key(feature_map, image.camera_id)):
+                    self._focals_px.setdefault(row, []).append(camera.focal_px)
+            mine = [photo_row[_photo_name(feature_map, image)] for image in feature_map.images]
             self.rows.append(np.array(mine, dtype=np.int64))
 
     def known_focal_px(self) -> dict[int, float]:

@@ -30,11 +30,7 @@ _LEAST_MOVE_M = 0.05  # that an anchor's photos may move by, or `SIGMAS` of its 
 
 
 def describe(
-    maps: Sequence[FeatureMap],
-    held: Collection[str],
-    joined: JoinedMaps,
-    result: Anchored,
-    frame: LocalFrame,
+    maps: Sequence[FeatureMap], held: Collection[str], joined: JoinedMaps, result: Anchored, frame: LocalFrame
 ) -> list[AdjustedMap]:
     """What became of each map.
 
