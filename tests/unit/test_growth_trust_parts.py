@@ -13,7 +13,16 @@ from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.bridge import Model
 from ingest.colmap.submodel import keep_photos
 from ingest.growth import gates
-from ingest.growth.graph.map_graph import PlacedMap, no_surer_than, place_of, solve_with_new
+from ingest.growth.graph.map_graph import (
+    OWN,
+    PlacedMap,
+    graph_edges,
+    graph_nodes,
+    no_surer_than,
+    place_of,
+    solve_with_new,
+)
+from ingest.growth.graph.pose_graph import solve_pose_graph
 from ingest.growth.graph.replacing import MovedMap, Replacement, overlaps_to_measure
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
 from ingest.growth.map_images import model_of
@@ -100,6 +109,34 @@ def test_two_edges_of_the_same_photos_count_once() -> None:
     np.testing.assert_allclose(loose[0].covariance, EDGE, rtol=1e-9)
     bent = EDGE + np.diag([0.0] * 4 + [0.01] * 3)
     np.testing.assert_allclose(no_surer_than([edge], bent)[0].covariance, bent, rtol=1e-6)
+
+
+def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -> None:
+    """A GPS anchor two metres east of a map on a firm one; solved again, nothing is surer than before."""
+    loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
+    gps, child = strip_map("gps", 20.0, covariance=loose), strip_map("m", 45.0, parents=[_ANCHOR])
+    to_gps = Edge(
+        map_id="gps",
+        place=place_of(gps),
+        other_from_map=east(2.0),
+        covariance=EDGE,
+        shared_points=9,
+        photos=3,
+    )
+    maps = {m.map_id: _placed(m) for m in (_ANCHOR, gps, child)}
+    maps["m"] = replace(maps["m"], edges=(*maps["m"].edges, to_gps))
+    ids = sorted(maps)
+    first = solve_pose_graph(graph_nodes(maps, ids, FRAME), graph_edges(maps, ids, FRAME))
+    moved = first.corrections["gps"]
+    assert np.linalg.norm(moved.translation) > 1.5
+    own = {"covariance": loose.ravel().tolist(), "present_from_own": moved.log().tolist()}
+    there = replace(maps["gps"], covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    agreeing = moved @ to_gps.other_from_map @ first.corrections["m"].inverse()
+    edges = (maps["m"].edges[0], replace(to_gps, other_from_map=agreeing))
+    maps |= {"gps": there, "m": replace(maps["m"], edges=edges)}
+    again = solve_pose_graph(graph_nodes(maps, ids, FRAME), graph_edges(maps, ids, FRAME))
+    assert np.linalg.norm(again.corrections["gps"].translation) < 0.01
+    np.testing.assert_allclose(again.covariance["gps"], first.covariance["gps"], rtol=1e-3, atol=1e-6)
 
 
 def test_the_gate_of_drift() -> None:

@@ -156,11 +156,16 @@ def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> Gra
 
 
 def graph_nodes(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphNode]:
-    """Nodes: anchors with their placement's covariance in the frame."""
-    priors = {
-        m: covariance_in_frame(maps[m].covariance, maps[m].frame, frame) for m in of if maps[m].is_anchor
-    }
-    return [GraphNode(map_id=m, prior=priors.get(m)) for m in of]
+    """Nodes; anchors with their own placement: where others have moved one, the edges say so anew."""
+    nodes = []
+    for map_id in of:
+        me, node = maps[map_id], GraphNode(map_id=map_id)
+        if me.is_anchor:
+            covariance, moved = me.own_placement
+            prior = covariance_in_frame(covariance, me.frame, frame)
+            node = replace(node, prior=prior, present_from_own=in_frame(moved, me.frame, frame))
+        nodes.append(node)
+    return nodes
 
 
 def solve_with_new(
