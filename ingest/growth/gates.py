@@ -37,10 +37,7 @@ _MAX_BLIND = 0.34  # share of photos that show less; single ones are left out
 class Gate:
     """One question and its answer.
 
-    Attributes:
-        name, reason: for programs: of the gate, and the code of a refusal by it.
-        figure, limit: what was measured, and where the line is.
-        message: for people, with both.
+    `reason` is the code of a refusal by it; `message` is for people, with figure and limit.
     """
 
     name: str

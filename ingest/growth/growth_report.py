@@ -20,15 +20,7 @@ _WORDS: tuple[tuple[PhotoOutcome, str], ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoFate:
-    """What became of a photo.
-
-    Attributes:
-        name: of the photo; a contributed one's candidate id.
-        owner: who gave it.
-        outcome: in an active map, in a quarantined one, still waiting, or refused for good.
-        map_id: of its map, "" where it has none.
-        reason_code, reason: why it waits or is refused.
-    """
+    """What became of a photo, and why it waits or is refused; the name of a contributed one is its id."""
 
     name: str
     owner: str
@@ -47,7 +39,6 @@ class GrownEntry:
             place still.
         reason_code, reason: why it is not active, or who confirmed it.
         drift_m, budget_m: 95 % bound on its drift against its anchors, and what is allowed.
-        photos: names. gates: every gate with its figure.
         agreements: how well the existing maps agree that it overlaps, in words.
     """
 
@@ -75,7 +66,6 @@ class GrowthReport:
             promoted.
         promotions: of every quarantined map that was examined, in the last round that did.
         replacements: what new anchors did.
-        notes: for people.
     """
 
     database: str

@@ -72,11 +72,7 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
 
     About the middle of its photos; not less, anywhere that the map answers for, than the given one says for
-    the worst direction there.
-
-    Args:
-        feature_map: whose places are meant.
-        covariance: (7, 7) of the placement's left perturbation, in the map's frame.
+    the worst direction there. The covariance is of the placement's left perturbation, in the map's frame.
     """
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     jacobian = point_jacobian(middle)

@@ -20,23 +20,14 @@ _VERSION = "1"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NotFound:
-    """Where a photo was looked for in vain.
-
-    Attributes:
-        maps: write ids: a map that was moved or thinned is another one.
-        reason: of localisation.
-    """
+    """Write ids of the maps where a photo was looked for in vain (one that was moved is another), and why."""
 
     maps: frozenset[str]
     reason: str
 
 
 class NotFoundRows:
-    """Photos of a run by row; what is noted here, the next run knows.
-
-    Attributes:
-        known: what was looked for in vain.
-    """
+    """Photos of a run by row, as `known`; what is noted here, the next run knows."""
 
     def __init__(self, photos: Sequence[Photo], features_of: FeaturesOf, work: Path) -> None:
         self._photos, self._folder = photos, work / "not_found"

@@ -102,13 +102,7 @@ def grow(
 
 @dataclass(slots=True, kw_only=True)
 class _Round:
-    """One round.
-
-    Attributes:
-        localiser: of the active maps.
-        localised: what they show of the photos that are in no map yet, by row.
-        posed: the same; lone ones of one camera with one lens.
-    """
+    """One round; `localised` photos are in no map; `posed`: those, lone ones of a camera with one lens."""
 
     database: Database
     new: GrowthPhotos

@@ -25,7 +25,6 @@ class GrowthOptions:
     Attributes:
         drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
             a survey's points are usually wanted for. Photos beyond it wait for an anchor.
-        confirmation: when a map counts as confirmed.
         threads: photos that are localised at a time.
     """
 
@@ -39,8 +38,6 @@ class GrowthPhotos:
     """New photos, matched and reconstructed.
 
     Attributes:
-        photos: rows of everything here.
-        features_of: of a row.
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
         overlaps: pairs of rows whose matches were verified; None: not known.

@@ -42,13 +42,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Placed:
-    """What became of the maps without a place.
-
-    Attributes:
-        placed: entries of those that have one now, in quarantine like all that growth makes.
-        unplaced: entries of those that have none still, with the reason.
-        notes: for people.
-    """
+    """Maps without a place that have one now, in quarantine, and those that still have none, and why."""
 
     placed: tuple[GrownEntry, ...] = ()
     unplaced: tuple[GrownEntry, ...] = ()
@@ -58,10 +52,7 @@ class Placed:
 def place_unplaced_maps(
     database: Database, areas: Sequence[IndexedArea], work: Path, options: GrowthOptions
 ) -> Placed:
-    """Try every map without a place; a question that was answered before is not asked again.
-
-    Args:
-        areas: of the active maps.
+    """Try every map without a place in the active areas; a question is not asked twice.
 
     Raises:
         StoreError: the database cannot be read or written; what is committed stands.

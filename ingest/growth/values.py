@@ -49,15 +49,11 @@ class LocalisedPhoto:
     """A new photo that the existing maps localise, by itself, without knowing of other new photos.
 
     Attributes:
-        row: row of the photos.
         frame: local frame of everything metric here.
-        cam_from_local: pose in that frame.
         covariance: (6, 6), axes of the frame, measured part only (without the maps' placements): small
             rotation of the camera (rad) before displacement of its centre (m), as pose_uncertainty has it.
-        camera: intrinsics that the localisation used or estimated.
         feature_rows: (k,) rows of the photo's features that are inliers; pixels: (k, 2) float64 of those.
-        map_ids: the maps that the inliers' points belong to, most inliers first; map_of: (k,) index into
-            them.
+        map_ids: the maps of the inliers' points, most inliers first; map_of: (k,) index into them.
         point_of: (k,) row of that map's points.
         points: (k, 3) those points in the frame, metres.
         point_covariance: (k, 3, 3) of the points, relative to their map's gauge.
@@ -100,7 +96,6 @@ class Edge:
     """An overlap of a map with another one; kept in the evidence of the map that was placed by it.
 
     Attributes:
-        map_id: the other map.
         other_from_map: carries what this map says to where the other says it; this map's local frame.
         covariance: (7, 7) of its left perturbation, relative to the other map.
         shared_points, photos: that it rests on.
@@ -183,8 +178,6 @@ class GrownMap:
     """A new map, ready to be committed (as quarantined, by whoever commits it).
 
     Attributes:
-        feature_map: method "map", its parents, generation and evidence["growth"].
-        placement: how it was placed.
         model: the reconstruction after refinement; metric, in the frame of the map.
         agreements: sentences on how well the existing maps agree that it overlaps.
         left_out: photos of the reconstruction that are not in the map, by row, with reason and message.

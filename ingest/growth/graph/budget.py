@@ -26,12 +26,7 @@ def grow_within_budget(
     confirmation: ConfirmationOptions,
     budget_m: float,
 ) -> GrownMap | Refused:
-    """The map of a reconstruction with its drift, of the part of it that is within the budget.
-
-    Args:
-        grow: from a reconstruction to a map.
-        maps: of the snapshot.
-    """
+    """The map, by `grow`, of a reconstruction with its drift, or of the part that is within the budget."""
     part, everything = model, tuple(model.rows.tolist())
     beyond: dict[int, tuple[str, str]] = {}
     refused = Refused(reason="", message="")
@@ -59,11 +54,7 @@ def grow_within_budget(
 def with_drift(
     grown: GrownMap, maps: Mapping[str, PlacedMap], confirmation: ConfirmationOptions, budget_m: float
 ) -> tuple[FeatureMap, float, FloatArray]:
-    """The map with its overlaps, drift and covariance by the graph of all maps.
-
-    Returns:
-        The map, its drift (metres), its covariance (7, 7) relative to the anchors.
-    """
+    """The map with its overlaps by the graph of maps, its drift (m) and covariance (7, 7) to anchors."""
     feature_map = grown.feature_map
     growth = growth_of(feature_map.placement.evidence)
     shared = np.reshape(growth["shared_turn"], (7, 3))

@@ -39,7 +39,6 @@ class GraphEdge:
     """A measured overlap of two maps at their present places.
 
     Attributes:
-        a, b: map ids.
         b_from_a: carries what map a says to where map b says it; graph's frame.
         covariance: (7, 7) of its left perturbation.
         shared: (7, 3) the part of it that all edges have in common: what they are off for one sigma of three
@@ -61,13 +60,7 @@ class GraphEdge:
 
 
 class PoseGraphFit:
-    """A graph solved by least squares, with what is needed to judge it.
-
-    Attributes:
-        edges: of the maps that were solved.
-        corrections: new_from_present by map id.
-        chi_square, degrees: of the fit.
-    """
+    """A graph solved by least squares, with what is needed to judge it; corrections are new_from_present."""
 
     def __init__(self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
         self._nodes, self._rows = nodes, {node.map_id: i for i, node in enumerate(nodes)}

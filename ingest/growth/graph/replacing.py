@@ -70,8 +70,7 @@ class Replacement:
     Attributes:
         reason: None, the pose graph's, or CANARY; `message` for people. Nothing was committed where there
             is one.
-        version: of the database since; -1 where nothing was committed.
-        moved: all maps that were committed anew.
+        version: of the database since, or -1. moved: all maps that were committed anew.
         measured: what was said of each new overlap, "map - anchor: ...".
         left_out: overlaps that contradict the rest.
         flagged: maps that are quarantined now, because they hang on a moved one by no overlap that holds.
@@ -90,10 +89,7 @@ class Replacement:
 
 
 def replace_descendants(database: Database, work: Path, *, budget_m: float) -> Replacement | None:
-    """Look for new anchors and anchors placed anew around grown maps, and re-place the maps by them.
-
-    Returns:
-        None where there is nothing new.
+    """Look for new anchors and anchors placed anew around grown maps, re-place the maps by them; or None.
 
     Raises:
         ConflictError: someone else changed one of the maps meanwhile; nothing has changed.

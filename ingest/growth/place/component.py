@@ -55,7 +55,6 @@ def grow_component(
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
-        identity: of the new map.
         max_bound_m: photos that may be further off (95 %) are left out.
 
     Returns:
@@ -122,11 +121,7 @@ def _assembled(
     areas: Sequence[Area],
     identity: MapIdentity,
 ) -> GrownMap | Refused:
-    """The map of a refined model, with what growth knows about it as evidence.
-
-    Args:
-        held: correspondences that agree with the placement.
-    """
+    """The map of a refined model held by these correspondences, with what growth knows of it as evidence."""
     model, placement = refined.model, refined.placement
     maps = {m.map_id: m for area in areas for m in area.maps}
     parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]

@@ -59,10 +59,9 @@ _COLUMNS = Correspondences.__slots__[1:]
 def find_correspondences(
     model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Mapping[int, FloatArray]
 ) -> Correspondences:
-    """Correspondences of a model's photos, own and carried along its tracks.
+    """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
 
     Args:
-        localised: by row of the photos, all in one frame.
         keypoints: pixels (n, 2) of all features of the model's photos, by row.
     """
     mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}

@@ -44,7 +44,7 @@ class FittedSimilarity:
     """A fitted similarity.
 
     Attributes:
-        local_from_sfm: the similarity. covariance: (7, 7) of its left perturbation.
+        covariance: (7, 7) of the similarity's left perturbation.
         errors_px: (m,) distances of all pixels from where the placed model sees their points.
         spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times the variance of what neighbours say exceeds that of independent

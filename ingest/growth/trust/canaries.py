@@ -53,7 +53,6 @@ class CanaryCheck:
     Attributes:
         before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
         error_before_m, error_m: of the answers; NaN where there is none.
-        regression: why it is one, "" where it is none.
     """
 
     name: str

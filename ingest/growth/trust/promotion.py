@@ -39,13 +39,7 @@ class ExaminedMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promotion:
-    """What became of one quarantined map.
-
-    Attributes:
-        promoted: whether it is active now.
-        reason_code, reason: why it stays in quarantine; the reason of the promotion otherwise.
-        gates: of confirmation and canaries.
-    """
+    """What became of one quarantined map, and why it stays one or was promoted."""
 
     map_id: str
     promoted: bool

@@ -42,8 +42,7 @@ class JointAdjustment:
     Attributes:
         reason: None, or UNCONNECTED, PHOTO_LOST, RESIDUALS, OBSERVATIONS_LOST, ANCHOR_MOVED; `message` for
             people.
-        maps: those that moved, new; empty where there is a reason.
-        reports: of each map, as far as it came.
+        maps: those that moved, new; empty where there is a reason. reports: of all, as far as it came.
         shared_points: points that more than one map has.
         elsewhere: photos that other maps have elsewhere than their own; they were not heard.
     """

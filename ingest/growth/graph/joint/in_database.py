@@ -55,7 +55,6 @@ def adjust_maps(
     Args:
         named: ids or their first letters.
         free: anchors, likewise, that may move although LiDAR or control points placed them; others are held.
-        dry_run: adjust, and commit nothing.
 
     Raises:
         InvalidValueError: fewer than two maps, one that is not active, several extractors or datums.

@@ -45,7 +45,6 @@ class JoinedMaps:
         keypoints: pixels (n, 2) of each photo of the model.
         known_focal_px: by camera, what the maps say of a focal length that EXIF has told: the median. From
             above, focal length and height hardly differ in the pixels, and maps do not keep EXIF's own.
-        maps: rows of each map.
         shared: (maps, maps) numbers of points that two maps have in common.
     """
 
