@@ -13,7 +13,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 
 # 95 % of a normal error along the worst axis.
-_SIGMAS_95 = 1.96
+SIGMAS_95 = 1.96
 # Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
 _SHARE_OF_PLACES = 0.99
 
@@ -24,7 +24,7 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
     Args:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
-    return _SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
+    return SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
 
 
 def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:

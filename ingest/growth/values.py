@@ -25,6 +25,11 @@ FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""
 
 LEAST_PHOTOS = 3  # of a reconstruction, of a map without a place, and of those by which two maps overlap
+# Points in common that connect two maps; an existing map with fewer would not hold a new one alone. An
+# accepted pose has 15 inliers, and an overlap is measured by 60.
+LEAST_SHARED_POINTS = 30
+MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
+LEAST_VIEWS = 3  # of points that are asked for what is there; two leave them along a ray
 # At images of 1600: twice the inlier tolerance of a pose, for two poses, or reconstructions of few photos
 # that are bent.
 TOLERANCE_PX = 8.0

@@ -31,12 +31,10 @@ from ingest.growth.place.similarity_fit import (
     tolerances_px,
 )
 from ingest.growth.place.visibility import LEAST_SHOWN, shown_parts
-from ingest.growth.values import Edge, LocalisedPhoto, MapsPlacement
+from ingest.growth.values import LEAST_SHARED_POINTS, Edge, LocalisedPhoto, MapsPlacement
 from ingest.photos.photo import Photo
 
-# An existing map with fewer shared points, or seen by fewer new photos, is not a parent: alone it would not
-# hold the new one.
-_LEAST_POINTS, _LEAST_PHOTOS = 30, 2
+_LEAST_PHOTOS = 2  # of the new ones that must see an existing map for it to be a parent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -206,7 +204,7 @@ def edges_of(
         mine = used & (correspondences.map_of == m)
         points = len(np.unique(correspondences.point_of[mine]))
         photos = len(np.unique(correspondences.photo_of[mine]))
-        if points < _LEAST_POINTS or photos < _LEAST_PHOTOS:
+        if points < LEAST_SHARED_POINTS or photos < _LEAST_PHOTOS:
             continue
         alone = fit_similarity(model, fit.local_from_sfm, correspondences, mine)
         found.append(

@@ -27,6 +27,7 @@ from ingest.colmap.anchored import (
 from ingest.colmap.bridge import Model
 from ingest.colmap.submodel import select_photos
 from ingest.growth import gates
+from ingest.growth.map_places import SIGMAS_95
 from ingest.growth.place.contradictions import contradicting_photos
 from ingest.growth.place.correspondences import Correspondences
 from ingest.growth.place.drift import (
@@ -237,7 +238,7 @@ def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[i
     bounds = np.full(len(spread), np.inf)
     seen = np.isfinite(spread[:, 0, 0])
     centers = center_covariances(model, spread)[seen]
-    bounds[seen] = 1.96 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
+    bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
     return {
         k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
         for k in np.flatnonzero(bounds > max_bound_m).tolist()

@@ -15,6 +15,7 @@ from featuredb.geometry.view_cones import in_view, view_cones
 from featuredb.index.area import Area
 from ingest.colmap.bridge import Model
 from ingest.growth.place.correspondences import Correspondences
+from ingest.growth.values import LEAST_VIEWS
 from reloc.localise.acceptance import agreement
 from reloc.localise.matching import EXPECTED_DEG, visible_points
 
@@ -23,9 +24,6 @@ from reloc.localise.matching import EXPECTED_DEG, visible_points
 # this limit 0.23 and more.
 LEAST_SHOWN = 0.25
 _LEAST_POINTS = 30  # a photo that should see fewer says nothing
-# Photos that see a point of the reconstruction before it may be asked for. What two photos alone see says
-# where the one is from the other, not what is there.
-_LEAST_VIEWS = 3
 
 
 def shown_parts(
@@ -42,7 +40,7 @@ def shown_parts(
         that several photos bear out; NaN for photos that should show hardly any. Photos that no map localised
         are asked as well.
     """
-    often = model.track_lengths() >= _LEAST_VIEWS
+    often = model.track_lengths() >= LEAST_VIEWS
     cones = view_cones(model.xyz, model.centers(), model.point_of, model.photo_of)
     shares = np.full((2, len(model.rows)), np.nan)
     for k, pose in enumerate(model.cam_from_sfm):

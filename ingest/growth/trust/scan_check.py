@@ -23,6 +23,7 @@ from featuredb.store import Database
 from featuredb.store.scans import has_scans
 from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
 from ingest.growth.map_places import growth_of, with_growth
+from ingest.growth.values import LEAST_VIEWS, MAD
 from ingest.register.structure.surface_fit import (
     Surface,
     SurfaceFitOptions,
@@ -32,12 +33,10 @@ from ingest.register.structure.surface_fit import (
 )
 
 _LOG = logging.getLogger(__name__)
-_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
 _NARROW, _WIDE_TO_NARROW = 0.0, (2.0, 1.0, 0.5, 0.0)  # metres; 0: `SIGMAS`
 _ROUNDS = 5  # of nearest planes, each cut
 _OPEN = np.diag([1.0] * 3 + [1e-8] * 3)  # 1 rad and 10 km: what nothing holds
 _SURFACE = SurfaceFitOptions()  # the scan as the comparison sees it
-_LEAST_VIEWS = 3  # of the points that take part; two views leave points along a ray
 _LEAST_POINTS, _MOST_POINTS = 100, 8000  # over the scan; fewer decide nothing, more say nothing new
 _SCAN_SIGMA_M = 0.1  # of a scan on Earth, per axis: what airborne scans promise
 _CELL_M = 5.0  # points of one patch of roof are off together; a cell of this size counts as one
@@ -137,7 +136,7 @@ class _Laid:
     def sigma_m(self, move: Rigid3) -> float:
         """Standard deviation of those distances that are not of something else."""
         distance = np.abs(self.residuals(move)[0])
-        return max(_MAD * float(np.median(distance)), _SURFACE.min_move_m)
+        return max(MAD * float(np.median(distance)), _SURFACE.min_move_m)
 
     def weights(self, places: FloatArray) -> FloatArray:
         """(n,) such that the points of one cell weigh one together."""
@@ -202,7 +201,7 @@ def _gate(chi2: float, what: str) -> Gate:
 def _points(feature_map: FeatureMap) -> FloatArray:
     """Points (n, 3) that enough photos see; single far ones would load a county of scan."""
     views = np.bincount(feature_map.observations.point_index, minlength=len(feature_map.points))
-    points = feature_map.points_local()[views >= _LEAST_VIEWS]
+    points = feature_map.points_local()[views >= LEAST_VIEWS]
     if not len(points):
         return points
     low, high = np.percentile(points, (1.0, 99.0), axis=0)

@@ -27,12 +27,9 @@ from ingest.growth.graph.joint.joined import JoinedMaps, join_maps
 from ingest.growth.graph.joint.judge import describe, placement_sigma_m, refusal
 from ingest.growth.graph.joint.links import find_links
 from ingest.growth.place.refine import in_metres
-from ingest.growth.values import tied_together
+from ingest.growth.values import LEAST_SHARED_POINTS, tied_together
 
 _AS_SURE = 2.0  # anchors up to so many times as uncertain as the surest hold the place of all
-# Points in common from which on two maps are connected: an accepted pose has 15 inliers, and an overlap is
-# measured by 60.
-_LEAST_SHARED = 30
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +85,7 @@ def adjust_together(
     if alone:
         return JointAdjustment(
             reason="UNCONNECTED",
-            message=f"maps {', '.join(alone)} have fewer than {_LEAST_SHARED} points in common "
+            message=f"maps {', '.join(alone)} have fewer than {LEAST_SHARED_POINTS} points in common "
             f"with the others; {links.heard} photos were found in other maps"
             + (
                 f", {len(links.elsewhere)} others {links.elsewhere_m:,.0f} m from where their own map has "
@@ -156,7 +153,7 @@ def _check(maps: Sequence[FeatureMap], held: Collection[str]) -> None:
 
 def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64]) -> list[str]:
     """Maps outside the largest group of maps with enough points in common."""
-    groups = tied_together(range(len(maps)), zip(*np.nonzero(shared >= _LEAST_SHARED), strict=True))
+    groups = tied_together(range(len(maps)), zip(*np.nonzero(shared >= LEAST_SHARED_POINTS), strict=True))
     largest = int(np.argmax(np.bincount(groups)))
     return [m.map_id for m, group in zip(maps, groups, strict=True) if group != largest]
 

@@ -14,7 +14,7 @@ from ingest.growth.gates import SIGMAS
 from ingest.growth.graph.joint.adjusted_map import AdjustedMap, kept_observations
 from ingest.growth.graph.joint.joined import JoinedMaps, observed_pixels
 from ingest.growth.map_places import place_sigmas_m
-from ingest.growth.values import pixel_scale
+from ingest.growth.values import MAD, pixel_scale
 
 _LEAST_OBSERVATIONS = 15  # photos that keep fewer refuse the adjustment, if they had more
 # The residuals of a map after the adjustment over those before, or over the second where they are smaller;
@@ -119,7 +119,7 @@ def _own_sigma_px(feature_map: FeatureMap) -> float:
 
 
 def _sigma_px(off: FloatArray) -> float:
-    return 1.4826 * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else 0.0
+    return MAD * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else 0.0
 
 
 def _sigmas_px(joined: JoinedMaps, model: Model) -> list[float]:
