@@ -16,12 +16,13 @@ from ingest.executor import Executor, InProcessExecutor, PoolExecutor, Progress,
 from ingest.fingerprint import digest
 from ingest.growth.candidate_photos import CandidatePhotos, waiting_photos
 from ingest.growth.growth_report import GrowthReport, PhotoFate
-from ingest.growth.run import GrowthOptions, extractor_for, grow
-from ingest.growth.run_record import GrowthPhotos, no_photos
+from ingest.growth.run import extractor_for, grow
+from ingest.growth.run_record import GrowthOptions, GrowthPhotos, no_photos
 from ingest.reconstruction import MapMakingOptions, Reconstructed, reconstruct_photos
 from ingest.workspace import Workspace, default_root, remove_leftovers
 
 _LOG = logging.getLogger(__name__)
+_MOST_PHOTOS = 2000  # that one run takes, oldest first; more wait for the next
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +37,6 @@ class GrowingOptions:
         work: work folder; default inside the database.
         give_up_days: photos that have waited so long without any use are refused: each run tries all that
             wait. Their owner, or `featuredb candidates`, can open them again.
-        max_photos: that one run takes, oldest first; more wait for the next.
     """
 
     growth: GrowthOptions = field(default_factory=GrowthOptions)
@@ -44,7 +44,6 @@ class GrowingOptions:
     workers: int = 1
     work: Path | None = None
     give_up_days: float = 90.0
-    max_photos: int = 2000
 
 
 def grow_candidates(
@@ -65,13 +64,13 @@ def grow_candidates(
     work = options.work or default_root(database.url)
     remove_leftovers(work)
     waiting = waiting_photos(database, work, progress)
-    photos = waiting.photos[: options.max_photos]
+    photos = waiting.photos[:_MOST_PHOTOS]
     if options.workers == 1:
         new, unreadable = _prepared(database, waiting, work, options, InProcessExecutor(), progress)
     else:
         with PoolExecutor(options.workers) as pool:
             new, unreadable = _prepared(database, waiting, work, options, pool, progress)
-    report = grow(database, new, work, options.growth.with_threads(options.workers))
+    report = grow(database, new, work, replace(options.growth, threads=options.workers))
     refused = _refuse(database, {**waiting.unusable, **unreadable}, report, now, options)
     left = len(waiting.photos) - len(photos)
     notes = (*report.notes, *((f"{left} photos wait for the next run",) if left else ()))
@@ -103,7 +102,7 @@ def _prepared(
     progress: Progress,
 ) -> tuple[GrowthPhotos, dict[str, tuple[str, str]]]:
     """Features, matches and reconstructions of the waiting photos; and those that cannot be read."""
-    photos = waiting.photos[: options.max_photos]
+    photos = waiting.photos[:_MOST_PHOTOS]
     if not photos:
         return no_photos(), {}
     extractor: ExtractorOptions = extractor_for(database.snapshot(), options.making.extractor)

@@ -28,7 +28,7 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
-from ingest.growth import run
+from ingest.growth import gates, run
 from ingest.growth.gates import Gate
 from ingest.growth.graph import budget
 from ingest.growth.place import component
@@ -103,8 +103,8 @@ class _Note:
         def refine_placed(model: Any, held: Any, *more: Any) -> Any:
             refined = step(model, held, *more)
             refused = isinstance(refined, Refused)
-            gates = refined.gates if refused else refined.placement.gates
-            own = [gate for gate in gates if gate.name not in {g.name for g in held.placement.gates}]
+            asked = refined.gates if refused else refined.placement.gates
+            own = [gate for gate in asked if gate.name not in {g.name for g in held.placement.gates}]
             if refused and all(gate.passes for gate in own):  # by photos that are left out
                 own.append(_said_no(refined.reason))
             self._model("refine", model, held.placement, own)
@@ -115,7 +115,7 @@ class _Note:
     def drifting(self, step: Any) -> Any:
         def with_drift(grown: Any, maps: Any, budget_m: float) -> Any:
             found = step(grown, maps, budget_m)
-            self._map("budget", found[0], [budget.drift_gate(found[1], budget_m)])
+            self._map("budget", found[0], [gates.drift(found[1], budget_m)])
             return found
 
         return with_drift

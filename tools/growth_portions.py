@@ -39,7 +39,8 @@ from ingest.fingerprint import digest
 from ingest.growing import reconstructed_photos
 from ingest.growth.graph.joint.in_database import adjust_maps
 from ingest.growth.growth_report import GrowthReport
-from ingest.growth.run import GrowthOptions, grow
+from ingest.growth.run import grow
+from ingest.growth.run_record import GrowthOptions
 from ingest.map_builder import MapIdentity, build_map
 from ingest.photos.photo import Photo
 from ingest.photos.scan import ScanOptions, require_usable, scan_folder

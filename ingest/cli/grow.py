@@ -131,16 +131,15 @@ def _show(report: "GrowthReport", args: argparse.Namespace) -> None:
 def _options(args: argparse.Namespace) -> "GrowingOptions":
     from featuredb.features.extractor import ExtractorOptions
     from ingest.growing import GrowingOptions
-    from ingest.growth.run import GrowthOptions
+    from ingest.growth.run_record import GrowthOptions
     from ingest.growth.trust.confirmation import ConfirmationOptions
-    from ingest.growth.trust.promotion import PromotionOptions
     from ingest.reconstruction import MapMakingOptions
 
     confirmation = ConfirmationOptions(trusted=tuple(args.trust))
     budget = {} if args.budget is None else {"drift_budget_m": args.budget}
     extractor = {} if args.max_features is None else {"max_features": args.max_features}
     return GrowingOptions(
-        growth=GrowthOptions(promotion=PromotionOptions(confirmation=confirmation), **budget),
+        growth=GrowthOptions(confirmation=confirmation, **budget),
         making=MapMakingOptions(extractor=ExtractorOptions(**extractor)),
         workers=args.workers,
         work=args.work,
@@ -232,15 +231,12 @@ def run_canary_run(args: argparse.Namespace) -> int:
     """Ask all known queries of the active maps; 1 if one is not answered rightly."""
     from featuredb.cli.common import format_table, open_database
     from featuredb.store.canaries import list_canaries
-    from ingest.growth.trust.canaries import CanaryOptions, check_known
+    from ingest.growth.trust.canaries import check_known
     from reloc.localiser import Localiser
 
     database = open_database(args)
     localiser = Localiser.open(database)
-    checks = [
-        check_known(database, canary, localiser, localiser, CanaryOptions())
-        for canary in list_canaries(database)
-    ]
+    checks = [check_known(database, canary, localiser, localiser) for canary in list_canaries(database)]
     if args.json:
         sys.stdout.write(json.dumps([check.as_json() for check in checks]) + "\n")
     else:

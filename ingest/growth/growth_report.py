@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from datetime import datetime
 from typing import Any, Literal
 
@@ -20,14 +20,9 @@ _WORDS: tuple[tuple[PhotoOutcome, str], ...] = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoFate:
-    """What became of a photo.
+    """What became of a photo, and why it waits or is refused.
 
-    Attributes:
-        name: of the photo; a contributed one's candidate id.
-        owner: who gave it, by identity.
-        outcome: in an active map, in a quarantined one, still waiting, or refused for good.
-        map_id: of its map, "" where it has none.
-        reason_code, reason: why it waits or is refused.
+    The name of a contributed one is its id; its owner is an identity.
     """
 
     name: str
@@ -47,7 +42,6 @@ class GrownEntry:
             place still.
         reason_code, reason: why it is not active, or who confirmed it.
         drift_m, budget_m: 95 % bound on its drift against its anchors, and what is allowed.
-        photos: names. gates: every gate with its figure.
         agreements: how well the existing maps agree that it overlaps, in words.
     """
 
@@ -75,7 +69,6 @@ class GrowthReport:
             promoted.
         promotions: of every quarantined map that was examined, in the last round that did.
         replacements: what new anchors did.
-        notes: for people.
     """
 
     database: str
@@ -98,25 +91,14 @@ class GrowthReport:
         return tuple(p.map_id for p in self.promotions if p.promoted)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values."""
         return {
             "database": self.database,
             "started": self.started.isoformat(),
             "seconds": round(self.seconds, 3),
             "rounds": self.rounds,
             "version": self.version,
-            "photos": [
-                {
-                    "name": p.name,
-                    "owner": p.owner,
-                    "outcome": p.outcome,
-                    "map_id": p.map_id,
-                    "reason_code": p.reason_code,
-                    "reason": p.reason,
-                }
-                for p in self.photos
-            ],
-            "maps": [_entry_json(entry) for entry in self.maps],
+            "photos": [asdict(photo) for photo in self.photos],
+            "maps": [asdict(entry) for entry in self.maps],
             "promotions": [p.as_json() for p in self.promotions],
             "replacements": [r.as_json() for r in self.replacements],
             "notes": list(self.notes),
@@ -137,24 +119,6 @@ class GrowthReport:
                 lines.append(f"map {p.map_id}: {became}: {p.reason}")
         lines += [f"note: {note}" for note in self.notes]
         return "\n".join(lines) + "\n"
-
-
-def _entry_json(entry: GrownEntry) -> dict[str, Any]:
-    return {
-        "map_id": entry.map_id,
-        "status": entry.status,
-        "reason_code": entry.reason_code,
-        "reason": entry.reason,
-        "photos": list(entry.photos),
-        "points": entry.points,
-        "parents": list(entry.parents),
-        "generation": entry.generation,
-        "steps": entry.steps,
-        "drift_m": entry.drift_m,
-        "budget_m": entry.budget_m,
-        "gates": dict(entry.gates),
-        "agreements": list(entry.agreements),
-    }
 
 
 def _entry_line(entry: GrownEntry) -> str:

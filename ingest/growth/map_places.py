@@ -13,7 +13,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
 
 # 95 % of a normal error along the worst axis.
-_SIGMAS_95 = 1.96
+SIGMAS_95 = 1.96
 # Of the points of oblique photos a few lie far beyond the scene, at the end of nearly parallel rays.
 _SHARE_OF_PLACES = 0.99
 
@@ -24,7 +24,7 @@ def drift_m(covariance_relative: FloatArray, places: FloatArray) -> float:
     Args:
         covariance_relative: (7, 7) relative to the anchors. places: (n, 3) in the same frame.
     """
-    return _SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
+    return SIGMAS_95 * at_most_places(place_sigmas_m(covariance_relative, places))
 
 
 def place_sigmas_m(covariance: FloatArray, places: FloatArray) -> FloatArray:
@@ -54,6 +54,13 @@ def growth_of(evidence: Mapping[str, Any]) -> dict[str, Any]:
     return dict(evidence.get(GROWTH) or {})
 
 
+def with_growth(feature_map: FeatureMap, **figures: Any) -> FeatureMap:
+    """The map with these figures in what growth has noted of it, in place of earlier ones."""
+    placement = feature_map.placement
+    growth = {**growth_of(placement.evidence), **figures}
+    return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
+
+
 def inflated(feature_map: FeatureMap) -> FeatureMap:
     """The map with its placement's covariance `isotropic_inflation`."""
     placement = feature_map.placement
@@ -65,11 +72,7 @@ def isotropic_inflation(feature_map: FeatureMap, covariance: FloatArray) -> Floa
     """(7, 7) that turns and shifts the map in all directions as much as the given one in its worst.
 
     About the middle of its photos; not less, anywhere that the map answers for, than the given one says for
-    the worst direction there.
-
-    Args:
-        feature_map: whose places are meant.
-        covariance: (7, 7) of the placement's left perturbation, in the map's frame.
+    the worst direction there. The covariance is of the placement's left perturbation, in the map's frame.
     """
     middle = np.mean([image.cam_from_local.center for image in feature_map.images], axis=0)
     jacobian = point_jacobian(middle)

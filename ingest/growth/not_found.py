@@ -5,11 +5,11 @@ in maps that have come since; only where it is found there, in all of them toget
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from ingest.fingerprint import digest, options_fingerprint
-from ingest.growth.place.localised import LocaliseEachOptions
+from ingest.growth.place.localised import QUERY
 from ingest.growth.values import FeaturesOf
 from ingest.photos.photo import Photo
 from ingest.workspace import read_json, write_json
@@ -20,29 +20,18 @@ _VERSION = "1"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NotFound:
-    """Where a photo was looked for in vain.
-
-    Attributes:
-        maps: write ids: a map that was moved or thinned is another one.
-        reason: of localisation.
-    """
+    """Write ids of the maps where a photo was looked for in vain (one that was moved is another), and why."""
 
     maps: frozenset[str]
     reason: str
 
 
 class NotFoundRows:
-    """Photos of a run by row; what is noted here, the next run knows.
+    """Photos of a run by row, as `known`; what is noted here, the next run knows."""
 
-    Attributes:
-        known: what was looked for in vain.
-    """
-
-    def __init__(
-        self, photos: Sequence[Photo], features_of: FeaturesOf, work: Path, options: LocaliseEachOptions
-    ) -> None:
+    def __init__(self, photos: Sequence[Photo], features_of: FeaturesOf, work: Path) -> None:
         self._photos, self._folder = photos, work / "not_found"
-        self._asked = options_fingerprint(replace(options, threads=1))
+        self._asked = options_fingerprint(QUERY)
         # All photos of a run have one extractor.
         self._extractor = features_of(0).features.fingerprint if photos else ""
         self.known: dict[int, NotFound] = {}

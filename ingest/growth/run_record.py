@@ -1,17 +1,17 @@
-"""The new photos of a run of growth, and what has come of them so far: maps, refusals, reasons."""
+"""What a run of growth goes by, its new photos, and what has come of them so far: maps, refusals, reasons."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
-from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Snapshot
 from featuredb.store.candidates.states import OPERATOR
 from ingest.colmap.bridge import Model
+from ingest.growth.gates import figures
 from ingest.growth.graph.replacing import Replacement
 from ingest.growth.growth_report import GrownEntry, PhotoFate
 from ingest.growth.map_places import growth_of
 from ingest.growth.not_found import NotFoundRows
+from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion
 from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.photos.photo import Photo
@@ -19,13 +19,26 @@ from ingest.sfm.extract import PhotoFeatures
 from ingest.sfm.pairs import Pair
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GrowthOptions:
+    """How a database grows.
+
+    Attributes:
+        drift_budget_m: 95 % bound on a map's errors against its anchors beyond which it is not taken: what
+            a survey's points are usually wanted for. Photos beyond it wait for an anchor.
+        threads: photos that are localised at a time.
+    """
+
+    drift_budget_m: float = 0.5
+    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
+    threads: int = 1
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrowthPhotos:
     """New photos, matched and reconstructed.
 
     Attributes:
-        photos: rows of everything here.
-        features_of: of a row.
         models: their reconstructions, called once a round; rows of a model are rows of `photos`.
         candidate_ids: of contributed photos, by row.
         overlaps: pairs of rows whose matches were verified; None: not known.
@@ -58,37 +71,35 @@ class Run:
     unplaced: tuple[GrownEntry, ...] = ()
     promotions: dict[str, Promotion] = field(default_factory=dict)
     replacements: list[Replacement] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
+    notes: dict[str, None] = field(default_factory=dict)
     heard: dict[tuple[str, int], LocalisedPhoto | None] = field(default_factory=dict)
     lost: NotFoundRows
     rounds: int = 0
 
-
-def note_refusal(refused: Refused, new: GrowthPhotos, run: Run) -> None:
-    rows = [r for r in refused.rows if r < len(new.photos) and r not in run.map_of]
-    run.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
-    run.refused.append(
-        GrownEntry(
-            map_id="",
-            status="refused",
-            reason_code=refused.reason,
-            reason=refused.message,
-            photos=tuple(new.photos[r].name for r in rows),
-            gates=refused.figures(),
+    def note_refusal(self, refused: Refused, photos: Sequence[Photo]) -> None:
+        rows = [r for r in refused.rows if r not in self.map_of]
+        self.why.update(dict.fromkeys(rows, (refused.reason, refused.message)))
+        self.refused.append(
+            GrownEntry(
+                map_id="",
+                status="refused",
+                reason_code=refused.reason,
+                reason=refused.message,
+                photos=tuple(photos[r].name for r in rows),
+                gates=figures(refused.gates),
+            )
         )
-    )
 
 
-def grown_entry(
-    feature_map: FeatureMap, grown: GrownMap, names: tuple[str, ...], status: str, code: str, reason: str
-) -> GrownEntry:
-    growth: dict[str, Any] = growth_of(feature_map.placement.evidence)
+def grown_entry(grown: GrownMap, status: str = "quarantined", code: str = "", reason: str = "") -> GrownEntry:
+    feature_map = grown.feature_map
+    growth = growth_of(feature_map.placement.evidence)
     return GrownEntry(
         map_id=feature_map.map_id,
         status=status,
         reason_code=code,
         reason=reason,
-        photos=names,
+        photos=tuple(image.name for image in feature_map.images),
         points=len(feature_map.points),
         parents=feature_map.parents,
         generation=feature_map.generation,
@@ -96,7 +107,7 @@ def grown_entry(
         drift_m=growth.get("drift_m"),
         budget_m=growth.get("budget_m"),
         gates=growth.get("gates", {}),
-        agreements=tuple(str(a) for a in grown.agreements),
+        agreements=tuple(grown.agreements),
     )
 
 

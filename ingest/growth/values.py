@@ -1,11 +1,13 @@
-"""The values that pass between the steps of growth: localised photos, placements, grown maps, refusals."""
+"""The values that pass between the steps of growth: localised photos, overlaps, placements, maps."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
@@ -22,26 +24,44 @@ from reloc.localise.result import LocaliseResult
 FeaturesOf = Callable[[int], PhotoFeatures]
 """Features of the photo of a row; called when they are needed, so that not all are in memory."""
 
+LEAST_PHOTOS = 3  # of a reconstruction, of a map without a place, and of those by which two maps overlap
+# Points in common that connect two maps; an existing map with fewer would not hold a new one alone. An
+# accepted pose has 15 inliers, and an overlap is measured by 60.
+LEAST_SHARED_POINTS = 30
+MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
+LEAST_VIEWS = 3  # of points that are asked for what is there; two leave them along a ray
+# At images of 1600: twice the inlier tolerance of a pose, for two poses, or reconstructions of few photos
+# that are bent.
+TOLERANCE_PX = 8.0
+
+
+def pixel_scale(*cameras: Camera) -> float:
+    """Pixels of the longest side for one of an image of 1600, on which SIFT locates keypoints; at least 1."""
+    return max(1.0, max(max(camera.width, camera.height) for camera in cameras) / 1600.0)
+
+
+def tied_together(nodes: Sequence[Hashable], pairs: Iterable[tuple[Hashable, Hashable]]) -> list[int]:
+    """For each node the number of its group: of those that a chain of pairs ties together."""
+    row = {node: k for k, node in enumerate(nodes)}
+    ends = np.array([(row[a], row[b]) for a, b in pairs], dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(ends.shape[1]), (ends[0], ends[1])), shape=(len(nodes), len(nodes)))
+    labels: list[int] = connected_components(graph, directed=False)[1].tolist()
+    return labels
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocalisedPhoto:
     """A new photo that the existing maps localise, by itself, without knowing of other new photos.
 
     Attributes:
-        row: row of the photos.
         frame: local frame of everything metric here.
-        cam_from_local: pose in that frame.
         covariance: (6, 6), axes of the frame, measured part only (without the maps' placements): small
             rotation of the camera (rad) before displacement of its centre (m), as pose_uncertainty has it.
-        camera: intrinsics that the localisation used or estimated.
-        feature_rows: (k,) rows of the photo's features that are inliers.
-        pixels: (k, 2) float64 of those.
-        map_ids: the maps that the inliers' points belong to, most inliers first.
-        map_of: (k,) index into map_ids.
+        feature_rows: (k,) rows of the photo's features that are inliers; pixels: (k, 2) float64 of those.
+        map_ids: the maps of the inliers' points, most inliers first; map_of: (k,) index into them.
         point_of: (k,) row of that map's points.
         points: (k, 3) those points in the frame, metres.
         point_covariance: (k, 3, 3) of the points, relative to their map's gauge.
-        by_prior: found only inside the reach of the photo's own position.
         result: the answer as a query would have got it.
     """
 
@@ -57,7 +77,6 @@ class LocalisedPhoto:
     point_of: NDArray[np.int64]
     points: FloatArray
     point_covariance: FloatArray
-    by_prior: bool
     result: LocaliseResult
 
     def __post_init__(self) -> None:
@@ -79,22 +98,46 @@ class LocalisedPhoto:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Edge:
-    """How one existing map holds a new one.
+    """An overlap of a map with another one; kept in the evidence of the map that was placed by it.
 
     Attributes:
-        map_id: the existing map.
-        parent_from_new: correction (a similarity near the identity, in the frame of the new map) that this
-            parent alone would apply to the placed map.
-        covariance: (7, 7) of its left perturbation, relative to the parent.
-        shared_points: points of the parent that are seen by new photos.
-        photos: new photos that see them.
+        other_from_map: carries what this map says to where the other says it; this map's local frame.
+        covariance: (7, 7) of its left perturbation, relative to the other map.
+        shared_points, photos: that it rests on.
+        place: digest of the other map's place when it was measured (`graph.map_graph.place_key`).
+        shared: (7, 3) the part of the covariance that overlaps have in common (`place.drift.shared_turn`).
     """
 
     map_id: str
-    parent_from_new: Sim3
+    other_from_map: Sim3
     covariance: FloatArray
     shared_points: int
     photos: int
+    place: str = ""
+    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "map_id": self.map_id,
+            "place": self.place,
+            "parent_from_new": self.other_from_map.log().tolist(),
+            "covariance": self.covariance.ravel().tolist(),
+            "shared_points": self.shared_points,
+            "photos": self.photos,
+            "shared": self.shared.ravel().tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> "Edge":
+        return cls(
+            map_id=str(value["map_id"]),
+            place=str(value.get("place", "")),
+            other_from_map=Sim3.exp(value.get("parent_from_new") or np.zeros(7)),
+            covariance=np.asarray(value["covariance"], dtype=np.float64).reshape(7, 7),
+            shared_points=int(value.get("shared_points", 0)),
+            photos=int(value.get("photos", 0)),
+            shared=np.asarray(value.get("shared") or np.zeros(21), dtype=np.float64).reshape(7, 3),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,12 +148,13 @@ class MapsPlacement:
         reason: code of the first gate that refused it, or None; `message` says it for people.
         frame: local frame in which the similarity places the model.
         local_from_sfm: None where none could be estimated.
-        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps, or None.
-        covariance: (7, 7) with the uncertainty of the existing maps on Earth, or None.
+        covariance_relative: (7, 7) of its left perturbation, relative to the existing maps.
+        on_earth: (7, 7) what the existing maps' own uncertainty on Earth adds.
         agreeing, disagreeing: rows of the localised photos that agree with the placement, and of those
             that do not. Photos that no map localises are in neither.
         blind: those that show too little of what existing maps, or the others' points, say they should.
-        edges: one for each existing map that holds it, most shared points first.
+        edges: one for each existing map that holds it, most shared points first: the correction that this
+            map alone would apply to the placed one.
         residual_rms_m: of the agreeing photos' centres, placed minus localised, metres; NaN without any.
         gates: every gate with its figure, in the order they were asked.
     """
@@ -119,8 +163,8 @@ class MapsPlacement:
     message: str
     frame: LocalFrame
     local_from_sfm: Sim3 | None = None
-    covariance_relative: FloatArray | None = None
-    covariance: FloatArray | None = None
+    covariance_relative: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
+    on_earth: FloatArray = field(default_factory=lambda: np.zeros((7, 7)))
     agreeing: tuple[int, ...] = ()
     disagreeing: tuple[int, ...] = ()
     blind: tuple[int, ...] = ()
@@ -133,76 +177,30 @@ class MapsPlacement:
         """Maps that hold the new one, most shared points first."""
         return tuple(edge.map_id for edge in self.edges)
 
-    def figures(self) -> dict[str, Any]:
-        """Gates by name, JSON-able."""
-        return {gate.name: gate.as_json() for gate in self.gates}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapAgreement:
-    """What a new map that overlaps two existing ones says of how well they agree.
-
-    Attributes:
-        map_a, map_b: the existing maps.
-        a_from_b: similarity, in the frame of the new map, that carries what B says to where A says it.
-        covariance: (7, 7) of its left perturbation.
-        distance_m: displacement of the middle of the overlap.
-        sigma_m: its standard deviation along the displacement, without the maps' own placements.
-        sigmas: distance over sigma.
-        photos: new photos that see points of A, of B.
-    """
-
-    map_a: str
-    map_b: str
-    a_from_b: Sim3
-    covariance: FloatArray
-    distance_m: float
-    sigma_m: float
-    sigmas: float
-    photos: tuple[int, int]
-
-    def __str__(self) -> str:
-        return (
-            f"maps {self.map_a} and {self.map_b} differ by {self.distance_m:.2f} m here, "
-            f"{self.sigmas:.1f} sigma"
-        )
-
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GrownMap:
     """A new map, ready to be committed (as quarantined, by whoever commits it).
 
     Attributes:
-        feature_map: method "map", its parents, generation and evidence["growth"].
-        placement: how it was placed.
         model: the reconstruction after refinement; metric, in the frame of the map.
-        agreements: between the existing maps that it overlaps.
+        agreements: sentences on how well the existing maps agree that it overlaps.
         left_out: photos of the reconstruction that are not in the map, by row, with reason and message.
     """
 
     feature_map: FeatureMap
     placement: MapsPlacement
     model: Model
-    agreements: tuple[MapAgreement, ...] = ()
+    agreements: Sequence[str] = ()
     left_out: Mapping[int, tuple[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Refused:
-    """Photos that did not become a map.
-
-    Attributes:
-        reason: code of the gate, for programs.
-        message: for people, with figures.
-        rows: the photos concerned.
-        gates: every gate that was asked.
-    """
+    """What did not become a map, or an overlap: code of the reason for programs, a message with figures for
+    people, rows of the photos concerned, and every gate that was asked."""
 
     reason: str
     message: str
-    rows: tuple[int, ...]
-    gates: tuple[Gate, ...] = field(default=())
-
-    def figures(self) -> dict[str, Any]:
-        """Gates by name, JSON-able."""
-        return {gate.name: gate.as_json() for gate in self.gates}
+    rows: tuple[int, ...] = ()
+    gates: tuple[Gate, ...] = ()

@@ -7,7 +7,7 @@ import pytest
 
 from featuredb.geometry.camera import Camera
 from ingest.growth.place.component import grow_component
-from ingest.growth.place.localised import LocaliseEachOptions, localise_photos, with_shared_lenses
+from ingest.growth.place.localised import localise_photos, with_shared_lenses
 from ingest.growth.values import GrownMap
 from reloc.localise.candidates import IndexedArea
 from tests.support.growth_box import DESCRIPTORS, KEY, POINTS, centers_error, existing, walk
@@ -92,10 +92,9 @@ def test_lone_photos_of_one_camera_have_one_lens(new: NewPhotos, area: IndexedAr
     back = pose.center + 0.25 * (pose.center - np.median(found[1].points, axis=0))
     off = replace(found[1], camera=long, cam_from_local=moved(pose, back - pose.center))
     given = {**found, 1: off}
-    options = LocaliseEachOptions()
-    one = with_shared_lenses(given, dict.fromkeys(range(3), "unnamed"), options)
+    one = with_shared_lenses(given, dict.fromkeys(range(3), "unnamed"))
     assert {p.camera for p in one.values()} == {CAMERA}
     assert np.linalg.norm(one[1].cam_from_local.center - new.poses[1].center) < 0.1
     assert one[0] is found[0]
-    apart = with_shared_lenses(given, {0: "a", 1: "b", 2: "a"}, options)
+    apart = with_shared_lenses(given, {0: "a", 1: "b", 2: "a"})
     assert apart[1] is off

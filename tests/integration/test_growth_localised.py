@@ -12,7 +12,6 @@ from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import FeatureMap, GeoPrior, MapObservations
 from ingest.growth.place.contradictions import pose_by_focal
 from ingest.growth.place.localised import (
-    LocaliseEachOptions,
     localise_photo,
     localise_photos,
     share_shown,
@@ -68,8 +67,7 @@ def test_each_photo_is_localised_by_itself(
 def test_two_threads_localise_as_one_does(
     new: NewPhotos, localised: dict[int, LocalisedPhoto], area: IndexedArea
 ) -> None:
-    options = LocaliseEachOptions(threads=2)
-    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], options)
+    again, reasons = localise_photos(new.photos, range(len(new.photos)), new.features_of, [area], threads=2)
     assert not reasons
     assert list(again) == list(localised)
     for row, photo in localised.items():
@@ -126,7 +124,7 @@ def _of_image(feature_map: FeatureMap, image_id: int) -> MapObservations:
 def test_a_pose_moves_with_its_focal_length_as_is_said(localised: dict[int, LocalisedPhoto]) -> None:
     for photo in localised.values():
         longer = replace(photo.camera, params=(1.01 * photo.camera.params[0], *photo.camera.params[1:]))
-        moved = with_lens(photo, longer, LocaliseEachOptions())
+        moved = with_lens(photo, longer)
         turn = photo.cam_from_local.rotation
         expected = 0.01 * pose_by_focal(photo)
         offset = moved.cam_from_local.center - photo.cam_from_local.center
@@ -144,7 +142,7 @@ def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
         new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [pose], camera_key=KEY, gps=[gps])
         features = new.features_of(0).features
         shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.55 * CAMERA.width))
-        return localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
+        return localise_photo(new.photos[0], 0, shown, [area])
 
     for gps in (None, prior(pose, (2.0, 1.0))):
         there = found_by(gps)
@@ -155,16 +153,18 @@ def test_away_from_its_geotag_a_photo_must_show_more(area: IndexedArea) -> None:
     assert away.startswith("CONTRADICTS_GEOTAG")
 
 
-def test_a_photo_half_covered_is_refused_as_a_query_and_heard_by_growth(area: IndexedArea) -> None:
+def test_a_photo_half_covered_is_refused_as_a_query_and_heard_by_growth(
+    area: IndexedArea, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A query stands alone; what growth takes must agree with other photos in any case."""
     new = take_photos(np.random.default_rng(5), POINTS, DESCRIPTORS, [walk(1)[0]], camera_key=KEY)
     features = new.features_of(0).features
     shown = features.take(np.flatnonzero(features.xy[:, 0] < 0.4 * CAMERA.width))
-    heard = localise_photo(new.photos[0], 0, shown, [area], LocaliseEachOptions())
+    heard = localise_photo(new.photos[0], 0, shown, [area])
     assert isinstance(heard, LocalisedPhoto), heard
     assert np.linalg.norm(heard.cam_from_local.center - new.poses[0].center) < 0.2
-    strict = LocaliseEachOptions(localise=LocaliseOptions())
-    refused = localise_photo(new.photos[0], 0, shown, [area], strict)
+    monkeypatch.setattr(localised_module, "QUERY", LocaliseOptions())
+    refused = localise_photo(new.photos[0], 0, shown, [area])
     assert isinstance(refused, str)
     assert refused.startswith("AMBIGUOUS"), refused
 
@@ -188,7 +188,7 @@ def test_what_a_geotag_reaches_is_searched_once(area: IndexedArea, monkeypatch: 
         gps = prior(pose, offset)
         new = take_photos(np.random.default_rng(5), POINTS, strange, [pose], camera_key=KEY, gps=[gps])
         asked.clear()
-        found = localise_photo(new.photos[0], 0, new.features_of(0).features, [area], LocaliseEachOptions())
+        found = localise_photo(new.photos[0], 0, new.features_of(0).features, [area])
         assert isinstance(found, str), found
         assert [(r.prior, r.beyond) for r, _ in asked] == [(gps, None), (None, gps)]
         for (_, outcome), reason in zip(asked, (first, second), strict=True):
@@ -198,14 +198,13 @@ def test_what_a_geotag_reaches_is_searched_once(area: IndexedArea, monkeypatch: 
 def test_poses_are_compared_with_one_lens(new: NewPhotos, localised: dict[int, LocalisedPhoto]) -> None:
     """A longer lens stands further back; with the true lens the photo is where it was."""
     longer = Camera(model="SIMPLE_RADIAL", width=1000, height=800, params=(960.0, 500.0, 400.0, 0.01))
-    options = LocaliseEachOptions()
-    back = with_lens(localised[2], longer, options)
+    back = with_lens(localised[2], longer)
     assert back.camera == longer
     moved = back.cam_from_local.center - new.poses[2].center
     outward = new.poses[2].center - np.median(localised[2].points, axis=0)
     assert np.linalg.norm(moved) > 1.5
     assert moved @ outward / np.linalg.norm(moved) / np.linalg.norm(outward) > 0.9
-    again = with_lens(back, CAMERA, options)
+    again = with_lens(back, CAMERA)
     assert np.linalg.norm(again.cam_from_local.center - new.poses[2].center) < 0.1
     other_size = Camera(model="SIMPLE_RADIAL", width=500, height=400, params=(450.0, 250.0, 200.0, 0.0))
-    assert with_lens(localised[2], other_size, options) is localised[2]
+    assert with_lens(localised[2], other_size) is localised[2]

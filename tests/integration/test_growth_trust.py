@@ -14,11 +14,12 @@ from featuredb.maps.move import move_map
 from featuredb.store import Database
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.map_images import features_of_image
+from ingest.growth.map_images import features_and_points
 from ingest.growth.place.overlaps import measure_overlap
-from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, own_canaries, run_canaries
+from ingest.growth.trust.canaries import CanaryRun, own_canaries, run_canaries
 from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
+from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
+from ingest.growth.values import Edge, Refused
 from reloc.localise.localise import localise_features
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
@@ -59,7 +60,7 @@ def _add(database: Database, feature_map: FeatureMap) -> None:
     database.commit_map(feature_map)
 
 
-def _promoted(database: Database, options: PromotionOptions | None = None) -> dict[str, Promotion]:
+def _promoted(database: Database, options: ConfirmationOptions | None = None) -> dict[str, Promotion]:
     localiser = Localiser.open(database)
     found = promote_confirmed(database, localiser, options, budget_m=_BUDGET_M)
     return {outcome.map_id: outcome for outcome in found}
@@ -213,12 +214,11 @@ def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:
     database = _database(tmp_path, _ANCHOR, strip_map("B", 150.0, owners=["survey"], seed=3))
     localiser = Localiser.open(database)
-    options = CanaryOptions(own_near=3, own_elsewhere=2)
-    chosen = own_canaries(localiser, [strip_map("m", 25.0, seed=1)], options)
-    again = own_canaries(Localiser.open(database), [strip_map("m", 25.0, seed=1)], options)
+    chosen = own_canaries(localiser, [strip_map("m", 25.0, seed=1)])
+    again = own_canaries(Localiser.open(database), [strip_map("m", 25.0, seed=1)])
     assert [(m.map_id, i.name) for m, i in chosen] == [(m.map_id, i.name) for m, i in again]
-    assert [m.map_id for m, _ in chosen] == ["A"] * 3 + ["B"] * 2
-    features = features_of_image(*chosen[0])
+    assert [m.map_id for m, _ in chosen] == ["A"] * 8 + ["B"] * 4
+    features = features_and_points(*chosen[0])[0]
     assert len(features) > 60
     assert features.width == CAMERA.width
 
@@ -251,9 +251,7 @@ def test_an_overlap_is_measured(tmp_path: Path) -> None:
     move = Sim3.exp([0.002, 0.001, -0.002, 0.003, 0.4, -0.3, 0.2])
     crooked = strip_map("m", 40.0, move=move, seed=1)
     found = measure_overlap(crooked, strip_map("n", 55.0, seed=2))
-    assert found.reason is None
-    assert found.other_from_map is not None
-    assert found.covariance is not None
+    assert isinstance(found, Edge), found
     places = POINTS[np.abs(POINTS[:, 0] - 45.0) < 20.0]
     miss = found.other_from_map.act(move.act(places)) - places
     assert np.linalg.norm(miss, axis=1).max() < 0.03
@@ -263,6 +261,7 @@ def test_an_overlap_is_measured(tmp_path: Path) -> None:
 
 def test_maps_that_do_not_overlap_have_none(tmp_path: Path) -> None:
     found = measure_overlap(strip_map("m", 20.0, seed=1), strip_map("n", 150.0, seed=2))
+    assert isinstance(found, Refused)
     assert found.reason == "NO_OVERLAP"
 
 
@@ -341,7 +340,7 @@ def test_a_parent_that_is_placed_anew_takes_its_children_along(tmp_path: Path) -
 
 def test_a_trusted_owner_is_promoted_alone(tmp_path: Path) -> None:
     mine = strip_map("m", 85.0, owners=["anna"], parents=[_ANCHOR], seed=1)
-    options = PromotionOptions(confirmation=ConfirmationOptions(trusted=("anna",)))
+    options = ConfirmationOptions(trusted=("anna",))
     assert _promoted(_database(tmp_path, _ANCHOR, mine), options)["m"].promoted
 
 

@@ -17,7 +17,7 @@ from featuredb.maps.move import move_map
 from featuredb.store import Database
 from featuredb.store.canaries import KnownPose, add_canary
 from ingest.growth.graph.replacing import replace_descendants
-from ingest.growth.trust.canaries import CanaryOptions, answer_now, check_known
+from ingest.growth.trust.canaries import answer_now, check_known
 from reloc.localiser import Localiser
 from tests.support.planar_map import EASTING, EPSG, HEIGHT, NORTHING, field_texture, planar_map, render, view
 from tests.support.scene_strip import east, grown
@@ -66,8 +66,7 @@ def test_what_known_queries_are_worth(database: Database) -> None:
     )
     nowhere = add_canary(database, "nowhere", _photo(texture=7), None, origin="person", request=_ASKED)
     localiser = Localiser.open(database)
-    options = CanaryOptions()
-    checks = {c.name: check_known(database, c, localiser, localiser, options) for c in (right, off, nowhere)}
+    checks = {c.name: check_known(database, c, localiser, localiser) for c in (right, off, nowhere)}
     assert checks["right"].after == "right"
     assert checks["right"].error_m < 0.2
     assert checks["off"].after == "moved"

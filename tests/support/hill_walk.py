@@ -14,9 +14,8 @@ from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
 from featuredb.store.candidates.states import Contribution
 from ingest.growing import GrowingOptions
-from ingest.growth.run import GrowthOptions
+from ingest.growth.run_record import GrowthOptions
 from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.growth.trust.promotion import PromotionOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from tests.support.hill_photos import CAMERA, FRAME, _exif, _render
@@ -90,9 +89,9 @@ def growing(
     *, budget_m: float = 0.5, confirmation: ConfirmationOptions | None = None, give_up_days: float = 1e6
 ) -> GrowingOptions:
     """Options that fit these small photos."""
-    promotion = PromotionOptions(confirmation=confirmation or ConfirmationOptions())
+    confirmation = confirmation or ConfirmationOptions()
     return GrowingOptions(
-        growth=GrowthOptions(drift_budget_m=budget_m, promotion=promotion),
+        growth=GrowthOptions(drift_budget_m=budget_m, confirmation=confirmation),
         making=MAKING,
         give_up_days=give_up_days,
     )

@@ -27,7 +27,6 @@ def localised_photo(row: int, cam_from_local: Rigid3, **values: Any) -> Localise
         row=row,
         frame=LocalFrame(latitude_deg=49.0, longitude_deg=8.0, height_m=0.0),
         cam_from_local=cam_from_local,
-        by_prior=False,
         result=not_localised(snapshot=0),
         **given,
     )

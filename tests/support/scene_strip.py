@@ -19,8 +19,9 @@ from featuredb.store import Database
 from featuredb.store.candidates.owners import Owners
 from featuredb.store.candidates.photos import contribute, mark_confirmed, mark_used
 from featuredb.store.candidates.states import Contribution
-from ingest.growth.graph.map_graph import StoredEdge, place_of
+from ingest.growth.graph.map_graph import place_of
 from ingest.growth.trust.confirmation import Sources
+from ingest.growth.values import Edge
 from tests.support.scenes import (
     EASTING,
     EPSG,
@@ -100,7 +101,7 @@ def strip_map(
 def grown(feature_map: FeatureMap, parents: Sequence[FeatureMap], drift_m: float = 0.1) -> FeatureMap:
     """The map as if these had placed it where it is."""
     edges = [
-        StoredEdge(
+        Edge(
             map_id=parent.map_id, place=place_of(parent), other_from_map=Sim3.identity(), covariance=EDGE,
             shared_points=500, photos=8,
         )

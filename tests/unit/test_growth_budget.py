@@ -10,8 +10,9 @@ import pytest
 from featuredb.geometry.arrays import FloatArray
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lineage import GROWTH
+from ingest.growth import gates
 from ingest.growth.graph import budget
-from ingest.growth.graph.budget import drift_gate, rows_within
+from ingest.growth.graph.budget import rows_within
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.values import GrownMap, MapsPlacement
 from tests.support.scenes import box_points, random_descriptors, ring, scene_map
@@ -54,7 +55,7 @@ def test_where_the_map_as_a_whole_has_drifted_no_photo_is_within() -> None:
 
 @pytest.mark.parametrize(("drift_m", "passes"), [(0.5, True), (0.51, False)])
 def test_the_gate_of_drift(drift_m: float, passes: bool) -> None:
-    gate = drift_gate(drift_m, BUDGET_M)
+    gate = gates.drift(drift_m, BUDGET_M)
     assert gate.passes == passes
     assert f"{drift_m:.2f} m" in gate.message
 

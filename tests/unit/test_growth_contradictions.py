@@ -10,13 +10,13 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from ingest.colmap.bridge import Model
-from ingest.growth.place.contradictions import ContradictionOptions, contradicting_photos
+from ingest.growth import gates
+from ingest.growth.place.contradictions import contradicting_photos
 from ingest.growth.place.similarity_fit import FittedSimilarity
 from ingest.growth.values import LocalisedPhoto
 from tests.support.localised_photos import localised_photo
 from tests.support.posed_models import model_of
 
-OPTIONS = ContradictionOptions()
 LOCALISED = np.diag([1e-3] * 3 + [0.05, 0.1, 0.2]) ** 2
 REFINED = np.diag([5e-4] * 3 + [0.02, 0.08, 0.05]) ** 2
 
@@ -26,7 +26,6 @@ def fit_of(spread: float = 1.0, neighbours_factor: float = 1.0) -> FittedSimilar
         local_from_sfm=Sim3.identity(),
         covariance=np.eye(7) * 1e-8,
         errors_px=np.zeros(0),
-        weights=np.zeros(0),
         spread=spread,
         neighbours_factor=neighbours_factor,
     )
@@ -57,7 +56,7 @@ def found(scale: float, fit: FittedSimilarity, spread: FloatArray | None = None)
     rng = np.random.default_rng(7)
     photos = {k: drawn(rng, k, pose, scale) for k, pose in enumerate(poses)}
     spread = np.tile(REFINED, (600, 1, 1)) if spread is None else spread
-    return len(contradicting_photos(model, photos, spread, [fit], OPTIONS)) / 600
+    return len(contradicting_photos(model, photos, spread, [fit])) / 600
 
 
 def test_honest_photos_hardly_ever_contradict() -> None:
@@ -78,10 +77,10 @@ def test_the_larger_of_both_fits_counts() -> None:
     rng = np.random.default_rng(7)
     photos = {k: drawn(rng, k, pose, 5.0) for k, pose in enumerate(poses)}
     spread = np.tile(REFINED, (50, 1, 1))
-    alone = contradicting_photos(model, photos, spread, [fit_of()], OPTIONS)
+    alone = contradicting_photos(model, photos, spread, [fit_of()])
     before = fit_of(spread=2.0, neighbours_factor=40.0)
     assert len(alone) > 40
-    assert not contradicting_photos(model, photos, spread, [before, fit_of()], OPTIONS)
+    assert not contradicting_photos(model, photos, spread, [before, fit_of()])
 
 
 def test_without_a_covariance_of_its_own_a_pose_is_taken_as_exact() -> None:
@@ -94,18 +93,18 @@ def test_only_photos_that_are_asked_are_named_and_with_figures() -> None:
         rotation=poses[1].rotation, translation=poses[1].translation + poses[1].rotation @ [0, 3, 0]
     )
     spread = np.tile(REFINED, (3, 1, 1))
-    named = contradicting_photos(model, {1: localised_photo(1, away)}, spread, [fit_of()], OPTIONS)
+    named = contradicting_photos(model, {1: localised_photo(1, away)}, spread, [fit_of()])
     assert list(named) == [1]
     assert "3.00 m and 0.00 degrees" in named[1]
-    assert contradicting_photos(model, {}, spread, [fit_of()], OPTIONS) == {}
+    assert contradicting_photos(model, {}, spread, [fit_of()]) == {}
 
 
 @pytest.mark.parametrize("sigmas", [1.0, 6.0])
-def test_the_limit_is_that_of_so_many_sigmas(sigmas: float) -> None:
+def test_the_limit_is_that_of_so_many_sigmas(sigmas: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gates, "SIGMAS", sigmas)
     model, poses = posed(400)
     rng = np.random.default_rng(9)
     photos = {k: drawn(rng, k, pose) for k, pose in enumerate(poses)}
-    options = ContradictionOptions(sigmas=sigmas)
-    named = contradicting_photos(model, photos, np.tile(REFINED, (400, 1, 1)), [fit_of()], options)
+    named = contradicting_photos(model, photos, np.tile(REFINED, (400, 1, 1)), [fit_of()])
     expected = {1.0: 0.317, 6.0: 0.0}[sigmas]
     assert len(named) / 400 == pytest.approx(expected, abs=0.08)

@@ -14,8 +14,8 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored
 from ingest.colmap.bridge import Model, with_observations
+from ingest.growth.place import drift
 from ingest.growth.place.drift import (
-    DriftOptions,
     PhotoSpread,
     bending_variance_m2,
     center_covariances,
@@ -23,7 +23,7 @@ from ingest.growth.place.drift import (
     shared_turn,
     turning_covariance,
 )
-from ingest.growth.place.refinement import loose_photos
+from ingest.growth.place.refine import loose_photos
 from tests.support.new_photos import NewPhotos, take_photos
 from tests.support.scenes import CAMERA, box_points, looking_at, random_descriptors
 
@@ -71,11 +71,8 @@ def spread_of(
     fixed: FixedPoints,
     kept: NDArray[np.bool_],
     lenses: Lenses,
-    options: DriftOptions | None = None,
 ) -> PhotoSpread:
-    return photo_covariances(
-        model, keypoints, fixed, kept, lenses, AnchoredOptions(), options or DriftOptions()
-    )
+    return photo_covariances(model, keypoints, fixed, kept, lenses, AnchoredOptions())
 
 
 def mean_turn(found: Sequence[Rigid3], true: Sequence[Rigid3], lens: Camera = CAMERA) -> FloatArray:
@@ -125,7 +122,7 @@ def test_a_lens_that_may_be_off_widens_it() -> None:
         assert (np.trace(a, axis1=1, axis2=2) > np.trace(b, axis1=1, axis2=2)).all()
 
 
-def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
+def test_a_similaritys_covariance_grows_until_it_holds_the_far_end(monkeypatch: pytest.MonkeyPatch) -> None:
     new, _, fixed = walk(2)
     keypoints = list(new.keypoints().values())
     kept = np.ones(len(fixed.point_of), dtype=np.bool_)
@@ -137,7 +134,8 @@ def test_a_similaritys_covariance_grows_until_it_holds_the_far_end() -> None:
     wider = tiny + np.diag([0.0] * 4 + [more] * 3)
     assert bending_variance_m2(new.model, wider, spread) < 1e-9
     assert bending_variance_m2(new.model, ample, spread) == 0.0
-    coarse = spread_of(*arguments, replace(DriftOptions(), least_px=5.0)).poses
+    monkeypatch.setattr(drift, "_LEAST_PX", 5.0)
+    coarse = spread_of(*arguments).poses
     assert bending_variance_m2(new.model, tiny, coarse) > 2.0 * more
     # A similarity that covers the far end is widened by what the near photos lack, not at the far end.
     centers = center_covariances(new.model, spread)

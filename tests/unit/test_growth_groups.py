@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.growth.place.groups import GroupOptions, PairCheck, intersections
+from ingest.growth.place.groups import PairCheck, intersections
 from tests.support.scenes import CAMERA, box_points, ring
-
-OPTIONS = GroupOptions()
 
 
 def test_rays_meet_in_the_points() -> None:
@@ -44,5 +42,5 @@ def test_rays_from_one_spot_have_no_angle() -> None:
     ],
 )
 def test_when_a_pair_agrees(verified: int, fitting: float, angle_deg: float, agrees: bool) -> None:
-    check = PairCheck(pair=(0, 1), verified=verified, fitting=fitting, angle_deg=angle_deg)
-    assert check.agrees(OPTIONS) is agrees
+    check = PairCheck(verified=verified, fitting=fitting, angle_deg=angle_deg)
+    assert check.agrees is agrees

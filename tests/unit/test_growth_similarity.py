@@ -9,7 +9,6 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from ingest.growth.place.correspondences import Correspondences, find_correspondences
 from ingest.growth.place.similarity_fit import (
-    SimilarityFitOptions,
     agreeing_photos,
     correspondence_errors,
     fit_similarity,
@@ -21,7 +20,6 @@ from tests.support.new_photos import SFM_FROM_LOCAL, NewPhotos, take_photos
 from tests.support.scenes import box_points, random_descriptors, ring
 
 TRUTH = SFM_FROM_LOCAL.inverse()
-OPTIONS = SimilarityFitOptions()
 
 
 def world(seed: int, noise_px: float = 0.5, photos: int = 5) -> tuple[NewPhotos, FloatArray]:
@@ -70,9 +68,7 @@ def test_exact_pixels_give_the_exact_similarity() -> None:
     new, points = world(1, noise_px=0.0)
     correspondences = correspondences_of(new, points)
     start = Sim3.exp(np.array([0.02, 0.01, -0.02, 0.015, 0.4, -0.3, 0.5])) @ TRUTH
-    fit = fit_similarity(
-        new.model, start, correspondences, np.ones(len(correspondences), dtype=np.bool_), OPTIONS
-    )
+    fit = fit_similarity(new.model, start, correspondences, np.ones(len(correspondences), dtype=np.bool_))
     error = error_of(fit.local_from_sfm)
     assert np.abs(error[:4]).max() < 1e-5
     assert np.abs(error[4:]).max() < 1e-4  # keypoints are float32
@@ -85,13 +81,12 @@ def test_wrong_correspondences_do_not_move_it() -> None:
     wrong = np.random.default_rng(0).random(len(correspondences)) < 0.25
     pixels = correspondences.pixels.copy()
     pixels[wrong] += 60.0
-    clean = fit_similarity(new.model, TRUTH, correspondences, ~wrong, OPTIONS)
+    clean = fit_similarity(new.model, TRUTH, correspondences, ~wrong)
     dirty = fit_similarity(
         new.model,
         TRUTH,
         replace(correspondences, pixels=pixels),
         np.ones(len(correspondences), dtype=np.bool_),
-        OPTIONS,
     )
     apart = (clean.local_from_sfm @ dirty.local_from_sfm.inverse()).log()
     sigma = np.sqrt(np.diag(clean.covariance))
@@ -108,9 +103,7 @@ def test_the_covariance_is_as_wide_as_the_errors(sigma_m: float) -> None:
     for seed in range(12):
         new, points = world(50 + seed)
         correspondences = correspondences_of(new, points, sigma_m, seed)
-        fit = fit_similarity(
-            new.model, TRUTH, correspondences, np.ones(len(correspondences), dtype=np.bool_), OPTIONS
-        )
+        fit = fit_similarity(new.model, TRUTH, correspondences, np.ones(len(correspondences), dtype=np.bool_))
         error = error_of(fit.local_from_sfm)
         lengths.append(float(error @ np.linalg.solve(fit.covariance, error)))
     assert 2.0 < np.mean(lengths) < 11.0, lengths
@@ -121,10 +114,10 @@ def test_photos_that_are_bent_alike_widen_the_covariance() -> None:
     new, points = world(3)
     correspondences = correspondences_of(new, points)
     every = np.ones(len(correspondences), dtype=np.bool_)
-    straight = fit_similarity(new.model, TRUTH, correspondences, every, OPTIONS)
+    straight = fit_similarity(new.model, TRUTH, correspondences, every)
     offsets = np.random.default_rng(1).normal(0, 3.0, (5, 2))
     bent = replace(correspondences, pixels=correspondences.pixels + offsets[correspondences.photo_of])
-    fit = fit_similarity(new.model, TRUTH, bent, every, OPTIONS)
+    fit = fit_similarity(new.model, TRUTH, bent, every)
     assert straight.neighbours_factor < 3.0
     assert fit.neighbours_factor > 10.0
     error = error_of(fit.local_from_sfm)
@@ -137,7 +130,7 @@ def test_what_no_correspondence_holds_is_open_and_stays() -> None:
     """One photo does not tell the scale; points behind all cameras tell nothing at all."""
     new, points = world(6)
     correspondences = correspondences_of(new, points)
-    fit = fit_similarity(new.model, TRUTH, correspondences, correspondences.photo_of == 0, OPTIONS)
+    fit = fit_similarity(new.model, TRUTH, correspondences, correspondences.photo_of == 0)
     assert np.linalg.eigvalsh(fit.covariance).min() > 0.0
     assert np.sqrt(fit.covariance[0, 0]) > 1.0
     center = new.model.cam_from_sfm[0].center
@@ -148,7 +141,6 @@ def test_what_no_correspondence_holds_is_open_and_stays() -> None:
         away,
         correspondences_behind(new, correspondences),
         np.ones(len(correspondences), np.bool_),
-        OPTIONS,
     )
     np.testing.assert_allclose(down.local_from_sfm.matrix(), away.matrix())
     assert np.sqrt(np.diag(down.covariance)).min() > 1.0
@@ -177,7 +169,7 @@ def test_photos_agree_by_their_own_correspondences() -> None:
     pixels[correspondences.photo_of == 2] += 40.0
     off = replace(correspondences, pixels=pixels)
     errors = correspondence_errors(new.model, TRUTH, off)
-    agree = agreeing_photos(errors, tolerances_px(new.model, off, 0.005), off, 0.5)
+    agree = agreeing_photos(errors, tolerances_px(new.model, off), off)
     assert agree.tolist() == [0, 1, 3, 4]
 
 

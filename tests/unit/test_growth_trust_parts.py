@@ -11,17 +11,26 @@ import pytest
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.bridge import Model
-from ingest.growth.graph.budget import drift_gate
-from ingest.growth.graph.map_graph import PlacedMap, StoredEdge, no_surer_than, place_of, solve_with_new
-from ingest.growth.graph.new_overlaps import overlaps_to_measure
-from ingest.growth.graph.replacing import MovedMap, Replacement
+from ingest.growth import gates
+from ingest.growth.graph.map_graph import (
+    OWN,
+    PlacedMap,
+    graph_edges,
+    graph_nodes,
+    no_surer_than,
+    place_of,
+    solve_with_new,
+)
+from ingest.growth.graph.pose_graph import solve_pose_graph
+from ingest.growth.graph.replacing import MovedMap, Replacement, overlaps_to_measure
 from ingest.growth.growth_report import GrownEntry, GrowthReport, PhotoFate
+from ingest.growth.map_images import model_of
 from ingest.growth.map_places import drift_m, growth_of, places_of
-from ingest.growth.place.overlaps import model_of
 from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import ConfirmationOptions, CorroboratingImage, Source
-from ingest.growth.trust.promotion import Promotion, canary_gate
+from ingest.growth.trust.promotion import Promotion
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
+from ingest.growth.values import Edge
 from ingest.sfm.links import keep_photos
 from tests.support.scene_strip import EDGE, FRAME, east, sources_of, strip_map
 
@@ -41,17 +50,17 @@ def _placed(feature_map: FeatureMap, created_ms: int = 0) -> PlacedMap:
         covariance=feature_map.placement.covariance,
         place=place_of(feature_map),
         corners=places_of(feature_map),
-        edges=tuple(StoredEdge.from_json(e) for e in growth.get("edges", ())),
+        edges=tuple(Edge.from_json(e) for e in growth.get("edges", ())),
         evidence=feature_map.placement.evidence,
     )
 
 
 def test_an_edge_survives_json() -> None:
-    edge = StoredEdge(
+    edge = Edge(
         map_id="x", place="p", other_from_map=Sim3.exp(np.arange(7) * 0.01), covariance=EDGE,
         shared_points=5, photos=2,
     )  # fmt: skip
-    again = StoredEdge.from_json(json.loads(json.dumps(edge.as_json())))
+    again = Edge.from_json(json.loads(json.dumps(edge.as_json())))
     np.testing.assert_allclose(again.other_from_map.matrix(), edge.other_from_map.matrix(), atol=1e-12)
     np.testing.assert_array_equal(again.covariance, edge.covariance)
     assert (again.map_id, again.place, again.shared_points, again.photos) == ("x", "p", 5, 2)
@@ -88,7 +97,7 @@ def test_drift_of_a_chain_grows_with_its_steps() -> None:
 
 def test_two_edges_of_the_same_photos_count_once() -> None:
     """Both hold the map as surely as one fit to both did; independent, they would be twice as sure."""
-    edge = StoredEdge(
+    edge = Edge(
         map_id="A", place="", other_from_map=Sim3.identity(), covariance=EDGE, shared_points=1, photos=1
     )
     found = no_surer_than([edge, replace(edge, map_id="B")], EDGE)
@@ -102,9 +111,37 @@ def test_two_edges_of_the_same_photos_count_once() -> None:
     np.testing.assert_allclose(no_surer_than([edge], bent)[0].covariance, bent, rtol=1e-6)
 
 
-def test_the_drift_gate() -> None:
-    assert drift_gate(0.49, 0.5).passes
-    refused = drift_gate(0.51, 0.5)
+def test_an_anchor_that_another_one_moved_does_not_count_their_overlap_twice() -> None:
+    """A GPS anchor two metres east of a map on a firm one; solved again, nothing is surer than before."""
+    loose = np.diag(np.repeat([1e-3, 3.0], [4, 3]) ** 2)
+    gps, child = strip_map("gps", 20.0, covariance=loose), strip_map("m", 45.0, parents=[_ANCHOR])
+    to_gps = Edge(
+        map_id="gps",
+        place=place_of(gps),
+        other_from_map=east(2.0),
+        covariance=EDGE,
+        shared_points=9,
+        photos=3,
+    )
+    maps = {m.map_id: _placed(m) for m in (_ANCHOR, gps, child)}
+    maps["m"] = replace(maps["m"], edges=(*maps["m"].edges, to_gps))
+    ids = sorted(maps)
+    first = solve_pose_graph(graph_nodes(maps, ids, FRAME), graph_edges(maps, ids, FRAME))
+    moved = first.corrections["gps"]
+    assert np.linalg.norm(moved.translation) > 1.5
+    own = {"covariance": loose.ravel().tolist(), "present_from_own": moved.log().tolist()}
+    there = replace(maps["gps"], covariance=first.covariance["gps"], evidence={"growth": {OWN: own}})
+    agreeing = moved @ to_gps.other_from_map @ first.corrections["m"].inverse()
+    edges = (maps["m"].edges[0], replace(to_gps, other_from_map=agreeing))
+    maps |= {"gps": there, "m": replace(maps["m"], edges=edges)}
+    again = solve_pose_graph(graph_nodes(maps, ids, FRAME), graph_edges(maps, ids, FRAME))
+    assert np.linalg.norm(again.corrections["gps"].translation) < 0.01
+    np.testing.assert_allclose(again.covariance["gps"], first.covariance["gps"], rtol=1e-3, atol=1e-6)
+
+
+def test_the_gate_of_drift() -> None:
+    assert gates.drift(0.49, 0.5).passes
+    refused = gates.drift(0.51, 0.5)
     assert not refused.passes
     assert refused.reason == "DRIFT_BUDGET"
     assert "0.51 m" in refused.message
@@ -119,7 +156,7 @@ def test_which_overlaps_are_measured_anew() -> None:
     def wanted(anchor: FeatureMap, others: dict[FeatureMap, int]) -> list[tuple[str, str]]:
         maps = {"A": _placed(anchor), "m": _placed(child, 1000)}
         maps |= {m.map_id: _placed(m, at) for m, at in others.items()}
-        return overlaps_to_measure(maps, 5.0)
+        return overlaps_to_measure(maps)
 
     assert wanted(_ANCHOR, {}) == []
     assert wanted(_ANCHOR, {near: 2000, far: 2000}) == [("m", "N")]
@@ -130,7 +167,7 @@ def test_which_overlaps_are_measured_anew() -> None:
 
 def _model() -> Model:
     feature_map = strip_map("m", 40.0)
-    return model_of(feature_map, feature_map.images)
+    return model_of(feature_map, feature_map.points_local(), feature_map.images, described=True)
 
 
 def test_a_model_is_cut_to_the_photos_that_hang_together() -> None:
@@ -210,8 +247,8 @@ def test_a_witness_makes_points_answer() -> None:
 def test_canaries_as_a_gate() -> None:
     good = CanaryCheck(name="a", before="right", after="right")
     bad = CanaryCheck(name="b", before="right", after="lost", regression="no longer localised")
-    assert canary_gate(CanaryRun(checks=(good,), note="")).passes
-    refused = canary_gate(CanaryRun(checks=(good, bad), note=""))
+    assert CanaryRun(checks=(good,), note="").gate.passes
+    refused = CanaryRun(checks=(good, bad), note="").gate
     assert not refused.passes
     assert "b: no longer localised" in refused.message
 

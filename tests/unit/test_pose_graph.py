@@ -12,11 +12,10 @@ from featuredb.geometry.sim3 import Sim3
 from ingest.growth.graph.pose_graph import (
     GraphEdge,
     GraphNode,
-    PoseGraphOptions,
     equivalent_sigmas,
     solve_pose_graph,
 )
-from ingest.growth.place.similarity_fit import left_jacobian, small_adjoint
+from ingest.growth.graph.pose_graph_fit import left_jacobian, small_adjoint
 
 _SIGMA = np.array([1e-4, 2e-4, 2e-4, 3e-4, 0.03, 0.02, 0.04])
 _EDGE = np.diag(_SIGMA**2)
@@ -105,8 +104,9 @@ def test_general_similarities_are_recovered() -> None:
 
 
 @pytest.mark.evaluation
-def test_covariance_is_that_of_many_trials() -> None:
+def test_covariance_is_that_of_many_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spread of solutions under sampled edge errors, with maps far from the origin and a loop."""
+    monkeypatch.setattr("ingest.growth.graph.pose_graph._CHANCE", 1e-12)
     rng = np.random.default_rng(0)
     truth = {
         "a": Sim3.identity(),
@@ -122,7 +122,7 @@ def test_covariance_is_that_of_many_trials() -> None:
             xi = rng.normal(0, _SIGMA) if noise else np.zeros(7)
             measured = Sim3.exp(xi) @ truth[j].inverse() @ truth[i]
             edges.append(GraphEdge(a=i, b=j, b_from_a=measured, covariance=_EDGE))
-        found = solve_pose_graph(nodes, edges, PoseGraphOptions(contradiction_p=1e-12))
+        found = solve_pose_graph(nodes, edges)
         return dict(found.corrections), dict(found.covariance)
 
     _, covariance = solved(noise=False)

@@ -10,8 +10,9 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3, point_jacobian
-from ingest.growth.graph.map_graph import StoredEdge, in_graph
+from ingest.growth.graph.map_graph import in_graph
 from ingest.growth.graph.pose_graph import GraphEdge, GraphNode, GraphSolution, solve_pose_graph
+from ingest.growth.values import Edge
 
 MAPS, STEP_M = 12, 30.0
 OWN = np.diag(np.array([1e-5, 5e-5, 5e-5, 5e-5, 0.005, 0.005, 0.005]) ** 2)
@@ -99,7 +100,7 @@ def test_a_far_anchor_takes_it_away() -> None:
 
 
 def test_it_is_stored_with_the_overlap_and_turns_with_its_frame() -> None:
-    edge = StoredEdge(
+    edge = Edge(
         map_id="m0",
         place="there",
         other_from_map=Sim3.identity(),
@@ -108,9 +109,9 @@ def test_it_is_stored_with_the_overlap_and_turns_with_its_frame() -> None:
         photos=3,
         shared=shared(1),
     )
-    back = StoredEdge.from_json(edge.as_json())
+    back = Edge.from_json(edge.as_json())
     np.testing.assert_allclose(back.shared, edge.shared)
-    old = StoredEdge.from_json({k: v for k, v in edge.as_json().items() if k != "shared"})
+    old = Edge.from_json({k: v for k, v in edge.as_json().items() if k != "shared"})
     np.testing.assert_array_equal(old.shared, np.zeros((7, 3)))
     here = LocalFrame(latitude_deg=48.0, longitude_deg=9.0, height_m=300.0)
     there = LocalFrame(latitude_deg=48.3, longitude_deg=9.5, height_m=100.0)

@@ -7,12 +7,10 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
 from featuredb.render.cloud import PointCloud
 from ingest.growth.gates import Gate
-from ingest.growth.trust.scan_check import ScanCheckOptions, cloud_gate
+from ingest.growth.trust.scan_check import cloud_gate
 from tests.support.scanned_map import ground_points, plain_cloud, scan
 
 pytest.importorskip("small_gicp")
-
-_OPTIONS = ScanCheckOptions()
 
 
 def _claim(sigma_m: float) -> FloatArray:
@@ -32,7 +30,7 @@ def _ground(shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> FloatArray:
 
 
 def _asked(cloud: PointCloud, points: FloatArray, sigma_m: float = 0.05) -> Gate:
-    gate = cloud_gate(cloud, points, _claim(sigma_m), _OPTIONS)
+    gate = cloud_gate(cloud, points, _claim(sigma_m))
     assert gate is not None
     return gate
 
@@ -65,7 +63,7 @@ def test_a_map_that_floats_is_refused_unless_its_height_is_anybodys_guess(cloud:
     gate = _asked(cloud, floating)
     assert not gate.passes
     assert gate.as_json()["figure"] is None
-    assert cloud_gate(cloud, floating, _claim(20.0), _OPTIONS) is None
+    assert cloud_gate(cloud, floating, _claim(20.0)) is None
 
 
 def test_flat_ground_holds_heights_alone() -> None:
@@ -78,5 +76,5 @@ def test_flat_ground_holds_heights_alone() -> None:
 
 
 def test_where_there_is_no_scan_nothing_is_said(cloud: PointCloud) -> None:
-    assert cloud_gate(cloud, _ground((500.0, 0.0, 0.0)), _claim(0.05), _OPTIONS) is None
-    assert cloud_gate(cloud, _ground()[:50], _claim(0.05), _OPTIONS) is None
+    assert cloud_gate(cloud, _ground((500.0, 0.0, 0.0)), _claim(0.05)) is None
+    assert cloud_gate(cloud, _ground()[:50], _claim(0.05)) is None

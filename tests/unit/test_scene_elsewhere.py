@@ -37,7 +37,7 @@ def test_positions_that_are_wrong_together_show_against_a_map_of_the_scene(
     assert found is not None
     assert found.summary.map_id == "old"
     assert words in found.message
-    assert found.photos >= 3
+    assert found.overlap.photos >= 3
 
 
 @pytest.mark.parametrize("by_m", [(0.0, 0.0), (12.0, -9.0)])

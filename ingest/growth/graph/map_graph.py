@@ -1,15 +1,13 @@
 """The maps of a snapshot as a pose graph: who placed whom, how well, and how far that may have drifted.
 
-An edge of the graph is an overlap that growth has measured. It is kept in the evidence of the map that was
-placed: the other map, the similarity that would carry this map's points to where the other says they are, and
-its covariance, both in this map's local frame, and a digest of the other's place at that time. Once the
-other is placed anew the digest differs, and the edge has to be measured again.
+An edge of the graph is an overlap that growth has measured (`values.Edge`). Once the other map is placed anew
+its digest of place differs, and the edge has to be measured again.
 """
 
 import hashlib
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,60 +16,16 @@ from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.maps.move import covariance_in_frame, in_frame
 from featuredb.store import Snapshot
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
 from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode
+from ingest.growth.map_places import growth_of
+from ingest.growth.values import Edge, tied_together
 
 OWN = "own_placement"  # key of an anchor's evidence of growth, once a graph has moved it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StoredEdge:
-    """An overlap of a map with another one.
-
-    Attributes:
-        map_id: the other map.
-        place: digest of the other map's place when it was measured (`place_key`).
-        other_from_map: carries what this map says to where the other says it; this map's local frame.
-        covariance: (7, 7) of its left perturbation.
-        shared_points, photos: that it rests on.
-        shared: (7, 3) the part of the covariance that overlaps have in common (`photo_spread.shared_turn`).
-    """
-
-    map_id: str
-    place: str
-    other_from_map: Sim3
-    covariance: FloatArray
-    shared_points: int
-    photos: int
-    shared: FloatArray = field(default_factory=lambda: np.zeros((7, 3)))
-
-    def as_json(self) -> dict[str, Any]:
-        return {
-            "map_id": self.map_id,
-            "place": self.place,
-            "parent_from_new": [float(v) for v in self.other_from_map.log()],
-            "covariance": [float(v) for v in self.covariance.ravel()],
-            "shared_points": self.shared_points,
-            "photos": self.photos,
-            "shared": [float(v) for v in self.shared.ravel()],
-        }
-
-    @classmethod
-    def from_json(cls, value: Mapping[str, Any]) -> "StoredEdge":
-        return cls(
-            map_id=str(value["map_id"]),
-            place=str(value.get("place", "")),
-            other_from_map=Sim3.exp(value.get("parent_from_new") or np.zeros(7)),
-            covariance=np.asarray(value["covariance"], dtype=np.float64).reshape(7, 7),
-            shared_points=int(value.get("shared_points", 0)),
-            photos=int(value.get("photos", 0)),
-            shared=np.reshape(np.asarray(value.get("shared") or np.zeros(21), dtype=np.float64), (7, 3)),
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -94,7 +48,7 @@ class PlacedMap:
     covariance: FloatArray
     place: str
     corners: FloatArray
-    edges: tuple[StoredEdge, ...]
+    edges: tuple[Edge, ...]
     evidence: Mapping[str, Any]
 
     @property
@@ -102,18 +56,14 @@ class PlacedMap:
         return not self.parents
 
     @property
-    def own_covariance(self) -> FloatArray:
-        """Of an anchor's own placement, before other anchors had a say."""
-        own = (self.evidence.get(GROWTH) or {}).get(OWN)
-        return (
-            self.covariance if own is None else np.asarray(own["covariance"], dtype=np.float64).reshape(7, 7)
+    def own_placement(self) -> tuple[FloatArray, Sim3]:
+        """Covariance (7, 7) of an anchor's placement before others moved it, and that move; its frame."""
+        own = growth_of(self.evidence).get(OWN)
+        if own is None:
+            return self.covariance, Sim3.identity()
+        return np.asarray(own["covariance"], dtype=np.float64).reshape(7, 7), Sim3.exp(
+            own["present_from_own"]
         )
-
-    @property
-    def present_from_own(self) -> Sim3:
-        """How far other anchors have moved an anchor since its own placement; its own frame."""
-        own = (self.evidence.get(GROWTH) or {}).get(OWN)
-        return Sim3.identity() if own is None else Sim3.exp(own["present_from_own"])
 
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
@@ -124,7 +74,6 @@ def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
 
 def _placed(row: Row) -> PlacedMap:
     evidence = json.loads(row["placement_evidence"] or "{}")
-    growth = evidence.get(GROWTH) or {}
     frame = LocalFrame(
         latitude_deg=row["origin_latitude_deg"],
         longitude_deg=row["origin_longitude_deg"],
@@ -146,7 +95,7 @@ def _placed(row: Row) -> PlacedMap:
         covariance=np.asarray(row["placement_covariance"], dtype=np.float64).reshape(7, 7),
         place=place_key(frame, placed_at, row["placement_covariance"]),
         corners=_corners(row, frame),
-        edges=tuple(StoredEdge.from_json(edge) for edge in growth.get("edges", ())),
+        edges=tuple(Edge.from_json(edge) for edge in growth_of(evidence).get("edges", ())),
         evidence=evidence,
     )
 
@@ -174,34 +123,28 @@ def place_of(feature_map: FeatureMap) -> str:
 
 def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
     """Maps that are connected with those of `start` by edges, those among them."""
-    neighbours: dict[str, set[str]] = {}
-    for a, b in edges:
-        neighbours.setdefault(a, set()).add(b)
-        neighbours.setdefault(b, set()).add(a)
-    found, queue = set(start) & set(maps), list(set(start) & set(maps))
-    while queue:
-        for other in neighbours.get(queue.pop(), ()):
-            if other in maps and other not in found:
-                found.add(other)
-                queue.append(other)
-    return found
+    nodes = list(maps)
+    group_of = dict(zip(nodes, tied_together(nodes, [e for e in edges if set(e) <= set(maps)]), strict=True))
+    groups = {group_of[m] for m in start if m in maps}
+    return {m for m in nodes if group_of[m] in groups}
 
 
-def graph_edges(
-    maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame
-) -> list[tuple[str, GraphEdge]]:
-    """Edges that still hold, in one frame, each with the map whose evidence has it."""
-    found = []
-    for map_id in of:
-        me = maps[map_id]
-        for edge in me.edges:
-            other = maps.get(edge.map_id)
-            if other is not None and edge.place == other.place:
-                found.append((map_id, in_graph(map_id, edge, me.frame, frame)))
-    return found
+def holds(maps: Mapping[str, PlacedMap], edge: Edge) -> bool:
+    """Whether the other map is where it was when the overlap was measured."""
+    return edge.map_id in maps and maps[edge.map_id].place == edge.place
 
 
-def in_graph(map_id: str, edge: StoredEdge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
+def graph_edges(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphEdge]:
+    """Edges that still hold, in one frame."""
+    return [
+        in_graph(map_id, edge, maps[map_id].frame, frame)
+        for map_id in of
+        for edge in maps[map_id].edges
+        if holds(maps, edge)
+    ]
+
+
+def in_graph(map_id: str, edge: Edge, own: LocalFrame, frame: LocalFrame) -> GraphEdge:
     """A stored edge in the frame of a graph."""
     return GraphEdge(
         a=map_id,
@@ -213,32 +156,31 @@ def in_graph(map_id: str, edge: StoredEdge, own: LocalFrame, frame: LocalFrame) 
 
 
 def graph_nodes(maps: Mapping[str, PlacedMap], of: Iterable[str], frame: LocalFrame) -> list[GraphNode]:
-    """Nodes: anchors with their placement's covariance in the frame."""
-    return [
-        GraphNode(
-            map_id=m,
-            prior=covariance_in_frame(maps[m].covariance, maps[m].frame, frame)
-            if maps[m].is_anchor
-            else None,
-        )
-        for m in of
-    ]
+    """Nodes; anchors with their own placement: where others have moved one, the edges say so anew."""
+    nodes = []
+    for map_id in of:
+        me, node = maps[map_id], GraphNode(map_id=map_id)
+        if me.is_anchor:
+            covariance, moved = me.own_placement
+            prior = covariance_in_frame(covariance, me.frame, frame)
+            node = replace(node, prior=prior, present_from_own=in_frame(moved, me.frame, frame))
+        nodes.append(node)
+    return nodes
 
 
 def solve_with_new(
-    maps: Mapping[str, PlacedMap], map_id: str, edges: Sequence[StoredEdge], frame: LocalFrame
+    maps: Mapping[str, PlacedMap], map_id: str, edges: Sequence[Edge], frame: LocalFrame
 ) -> GraphSolution:
     """The graph with one more map, in that map's frame. Edges name existing maps."""
     pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges]
     members = sorted(family(maps, pairs, [e.map_id for e in edges]) - {map_id})
     nodes = [*graph_nodes(maps, members, frame), GraphNode(map_id=map_id)]
-    known = [edge for _, edge in graph_edges(maps, members, frame) if map_id not in (edge.a, edge.b)]
-    ids = {node.map_id for node in nodes}
-    new = [in_graph(map_id, e, frame, frame) for e in edges if e.map_id in ids]
+    known = [e for e in graph_edges(maps, members, frame) if map_id not in (e.a, e.b)]
+    new = [in_graph(map_id, e, frame, frame) for e in edges if e.map_id in members]
     return solve_pose_graph(nodes, [*known, *new])
 
 
-def no_surer_than(edges: Sequence[StoredEdge], together: FloatArray | None) -> list[StoredEdge]:
+def no_surer_than(edges: Sequence[Edge], together: FloatArray) -> list[Edge]:
     """Edges of one map to several, all made of the same photos, so that they do not count these twice.
 
     Taken as independent, they would place the map more surely than one fit to all of them, its bending
@@ -248,8 +190,8 @@ def no_surer_than(edges: Sequence[StoredEdge], together: FloatArray | None) -> l
     Args:
         together: (7, 7) covariance of the map's placement by all of them at once.
     """
-    if together is None or not edges:
-        return list(edges)
+    if not edges:
+        return []
     apart = np.linalg.inv(sum(np.linalg.inv(edge.covariance) for edge in edges))
     half = np.linalg.cholesky(apart)  # axes in which what they say together is a unit ball: units mix
     white = np.linalg.solve(half, np.linalg.solve(half, together - apart).T)

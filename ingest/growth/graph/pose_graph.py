@@ -1,9 +1,9 @@
 """A pose graph over maps: where all of them lie best, given anchors and measured overlaps.
 
 Nodes are corrections of the maps' present places, similarities in one local frame; edges are measured
-similarities between maps that overlap; anchors are held by their own covariance. scipy's least squares on
-the tangent of SIM(3) solves it. With x' = X_i x for the points of map i and Z that carries what map i says to
-where map j says it, X_i = X_j Z in truth, so an edge's residual is log(X_j^-1 X_i Z^-1).
+similarities between maps that overlap; anchors are held by their own covariance. With x' = X_i x for the
+points of map i and Z that carries what map i says to where map j says it, X_i = X_j Z in truth, so an edge's
+residual is log(X_j^-1 X_i Z^-1).
 
 Marginal covariances come from the normal matrix of the whole graph, not from sums along one path. An edge is
 judged by how much of chi-square goes with it (the block form of Baarda's test).
@@ -13,34 +13,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.stats import chi2, norm
 
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
+from ingest.growth.gates import SIGMAS
 from ingest.growth.graph.pose_graph_fit import GraphEdge, GraphNode, PoseGraphFit
+from ingest.growth.values import tied_together
 
 _NAMED = 8  # overlaps that a message names
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PoseGraphOptions:
-    """When a graph is believed.
-
-    Attributes:
-        contradiction_p: probability of a worse chi-square by chance below which something contradicts;
-            0.0027 is 3 sigma of a normal error, the line of all gates of growth.
-        clear_lead: an edge is left out when it takes with it so many times more of chi-square than the next
-            one; where several explain the contradiction alike, nobody can tell which is wrong.
-        max_variance_factor: where no edge stands out, all covariances grow by chi-square over its degrees,
-            up to this: deviations five times those claimed are no longer noise.
-    """
-
-    contradiction_p: float = 0.0027
-    clear_lead: float = 2.0
-    max_variance_factor: float = 25.0
+_CHANCE = float(chi2.sf(SIGMAS**2, 1))  # of a worse chi-square, below which something contradicts
+# An edge is left out when it takes with it so many times more of chi-square than the next one; where several
+# explain the contradiction alike, nobody can tell which is wrong.
+_CLEAR_LEAD = 2.0
+# Where no edge stands out, all covariances grow by chi-square over its degrees, up to this: deviations five
+# times those claimed are no longer noise.
+_MOST_VARIANCE_FACTOR = 25.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -48,7 +37,6 @@ class EdgeFit:
     """How an edge agrees with the rest.
 
     Attributes:
-        distance_m: what the edge misses at the origin of the graph's frame, metres.
         chi_square: by how much the graph's chi-square falls without the edge.
         redundancy: number of its seven directions that others check, 0 to 7.
         sigmas: of a normal error that is as unlikely; NaN where nothing checks it.
@@ -56,7 +44,6 @@ class EdgeFit:
     """
 
     edge: GraphEdge
-    distance_m: float
     chi_square: float
     redundancy: int
     sigmas: float
@@ -92,15 +79,12 @@ class GraphSolution:
         return tuple(fit for fit in self.edges if fit.left_out)
 
 
-def solve_pose_graph(
-    nodes: Sequence[GraphNode], edges: Sequence[GraphEdge], options: PoseGraphOptions | None = None
-) -> GraphSolution:
+def solve_pose_graph(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> GraphSolution:
     """The most likely places of all maps; edges that contradict the rest are named and left out.
 
     Raises:
         InvalidValueError: map ids repeat, or an edge names an unknown map.
     """
-    options = options or PoseGraphOptions()
     _check(nodes, edges)
     left_out: list[EdgeFit] = []
     remaining = list(edges)
@@ -109,85 +93,62 @@ def solve_pose_graph(
         reached = _anchored(nodes, remaining)
         if not reached:
             return GraphSolution(reason="NO_ANCHOR", message="no map of the graph is an anchor")
-        fitted = PoseGraphFit.of([n for n in nodes if n.map_id in reached], remaining)
-        fits = _edge_fits(fitted)
-        worst = _contradicting(fitted, fits, options)
+        fitted = PoseGraphFit([n for n in nodes if n.map_id in reached], remaining)
+        fits = tuple(
+            EdgeFit(edge=edge, chi_square=chi, redundancy=rank, sigmas=equivalent_sigmas(chi, rank))
+            for edge, (chi, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True)
+        )
+        worst = _contradicting(fitted, fits)
         if worst is None or _anchored(nodes, [e for e in remaining if e is not worst.edge]) != anchored_first:
             break
         left_out.append(replace(worst, left_out=True))
         remaining.remove(worst.edge)
-    return _solution(fitted, (*fits, *left_out), options)
+    return _solution(fitted, (*fits, *left_out))
 
 
-def _solution(fitted: "PoseGraphFit", fits: tuple[EdgeFit, ...], options: PoseGraphOptions) -> GraphSolution:
+def _solution(fitted: PoseGraphFit, fits: tuple[EdgeFit, ...]) -> GraphSolution:
     factor = 1.0
-    unlikely = fitted.degrees > 0 and chi2.sf(fitted.chi_square, fitted.degrees) < options.contradiction_p
-    if unlikely:
+    if fitted.degrees > 0 and not _likely(fitted.chi_square, fitted.degrees):
         factor = max(1.0, fitted.chi_square / fitted.degrees)
     figures = f"chi-square {fitted.chi_square:.1f} with {fitted.degrees} degrees of freedom"
-    if factor > options.max_variance_factor:
-        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
-        named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
-        return GraphSolution(
-            reason="CONTRADICTION",
-            message=f"the overlaps contradict each other and no single one stands out ({figures}): {named}",
-            chi_square=fitted.chi_square,
-            degrees=fitted.degrees,
-            variance_factor=factor,
-            edges=fits,
-        )
-    on_earth, relative = fitted.marginals(), fitted.relative_marginals()
-    return GraphSolution(
+    found = GraphSolution(
         reason=None,
         message=figures,
-        corrections=fitted.corrections,
-        covariance={m: factor * c for m, c in on_earth.items()},
-        covariance_relative={m: factor * c for m, c in relative.items()},
         chi_square=fitted.chi_square,
         degrees=fitted.degrees,
         variance_factor=factor,
         edges=fits,
     )
+    if factor > _MOST_VARIANCE_FACTOR:
+        worst = sorted((f for f in fits if np.isfinite(f.sigmas)), key=lambda f: -f.chi_square)[:_NAMED]
+        named = "; ".join(f"{f.edge} by {f.sigmas:.1f} sigma" for f in worst)
+        text = f"the overlaps contradict each other and no single one stands out ({figures}): {named}"
+        return replace(found, reason="CONTRADICTION", message=text)
+    return replace(
+        found,
+        corrections=fitted.corrections,
+        covariance={m: factor * c for m, c in fitted.marginals().items()},
+        covariance_relative={m: factor * c for m, c in fitted.relative_marginals().items()},
+    )
 
 
-def _edge_fits(fitted: PoseGraphFit) -> tuple[EdgeFit, ...]:
-    fits = []
-    for edge, (statistic, rank) in zip(fitted.edges, fitted.edges_judged(), strict=True):
-        a, b = fitted.corrections[edge.a], fitted.corrections[edge.b]
-        miss = b.inverse() @ a @ edge.b_from_a.inverse()
-        fits.append(
-            EdgeFit(
-                edge=edge,
-                distance_m=float(np.linalg.norm(miss.translation)),
-                chi_square=statistic,
-                redundancy=rank,
-                sigmas=equivalent_sigmas(statistic, rank),
-            )
-        )
-    return tuple(fits)
+def _likely(chi_square: float, degrees: int) -> bool:
+    return bool(chi2.sf(chi_square, degrees) >= _CHANCE)
 
 
-def _contradicting(
-    fitted: "PoseGraphFit", fits: Sequence[EdgeFit], options: PoseGraphOptions
-) -> EdgeFit | None:
+def _contradicting(fitted: PoseGraphFit, fits: Sequence[EdgeFit]) -> EdgeFit | None:
     """The edge that alone explains why the graph does not fit, if there is one."""
-    if fitted.degrees == 0 or chi2.sf(fitted.chi_square, fitted.degrees) >= options.contradiction_p:
-        return None
     checked = sorted((f for f in fits if f.redundancy), key=lambda f: -f.chi_square)
-    if not checked:
+    if fitted.degrees == 0 or _likely(fitted.chi_square, fitted.degrees) or not checked:
         return None
     worst = checked[0]
-    if chi2.sf(worst.chi_square, worst.redundancy) >= options.contradiction_p:
+    if _likely(worst.chi_square, worst.redundancy):
         return None
     rivals = [f.chi_square for f in checked[1:]] + [t for t, _ in fitted.priors_judged()]
     # Of two measurements of one loop the same part of chi-square goes with either.
-    alone = all(worst.chi_square > options.clear_lead * other for other in rivals)
-    rest = fitted.chi_square - worst.chi_square
-    clean = chi2.sf(rest, max(fitted.degrees - worst.redundancy, 1)) >= options.contradiction_p
-    others_clean = any(
-        chi2.sf(fitted.chi_square - other, max(fitted.degrees - 7, 1)) >= options.contradiction_p
-        for other in rivals
-    )
+    alone = all(worst.chi_square > _CLEAR_LEAD * other for other in rivals)
+    clean = _likely(fitted.chi_square - worst.chi_square, max(fitted.degrees - worst.redundancy, 1))
+    others_clean = any(_likely(fitted.chi_square - other, max(fitted.degrees - 7, 1)) for other in rivals)
     return worst if alone or (clean and not others_clean) else None
 
 
@@ -202,12 +163,9 @@ def _check(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
 
 def _anchored(nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> set[str]:
     """Maps with a chain of edges to an anchor."""
-    row = {node.map_id: i for i, node in enumerate(nodes)}
-    a, b = [row[e.a] for e in edges], [row[e.b] for e in edges]
-    graph = coo_array((np.ones(len(edges)), (a, b)), shape=(len(nodes), len(nodes)))
-    _, label = connected_components(graph, directed=False)
-    held = {int(label[i]) for i, node in enumerate(nodes) if node.prior is not None}
-    return {node.map_id for i, node in enumerate(nodes) if int(label[i]) in held}
+    labels = tied_together([node.map_id for node in nodes], [(e.a, e.b) for e in edges])
+    held = {label for node, label in zip(nodes, labels, strict=True) if node.prior is not None}
+    return {node.map_id for node, label in zip(nodes, labels, strict=True) if label in held}
 
 
 def equivalent_sigmas(chi_square: float, degrees: int) -> float:

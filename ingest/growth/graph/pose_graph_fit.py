@@ -1,21 +1,21 @@
 """The least squares behind a pose graph over maps: solution, marginal covariances, tests of measurements."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.linalg import expm
 from scipy.sparse import coo_array, csc_array, csr_array
 from scipy.sparse.linalg import splu
 
 from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import Sim3
-from ingest.growth.place.similarity_fit import left_jacobian
 
 # Standard deviations that nothing is known better than: log scale and radians, metres. They keep a covariance
 # of zero, an anchor that is the truth by decree, invertible.
 _FLOOR = np.diag(np.repeat([1e-9, 1e-6], [4, 3]) ** 2)
-_DENSE_MAPS = 150  # up to here the exact dense solver takes milliseconds; beyond, the iterative sparse one
+_ROUNDS, _HALVINGS, _SETTLED = 50, 8, 1e-6  # a step of so many sigmas is far below any
 _FREE = 1e-6  # a direction of an edge whose redundancy is smaller is not checked by anything
 
 
@@ -39,7 +39,6 @@ class GraphEdge:
     """A measured overlap of two maps at their present places.
 
     Attributes:
-        a, b: map ids.
         b_from_a: carries what map a says to where map b says it; graph's frame.
         covariance: (7, 7) of its left perturbation.
         shared: (7, 3) the part of it that all edges have in common: what they are off for one sigma of three
@@ -61,40 +60,58 @@ class GraphEdge:
 
 
 class PoseGraphFit:
-    """A graph solved by least squares, with what is needed to judge it.
+    """A graph solved by least squares, with what is needed to judge it; corrections are new_from_present."""
 
-    Attributes:
-        edges: of the maps that were solved.
-        corrections: new_from_present by map id.
-        chi_square, degrees: of the fit.
-    """
-
-    def __init__(
-        self,
-        nodes: Sequence[GraphNode],
-        edges: Sequence[GraphEdge],
-        places: Sequence[Sim3],
-        jacobian: csr_array,
-        residuals: FloatArray,
-    ) -> None:
-        self._nodes, self.edges = nodes, edges
-        self._rows = {node.map_id: i for i, node in enumerate(nodes)}
-        self._jacobian, self._residuals = jacobian, residuals
-        self.corrections = {node.map_id: place for node, place in zip(nodes, places, strict=True)}
-        self.chi_square = float(residuals @ residuals)
-        self.degrees = len(residuals) - 7 * len(nodes)
+    def __init__(self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> None:
+        self._nodes, self._rows = nodes, {node.map_id: i for i, node in enumerate(nodes)}
+        self.edges = [e for e in edges if e.a in self._rows and e.b in self._rows]
+        self._white = [_whitening(edge.covariance) for edge in self.edges]
+        self._anchors = [i for i, node in enumerate(nodes) if node.prior is not None]
+        places = self._solved()
+        self._residuals, self._jacobian = self._linearised(places)
+        self.corrections = dict(zip(self._rows, places, strict=True))
+        self.chi_square = float(self._residuals @ self._residuals)
+        self.degrees = len(self._residuals) - 7 * len(nodes)
         wanted = [(i, i) for i in range(len(nodes))]
-        wanted += [(self._rows[e.a], self._rows[e.b]) for e in edges]
-        self._blocks = _inverse_blocks(jacobian, wanted)
+        wanted += [(self._rows[e.a], self._rows[e.b]) for e in self.edges]
+        self._blocks = _inverse_blocks(self._jacobian, wanted)
 
-    @classmethod
-    def of(cls, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge]) -> "PoseGraphFit":
-        rows = {node.map_id: i for i, node in enumerate(nodes)}
-        held = [e for e in edges if e.a in rows and e.b in rows]
-        problem = _Problem(nodes, held, rows)
-        places = problem.solve()
-        residuals, jacobian = problem.linearise(places)
-        return cls(nodes, held, places, jacobian, residuals)
+    def _solved(self) -> list[Sim3]:
+        """Corrections by Gauss and Newton from the present places; a step that makes it worse is halved."""
+        places = [Sim3.identity() for _ in self._nodes]
+        for _ in range(_ROUNDS):
+            residuals, jacobian = self._linearised(places)
+            step = -_solver(jacobian)((jacobian.T @ residuals)[:, None])[:, 0]
+            if np.linalg.norm(jacobian @ step) < _SETTLED:
+                break
+            for _ in range(_HALVINGS):
+                parts = step.reshape(-1, 7)
+                tried = [Sim3.exp(part) @ place for part, place in zip(parts, places, strict=True)]
+                if np.linalg.norm(self._linearised(tried)[0]) < np.linalg.norm(residuals):
+                    places = tried
+                    break
+                step = step / 2.0
+            else:
+                break
+        return places
+
+    def _linearised(self, places: Sequence[Sim3]) -> tuple[FloatArray, csr_array]:
+        """Whitened residuals (7 m,) of edges and anchors' priors, derivatives by left perturbations."""
+        residuals: list[FloatArray] = []
+        blocks: list[tuple[int, int, FloatArray]] = []
+        for k, (edge, white) in enumerate(zip(self.edges, self._white, strict=True)):
+            a, b = self._rows[edge.a], self._rows[edge.b]
+            b_inverse = places[b].inverse()
+            miss = (b_inverse @ places[a] @ edge.b_from_a.inverse()).log()
+            along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
+            residuals.append(white @ miss)
+            blocks += [(k, a, along), (k, b, -along)]
+        for k, i in enumerate(self._anchors, start=len(self.edges)):
+            white = _whitening(self._nodes[i].prior)
+            miss = (places[i] @ self._nodes[i].present_from_own).log()
+            residuals.append(white @ miss)
+            blocks.append((k, i, white @ np.linalg.inv(left_jacobian(miss))))
+        return np.concatenate(residuals), _assemble(blocks, len(residuals), len(places))
 
     def edges_judged(self) -> list[tuple[float, int]]:
         """What each edge takes of chi-square, and in how many directions others check it."""
@@ -102,9 +119,7 @@ class PoseGraphFit:
 
     def priors_judged(self) -> list[tuple[float, int]]:
         """The same of each anchor's own placement."""
-        first = len(self.edges)
-        anchors = [i for i, node in enumerate(self._nodes) if node.prior is not None]
-        return [self._test(first + k, (i,)) for k, i in enumerate(anchors)]
+        return [self._test(k, (i,)) for k, i in enumerate(self._anchors, start=len(self.edges))]
 
     def marginals(self) -> dict[str, FloatArray]:
         """Covariance (7, 7) of each map's correction, with what edges have in common."""
@@ -132,7 +147,7 @@ class PoseGraphFit:
         """
         count = jacobian.shape[1] // 7
         together, apart = np.zeros((count, 7, 3)), np.zeros((count, 7, 7))
-        errors_of = {k: _whitening(e.covariance) @ e.shared for k, e in enumerate(self.edges)}
+        errors_of = {k: self._white[k] @ e.shared for k, e in enumerate(self.edges)}
         shared = {k: errors for k, errors in errors_of.items() if errors.any()}
         if not shared:
             return apart
@@ -150,16 +165,15 @@ class PoseGraphFit:
         rows = slice(7 * k, 7 * k + 7)
         columns = (7 * np.array(nodes)[:, None] + np.arange(7)).ravel()
         part = self._jacobian[rows][:, columns].toarray()
-        covariance = np.block([[_block(self._blocks, i, j) for j in nodes] for i in nodes])
+        blocks = self._blocks
+        covariance = np.block(
+            [[blocks[i, j] if (i, j) in blocks else blocks[j, i].T for j in nodes] for i in nodes]
+        )
         spread = np.eye(7) - part @ covariance @ part.T
         values, vectors = np.linalg.eigh(0.5 * (spread + spread.T))
         free = values > _FREE
         along = vectors[:, free].T @ self._residuals[rows]
         return float((along**2 / values[free]).sum()), int(free.sum())
-
-
-def _block(blocks: Mapping[tuple[int, int], FloatArray], i: int, j: int) -> FloatArray:
-    return blocks[i, j] if (i, j) in blocks else blocks[j, i].T
 
 
 def _inverse_blocks(
@@ -191,70 +205,6 @@ def _solver(jacobian: csr_array) -> Callable[[FloatArray], FloatArray]:
     return lambda right: np.asarray(scale[:, None] * solver.solve(scale[:, None] * right))
 
 
-class _Problem:
-    """Residuals and their derivatives: edges first, then the anchors' priors; each whitened."""
-
-    def __init__(
-        self, nodes: Sequence[GraphNode], edges: Sequence[GraphEdge], rows: Mapping[str, int]
-    ) -> None:
-        self._count = len(nodes)
-        self._edges = [(rows[e.a], rows[e.b], e.b_from_a.inverse(), _whitening(e.covariance)) for e in edges]
-        self._priors = [
-            (i, n.present_from_own, _whitening(n.prior)) for i, n in enumerate(nodes) if n.prior is not None
-        ]
-
-    def solve(self) -> list[Sim3]:
-        """Corrections; started from the present places, then once more from where that ends."""
-        places = [Sim3.identity() for _ in range(self._count)]
-        exact = self._count <= _DENSE_MAPS
-        for _ in range(2):  # the second round confirms, in a tangent that is about the answer
-            start = list(places)
-            found = least_squares(
-                self._residuals,
-                np.zeros(7 * self._count),
-                jac=self._jacobian,
-                args=(start, exact),
-                x_scale="jac",
-                tr_solver="exact" if exact else "lsmr",
-                # Whitened: a step of 1e-9 of the corrections, or 1e-12 of chi-square, is far below any sigma.
-                xtol=1e-9,
-                ftol=1e-12,
-                gtol=1e-9,
-                max_nfev=50,
-            )
-            places = self._moved(start, found.x)
-        return places
-
-    def linearise(self, places: Sequence[Sim3]) -> tuple[FloatArray, csr_array]:
-        """Whitened residuals (7 m,) and their derivatives by left perturbations of the corrections."""
-        residuals: list[FloatArray] = []
-        blocks: list[tuple[int, int, FloatArray]] = []
-        for k, (a, b, measured_inverse, white) in enumerate(self._edges):
-            b_inverse = places[b].inverse()
-            miss = (b_inverse @ places[a] @ measured_inverse).log()
-            along = white @ np.linalg.solve(left_jacobian(miss), b_inverse.adjoint())
-            residuals.append(white @ miss)
-            blocks += [(k, a, along), (k, b, -along)]
-        for k, (i, present_from_own, white) in enumerate(self._priors, start=len(self._edges)):
-            miss = (places[i] @ present_from_own).log()
-            residuals.append(white @ miss)
-            blocks.append((k, i, white @ np.linalg.inv(left_jacobian(miss))))
-        return np.concatenate(residuals), _assemble(blocks, len(residuals), self._count)
-
-    def _residuals(self, x: FloatArray, start: Sequence[Sim3], dense: bool) -> FloatArray:
-        return self.linearise(self._moved(start, x))[0]
-
-    def _jacobian(self, x: FloatArray, start: Sequence[Sim3], dense: bool) -> "FloatArray | csr_array":
-        """Derivatives by the tangent about `start`."""
-        _, by_place = self.linearise(self._moved(start, x))
-        turns = [(i, i, left_jacobian(part)) for i, part in enumerate(x.reshape(-1, 7))]
-        jacobian = csr_array(by_place @ _assemble(turns, self._count, self._count))
-        return jacobian.toarray() if dense else jacobian
-
-    def _moved(self, start: Sequence[Sim3], x: FloatArray) -> list[Sim3]:
-        return [Sim3.exp(part) @ place for part, place in zip(x.reshape(-1, 7), start, strict=True)]
-
-
 def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns: int) -> csr_array:
     """A sparse matrix of (7, 7) blocks."""
     inner = np.arange(7)
@@ -264,6 +214,28 @@ def _assemble(blocks: Sequence[tuple[int, int, FloatArray]], rows: int, columns:
     return csr_array(coo_array((value, (row, column)), shape=(7 * rows, 7 * columns)))
 
 
-def _whitening(covariance: FloatArray) -> FloatArray:
+def _whitening(covariance: FloatArray | None) -> FloatArray:
     """W (7, 7) with W C W^T = I."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance + _FLOOR)), dtype=np.float64)
+
+
+def small_adjoint(tangent: FloatArray) -> FloatArray:
+    """(7, 7) matrix of the Lie bracket with (sigma, omega, nu), the derivative of Sim3.adjoint."""
+    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
+    ad = np.zeros((7, 7))
+    ad[1:4, 1:4] = skew(omega)
+    ad[4:, 0] = -nu
+    ad[4:, 1:4] = skew(nu)
+    ad[4:, 4:] = sigma * np.eye(3) + skew(omega)
+    return ad
+
+
+def left_jacobian(tangent: FloatArray) -> FloatArray:
+    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
+
+    The integral of exp(t ad) over t in [0, 1]: the corner of one matrix exponential (Van Loan 1978).
+    """
+    both = np.zeros((14, 14))
+    both[:7, :7] = small_adjoint(tangent)
+    both[:7, 7:] = np.eye(7)
+    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

@@ -1,7 +1,8 @@
 """A new anchor re-places what was grown: overlaps measured, graph solved, all maps moved in one commit."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,48 +11,41 @@ import numpy as np
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
-from featuredb.maps.feature_map import FeatureMap, MapStatus
-from featuredb.maps.lineage import GROWTH
+from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import covariance_in_frame, in_frame, move_map
 from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
+from featuredb.store.commits import write_time
+from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.graph.map_graph import (
     OWN,
     PlacedMap,
-    StoredEdge,
     family,
     graph_edges,
     graph_nodes,
+    holds,
     in_graph,
     place_of,
     placed_maps,
 )
-from ingest.growth.graph.new_overlaps import NewOverlaps, measure_new, overlaps_to_measure
-from ingest.growth.graph.pose_graph import GraphSolution, PoseGraphOptions, solve_pose_graph
-from ingest.growth.map_places import drift_m, growth_of, inflated, places_of
-from ingest.growth.place.overlaps import OverlapOptions
-from ingest.growth.trust.canaries import CanaryCheck, CanaryOptions, CanaryRun, check_known
+from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
+from ingest.growth.map_places import drift_m, growth_of, inflated, places_of, with_growth
+from ingest.growth.place.localised import QUERY
+from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.trust.canaries import CanaryCheck, CanaryRun, check_known
+from ingest.growth.trust.promotion import PARENT_MOVED
+from ingest.growth.values import Edge
+from ingest.workspace import read_json, write_json
 from reloc.localiser import Localiser
 
-# Said of maps whose parent was placed anew, see featuredb.store.changes.
-_FLAG = "was placed anew"
+_LOG = logging.getLogger(__name__)
+_GAP_M = 5.0  # boxes of a grown map and a new anchor that come this close are looked at for an overlap
+_LEAST_MOVE_M = 0.01  # anchors that would move by less stay where they are
 _SAME_M = 1e-6  # an answer that moves by less was not touched
+_VERSION = "2"  # raised when overlaps are measured otherwise
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReplaceOptions:
-    """How maps are re-placed.
-
-    Attributes:
-        gap_m: boxes of a grown map and a new anchor that come this close are looked at for an overlap.
-        min_move_m: anchors that would move by less stay where they are, and maps are not committed anew.
-    """
-
-    gap_m: float = 5.0
-    min_move_m: float = 0.01
-    canaries: CanaryOptions = field(default_factory=CanaryOptions)
-    overlap: OverlapOptions = field(default_factory=OverlapOptions)
-    graph: PoseGraphOptions = field(default_factory=PoseGraphOptions)
+Edges = Mapping[str, Sequence[Edge]]
+"""New overlaps, by the map whose evidence will have them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +70,7 @@ class Replacement:
     Attributes:
         reason: None, the pose graph's, or CANARY; `message` for people. Nothing was committed where there
             is one.
-        version: of the database since; -1 where nothing was committed.
-        moved: all maps that were committed anew.
+        version: of the database since, or -1. moved: all maps that were committed anew.
         measured: what was said of each new overlap, "map - anchor: ...".
         left_out: overlaps that contradict the rest.
         flagged: maps that are quarantined now, because they hang on a moved one by no overlap that holds.
@@ -92,143 +85,157 @@ class Replacement:
     flagged: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        return {
-            "reason": self.reason,
-            "message": self.message,
-            "version": self.version,
-            "moved": [
-                {
-                    "map_id": m.map_id,
-                    "move_m": round(m.move_m, 4),
-                    "drift_before_m": m.drift_before_m,
-                    "drift_m": round(m.drift_m, 4),
-                }
-                for m in self.moved
-            ],
-            "measured": list(self.measured),
-            "left_out": list(self.left_out),
-            "flagged": list(self.flagged),
-        }
+        return asdict(self)
 
 
-def replace_descendants(
-    database: Database, work: Path, options: ReplaceOptions | None = None, *, budget_m: float
-) -> Replacement | None:
-    """Look for new anchors and anchors placed anew around grown maps, and re-place the maps by them.
-
-    Returns:
-        None where there is nothing new.
+def replace_descendants(database: Database, work: Path, *, budget_m: float) -> Replacement | None:
+    """Look for new anchors and anchors placed anew around grown maps, re-place the maps by them; or None.
 
     Raises:
         ConflictError: someone else changed one of the maps meanwhile; nothing has changed.
         StoreError
     """
-    options = options or ReplaceOptions()
     snapshot = database.snapshot()
     maps = placed_maps(snapshot)
-    wanted = overlaps_to_measure(maps, options.gap_m)
-    if not wanted:
+    edges, notes = _measured(snapshot, maps, overlaps_to_measure(maps), work)
+    if not edges:
         return None
-    measured = measure_new(snapshot, maps, wanted, work, options.overlap)
-    if not measured.edges:
-        return None
-    members = _members(maps, measured)
+    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
+    pairs += [(m, e.map_id) for m, own in edges.items() for e in own]
+    members = sorted(family(maps, pairs, edges))
     frame = next(maps[m].frame for m in members if maps[m].is_anchor)
-    solution = _solve(maps, members, measured, frame, options)
-    left_out = tuple(str(fit.edge) for fit in solution.left_out)
+    new = [in_graph(m, e, maps[m].frame, frame) for m, own in edges.items() for e in own]
+    known = graph_edges(maps, members, frame)
+    solution = solve_pose_graph(graph_nodes(maps, members, frame), [*known, *new])
+    told = Replacement(
+        reason=solution.reason,
+        message=solution.message,
+        measured=notes,
+        left_out=tuple(str(fit.edge) for fit in solution.left_out),
+    )
     if solution.reason is not None:
-        return Replacement(
-            reason=solution.reason, message=solution.message, measured=measured.notes, left_out=left_out
-        )
-    return _commit(database, snapshot, maps, measured, solution, frame, options, budget_m)
+        return told
+    moved, reports = _moved(snapshot, maps, edges, solution, frame, budget_m)
+    canaries = ask_persons_canaries(database, {m.map_id: m for m in moved})
+    if canaries.regressions:
+        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.message}")
+    ids = [m.map_id for m in moved]
+    results = database.commit_maps(
+        moved, replaces=ids, based_on={map_id: maps[map_id].write_id for map_id in ids}
+    )
+    return replace(
+        told,
+        message=f"{len(moved)} maps placed anew: {solution.message}",
+        version=max(r.version for r in results),
+        moved=tuple(reports),
+        flagged=tuple(sorted({m for r in results for m in r.flagged})),
+    )
 
 
-def _members(maps: Mapping[str, PlacedMap], measured: NewOverlaps) -> list[str]:
-    """All maps that the new overlaps have a say in."""
-    pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if _holds(maps, e)]
-    pairs += [(m, e.map_id) for m, edges in measured.edges.items() for e in edges]
-    return sorted(family(maps, pairs, measured.edges))
+def overlaps_to_measure(maps: Mapping[str, PlacedMap]) -> list[tuple[str, str]]:
+    """Pairs of a grown map and a map that may hold it: parents placed anew, and anchors that came later."""
+    pairs: set[tuple[str, str]] = set()
+    anchors = [m for m in maps.values() if m.is_anchor and m.status == "active"]
+    for me in maps.values():
+        if me.is_anchor:
+            continue
+        places = {edge.map_id: edge.place for edge in me.edges}
+        pairs |= {(me.map_id, m) for m, place in places.items() if m in maps and maps[m].place != place}
+        for anchor in anchors:
+            later = write_time(anchor.write_id) > write_time(me.write_id)
+            if anchor.map_id not in places and later and _touch(me, anchor):
+                pairs.add((me.map_id, anchor.map_id))
+    return sorted(pairs)
 
 
-def _holds(maps: Mapping[str, PlacedMap], edge: StoredEdge) -> bool:
-    return edge.map_id in maps and maps[edge.map_id].place == edge.place
+def _touch(a: PlacedMap, b: PlacedMap) -> bool:
+    if not len(a.corners) or not len(b.corners):
+        return False
+    other = a.frame.enu_from(b.frame).act(b.corners)
+    low, high = a.corners.min(axis=0)[:2] - _GAP_M, a.corners.max(axis=0)[:2] + _GAP_M
+    return bool((other.min(axis=0)[:2] <= high).all() and (low <= other.max(axis=0)[:2]).all())
 
 
-def _solve(
-    maps: Mapping[str, PlacedMap],
-    members: list[str],
-    measured: NewOverlaps,
-    frame: LocalFrame,
-    options: ReplaceOptions,
-) -> GraphSolution:
-    known = [edge for _, edge in graph_edges(maps, members, frame)]
-    new = [in_graph(m, e, maps[m].frame, frame) for m, edges in measured.edges.items() for e in edges]
-    return solve_pose_graph(graph_nodes(maps, members, frame), [*known, *new], options.graph)
+def _measured(
+    snapshot: Snapshot, maps: Mapping[str, PlacedMap], wanted: Sequence[tuple[str, str]], work: Path
+) -> tuple[Edges, tuple[str, ...]]:
+    """New overlaps, and a note on each that was looked for; kept in the work folder."""
+    loaded: dict[str, FeatureMap] = {}
+    edges: dict[str, list[Edge]] = {}
+    notes: list[str] = []
+    for map_id, other_id in wanted:
+        asked = options_fingerprint(QUERY)
+        key = digest(_VERSION, asked, map_id, maps[map_id].place, other_id, maps[other_id].place)
+        cache = work / "overlaps" / f"{key[:24]}.json"
+        if not cache.is_file():
+            for m in (map_id, other_id):
+                loaded[m] = loaded.get(m) or snapshot.load_map(m)
+            found = measure_overlap(loaded[map_id], loaded[other_id])
+            known: dict[str, Any] = {"edge": None}
+            if isinstance(found, Edge):
+                known["edge"] = replace(found, place=maps[other_id].place).as_json()
+                known["note"] = f"{found.photos} images and {found.shared_points} points in common"
+            else:
+                known["note"] = found.message
+            write_json(cache, known)
+        said = read_json(cache)
+        notes.append(f"{map_id} - {other_id}: {said['note']}")
+        if said["edge"] is not None:
+            edges.setdefault(map_id, []).append(Edge.from_json(said["edge"]))
+    if notes:
+        _LOG.info("overlaps: %s", "; ".join(notes))
+    return edges, tuple(notes)
 
 
-def _commit(
-    database: Database,
+def _moved(
     snapshot: Snapshot,
     maps: Mapping[str, PlacedMap],
-    measured: NewOverlaps,
+    new_edges: Edges,
     solution: GraphSolution,
     frame: LocalFrame,
-    options: ReplaceOptions,
     budget_m: float,
-) -> Replacement:
+) -> tuple[list[FeatureMap], list[MovedMap]]:
+    """The maps at their new places, and what is said of each."""
     moved: dict[str, FeatureMap] = {}
     ways: dict[str, float] = {}
     corrections: dict[str, Sim3] = {}
     for map_id, correction in solution.corrections.items():
-        own = in_frame(correction, frame, maps[map_id].frame)
-        ways[map_id] = _way(own, maps[map_id].corners)
-        if maps[map_id].is_anchor and ways[map_id] < options.min_move_m:
+        before = maps[map_id]
+        own = in_frame(correction, frame, before.frame)
+        corners = before.corners if len(before.corners) else np.zeros((1, 3))
+        ways[map_id] = float(np.linalg.norm(own.act(corners) - corners, axis=1).max())
+        if before.is_anchor and ways[map_id] < _LEAST_MOVE_M:
             own = Sim3.identity()
         else:
-            covariance = covariance_in_frame(solution.covariance[map_id], frame, maps[map_id].frame)
+            covariance = covariance_in_frame(solution.covariance[map_id], frame, before.frame)
             there = move_map(snapshot.load_map(map_id), own, covariance=covariance)
-            moved[map_id] = there if maps[map_id].is_anchor else inflated(there)
+            moved[map_id] = there if before.is_anchor else inflated(there)
         corrections[map_id] = own
     places = {m: place_of(moved[m]) if m in moved else maps[m].place for m in solution.corrections}
     contradicting = {(fit.edge.a, fit.edge.b) for fit in solution.left_out}
     new, reports = [], []
     for map_id, feature_map in moved.items():
+        before = maps[map_id]
         edges = [
             _carried(e, map_id, maps, corrections, places)
-            for e in [*(e for e in maps[map_id].edges if _holds(maps, e)), *measured.edges.get(map_id, [])]
+            for e in (*(e for e in before.edges if holds(maps, e)), *new_edges.get(map_id, ()))
             if (map_id, e.map_id) not in contradicting and e.map_id in corrections
         ]
-        finished, drift = _with_evidence(feature_map, maps[map_id], edges, solution, frame, budget_m)
-        finished = replace(finished, status=_status(maps[map_id], drift, budget_m))
-        new.append(finished)
-        before = growth_of(maps[map_id].evidence).get("drift_m")
-        reports.append(MovedMap(map_id=map_id, move_m=ways[map_id], drift_before_m=before, drift_m=drift))
-    new = _with_generations(new, maps)
-    canaries = ask_persons_canaries(database, {m.map_id: m for m in new}, options.canaries)
-    if canaries.regressions:
-        return Replacement(
-            reason="CANARY",
-            message=f"nothing is moved: {canaries.message}",
-            measured=measured.notes,
-            left_out=tuple(str(fit.edge) for fit in solution.left_out),
+        finished, drift = _with_evidence(feature_map, before, edges, solution, frame, budget_m)
+        # Active maps stay so; those that were quarantined for their parent's sake are active again.
+        again = PARENT_MOVED in before.status_reason and drift <= budget_m
+        active = before.status == "active" or again
+        new.append(replace(finished, status="active" if active else "quarantined"))
+        drifted = growth_of(before.evidence).get("drift_m")
+        reports.append(
+            MovedMap(
+                map_id=map_id, move_m=round(ways[map_id], 4), drift_before_m=drifted, drift_m=round(drift, 4)
+            )
         )
-    results = database.commit_maps(
-        new, replaces=[m.map_id for m in new], based_on={m.map_id: maps[m.map_id].write_id for m in new}
-    )
-    return Replacement(
-        reason=None,
-        message=f"{len(new)} maps placed anew: {solution.message}",
-        version=max(r.version for r in results),
-        moved=tuple(reports),
-        measured=measured.notes,
-        left_out=tuple(str(fit.edge) for fit in solution.left_out),
-        flagged=tuple(sorted({m for r in results for m in r.flagged})),
-    )
+    return _with_generations(new, maps), reports
 
 
-def ask_persons_canaries(
-    database: Database, new: Mapping[str, FeatureMap], options: CanaryOptions
-) -> CanaryRun:
+def ask_persons_canaries(database: Database, new: Mapping[str, FeatureMap]) -> CanaryRun:
     """The known queries that a person vouches for, before and after maps move.
 
     Images of the maps move along, and so do remembered answers. Where someone knows the truth, an answer that
@@ -240,8 +247,8 @@ def ask_persons_canaries(
         return CanaryRun(checks=(), note="no known queries")
     before = Localiser.open(database)
     after = Localiser.open(database, previous=before, instead=new)
-    checks = [check_known(database, canary, before, after, options) for canary in known]
-    return CanaryRun(checks=tuple(_judged(check) for check in checks), note=f"{len(known)} known queries")
+    checks = tuple(_judged(check_known(database, canary, before, after)) for canary in known)
+    return CanaryRun(checks=checks, note=f"{len(known)} known queries")
 
 
 def _judged(check: CanaryCheck) -> CanaryCheck:
@@ -252,26 +259,22 @@ def _judged(check: CanaryCheck) -> CanaryCheck:
     return replace(check, regression=f"{check.error_m:.2f} m off, once the maps have moved")
 
 
-def _way(move: Sim3, corners: FloatArray) -> float:
-    places = corners if len(corners) else np.zeros((1, 3))
-    return float(np.linalg.norm(move.act(places) - places, axis=1).max())
-
-
 def _carried(
-    edge: StoredEdge,
+    edge: Edge,
     map_id: str,
     maps: Mapping[str, PlacedMap],
     corrections: Mapping[str, Sim3],
     places: Mapping[str, str],
-) -> StoredEdge:
+) -> Edge:
     """An overlap in the coordinates of the new places: Z' = X_other Z X_map^-1."""
     other = in_frame(corrections[edge.map_id], maps[edge.map_id].frame, maps[map_id].frame)
     adjoint = other.adjoint()
+    covariance: FloatArray = adjoint @ edge.covariance @ adjoint.T
     return replace(
         edge,
         place=places[edge.map_id],
         other_from_map=other @ edge.other_from_map @ corrections[map_id].inverse(),
-        covariance=_symmetric(adjoint @ edge.covariance @ adjoint.T),
+        covariance=0.5 * (covariance + covariance.T),
         shared=adjoint @ edge.shared,
     )
 
@@ -279,40 +282,31 @@ def _carried(
 def _with_evidence(
     feature_map: FeatureMap,
     before: PlacedMap,
-    edges: list[StoredEdge],
+    edges: list[Edge],
     solution: GraphSolution,
     frame: LocalFrame,
     budget_m: float,
 ) -> tuple[FeatureMap, float]:
-    """The moved map with its new covariance, drift and overlaps; and its drift."""
+    """The moved map with its drift, overlaps and parents; and its drift."""
     map_id, own = feature_map.map_id, feature_map.frame
     relative = covariance_in_frame(solution.covariance_relative[map_id], frame, own)
     drift = drift_m(relative, places_of(feature_map))
-    growth = growth_of(feature_map.placement.evidence)
     if before.is_anchor:
-        total = in_frame(solution.corrections[map_id], frame, own) @ before.present_from_own
-        growth[OWN] = {
-            "covariance": before.own_covariance.ravel().tolist(),
-            "present_from_own": total.log().tolist(),
-        }
-    else:
-        growth |= {
-            "drift_m": round(drift, 6),
-            "budget_m": budget_m,
-            "covariance_relative": relative.ravel().tolist(),
-            "edges": [edge.as_json() for edge in edges],
-        }
-    placement = replace(
-        feature_map.placement,
-        evidence={**feature_map.placement.evidence, GROWTH: growth},
+        covariance, present_from_own = before.own_placement
+        total = in_frame(solution.corrections[map_id], frame, own) @ present_from_own
+        placed = {"covariance": covariance.ravel().tolist(), "present_from_own": total.log().tolist()}
+        return with_growth(feature_map, **{OWN: placed}), drift
+    noted = with_growth(
+        feature_map,
+        drift_m=round(drift, 6),
+        budget_m=budget_m,
+        covariance_relative=relative.ravel().tolist(),
+        edges=[edge.as_json() for edge in edges],
     )
-    parents = before.parents
-    if not before.is_anchor:
-        held = tuple(dict.fromkeys(edge.map_id for edge in edges))
-        kept = tuple(m for m in before.parents if m in held)
-        # Only anchors join the parents: a map never becomes its own ancestor.
-        parents = (*kept, *(m for m in held if m not in kept)) or before.parents
-    return replace(feature_map, placement=placement, parents=parents), drift
+    held = tuple(dict.fromkeys(edge.map_id for edge in edges))
+    kept = tuple(m for m in before.parents if m in held)
+    # Only anchors join the parents: a map never becomes its own ancestor.
+    return replace(noted, parents=(*kept, *(m for m in held if m not in kept)) or before.parents), drift
 
 
 def _with_generations(new: list[FeatureMap], maps: Mapping[str, PlacedMap]) -> list[FeatureMap]:
@@ -322,14 +316,3 @@ def _with_generations(new: list[FeatureMap], maps: Mapping[str, PlacedMap]) -> l
         for map_id, of in parents.items():
             generation[map_id] = 1 + max(generation.get(p, 0) for p in of)
     return [replace(m, generation=generation[m.map_id]) for m in new]
-
-
-def _status(before: PlacedMap, drift: float, budget_m: float) -> MapStatus:
-    """Active maps stay so; those that were quarantined for their parent's sake are active again."""
-    if before.status == "active":
-        return "active"
-    return "active" if _FLAG in before.status_reason and drift <= budget_m else "quarantined"
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)

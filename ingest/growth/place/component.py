@@ -2,27 +2,24 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import Area
 from featuredb.maps.error_modes import without_modes
-from featuredb.maps.feature_map import FeatureMap, Placement
+from featuredb.maps.feature_map import Placement
 from featuredb.maps.lineage import GROWTH
 from ingest.colmap.bridge import Model
-from ingest.growth.map_places import drift_m, places_of
+from ingest.growth import gates
+from ingest.growth.map_places import drift_m, growth_of, places_of
 from ingest.growth.place.correspondences import Correspondences, find_correspondences
-from ingest.growth.place.localised import LocaliseEachOptions, in_frame, with_lens
-from ingest.growth.place.parents import drift_covariance, map_agreements
-from ingest.growth.place.placement import PlacementOptions, SupportedPlacement, place_by_maps
-from ingest.growth.place.refine import adopt_lenses
-from ingest.growth.place.refinement import RefinementOptions, refine_placed
-from ingest.growth.values import FeaturesOf, GrownMap, LocalisedPhoto, MapsPlacement, Refused
+from ingest.growth.place.localised import in_frame, with_lens
+from ingest.growth.place.placement import map_agreements, parents_covariance, place_by_maps
+from ingest.growth.place.refine import Refinement, adopt_lenses, refine_placed
+from ingest.growth.values import LEAST_PHOTOS, FeaturesOf, GrownMap, LocalisedPhoto, Refused
 from ingest.map_builder import MapIdentity, MapOptions, build_map
 from ingest.photos.photo import Photo
 from ingest.sfm.links import connected_parts, keep_photos
@@ -30,23 +27,14 @@ from reloc.localise.candidates import IndexedArea
 
 _LOG = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GrowOptions:
-    """From a reconstruction to a map.
-
-    Attributes:
-        placement, refinement: the steps.
-        localise: how poses are found again with the lenses of the reconstruction.
-        maps: what goes into the map; the height datum is that of the parents. Points of two photos carry
-            descriptors: a handful of photos has hardly longer tracks, and the next photo needs them to be
-            localised.
-    """
-
-    placement: PlacementOptions = field(default_factory=PlacementOptions)
-    refinement: RefinementOptions = field(default_factory=RefinementOptions)
-    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
-    maps: MapOptions = field(default_factory=lambda: MapOptions(min_track_length=2))
+# Points of two photos carry descriptors: a handful of photos has hardly longer tracks, and the next photo
+# needs them to be localised.
+_MAPS = MapOptions(min_track_length=2)
+# What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until
+# the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
+# whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
+# confirm them: twelve photos promoted 277 m off.
+AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
 
 
 def grow_component(
@@ -56,7 +44,7 @@ def grow_component(
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
-    options: GrowOptions | None = None,
+    max_bound_m: float = 0.5,
 ) -> GrownMap | Refused:
     """Place a reconstruction by the existing maps, refine it with their points held fixed, build its map.
 
@@ -66,14 +54,14 @@ def grow_component(
         model: a connected reconstruction; its rows are rows of `photos`.
         localised: new photos that the maps localise, by row; others than the model's are ignored.
         areas: of the active maps, as `localised` had them.
-        identity: of the new map.
+        max_bound_m: photos that may be further off (95 %) are left out.
 
     Returns:
         The map, or a refusal. What no step foresaw is a refusal, too (FAILED): it costs this reconstruction
         and not the others of the run, nor the next run.
     """
     try:
-        return _grown(model, photos, features_of, localised, areas, identity, options or GrowOptions())
+        return _grown(model, photos, features_of, localised, areas, identity, max_bound_m)
     except (ArithmeticError, LookupError, RuntimeError, ValueError) as error:
         rows = tuple(int(r) for r in model.rows)
         _LOG.exception("a reconstruction of %d photos (%s ...)", len(rows), photos[rows[0]].name)
@@ -88,68 +76,28 @@ def _grown(
     localised: Mapping[int, LocalisedPhoto],
     areas: Sequence[IndexedArea],
     identity: MapIdentity,
-    options: GrowOptions,
+    max_bound_m: float,
 ) -> GrownMap | Refused:
     rows = tuple(int(r) for r in model.rows)
     mine = {r: localised[r] for r in rows if r in localised}
     if not mine:
-        return Refused(
-            reason="NOT_LOCALISED", message=f"none of {len(rows)} photos is localised by a map", rows=rows
-        )
+        message = f"none of {len(rows)} photos is localised by a map"
+        return Refused(reason="NOT_LOCALISED", message=message, rows=rows)
     frame, near = _meeting_place(mine, areas)
     mine = {r: in_frame(photo, frame) for r, photo in mine.items()}
     keypoints = [features_of(r).features.xy.astype(np.float64) for r in rows]
-    model, lenses = adopt_lenses(model, mine, photos, near, keypoints, options.refinement.refine)
-    mine, correspondences, held = _placed(model, mine, keypoints, photos, near, frame, options)
+    model, lenses = adopt_lenses(model, mine, photos, near, keypoints)
+    camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
+    mine = {r: with_lens(photo, model.cameras[camera_of[r]]) for r, photo in mine.items()}
+    correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
+    held = place_by_maps(model, mine, correspondences, photos, near, frame)
     placement = held.placement
-    if placement.reason is not None or placement.local_from_sfm is None:
-        return Refused(
-            reason=placement.reason or "", message=placement.message, rows=rows, gates=placement.gates
-        )
-    refined = refine_placed(
-        model, held, correspondences, mine, keypoints, lenses, options.placement, options.refinement
-    )
+    if placement.reason is not None:
+        return Refused(reason=placement.reason, message=placement.message, rows=rows, gates=placement.gates)
+    refined = refine_placed(model, held, correspondences, mine, keypoints, lenses, max_bound_m)
     if isinstance(refined, Refused):
         return refined
-    final, more = refined.placement, refined.evidence()
-    grown = assemble(refined.model, final, held, photos, features_of, near, identity, options, more)
-    if isinstance(grown, Refused):
-        return grown
-    return replace(
-        grown,
-        feature_map=_with_covariances(grown.feature_map, refined.spread.poses),
-        left_out=refined.left_out,
-    )
-
-
-def _placed(
-    model: Model,
-    localised: Mapping[int, LocalisedPhoto],
-    keypoints: Sequence[FloatArray],
-    photos: Sequence[Photo],
-    areas: Sequence[Area],
-    frame: LocalFrame,
-    options: GrowOptions,
-) -> tuple[dict[int, LocalisedPhoto], Correspondences, SupportedPlacement]:
-    """The photos' own poses by the model's lenses, all correspondences, and the placement."""
-    rows = model.rows.tolist()
-    camera_of = dict(zip(rows, model.camera_of.tolist(), strict=True))
-    mine = {r: with_lens(p, model.cameras[camera_of[r]], options.localise) for r, p in localised.items()}
-    correspondences = find_correspondences(model, mine, dict(zip(rows, keypoints, strict=True)))
-    return (
-        mine,
-        correspondences,
-        place_by_maps(model, mine, correspondences, photos, areas, frame, options.placement),
-    )
-
-
-def _with_covariances(feature_map: FeatureMap, spread: FloatArray) -> FeatureMap:
-    """The map whose images know what their lenses leave open; as they were where nothing is known."""
-    images = tuple(
-        replace(image, covariance=own) if np.isfinite(own).all() else image
-        for image, own in zip(feature_map.images, spread, strict=True)
-    )
-    return replace(feature_map, images=images, provenance=without_modes(feature_map.provenance))
+    return _assembled(refined, correspondences.take(held.used), photos, features_of, near, identity)
 
 
 def _meeting_place(
@@ -160,48 +108,37 @@ def _meeting_place(
     for photo in localised.values():
         inliers[photo.frame] = inliers.get(photo.frame, 0) + len(photo.pixels)
     frame = max(inliers, key=lambda f: inliers[f])
-    main = next(a.area for a in areas if a.area.frame == frame)
-    datum = main.maps[0].height_datum
+    datum = next(a.area for a in areas if a.area.frame == frame).maps[0].height_datum
     return frame, [a.area for a in areas if a.area.maps[0].height_datum == datum]
 
 
-def assemble(
-    model: Model,
-    placement: MapsPlacement,
-    held: SupportedPlacement,
+def _assembled(
+    refined: Refinement,
+    held: Correspondences,
     photos: Sequence[Photo],
     features_of: FeaturesOf,
     areas: Sequence[Area],
     identity: MapIdentity,
-    options: GrowOptions,
-    more: Mapping[str, Any] | None = None,
 ) -> GrownMap | Refused:
-    """The map of a refined model, with what growth knows about it as evidence.
-
-    Args:
-        model: in metres, in the placement's frame.
-        more: further evidence of growth.
-    """
+    """The map of a refined model held by these correspondences, with what growth knows of it as evidence."""
+    model, placement = refined.model, refined.placement
     maps = {m.map_id: m for area in areas for m in area.maps}
     parents = [(maps[e.map_id], e.shared_points) for e in placement.edges]
-    assert placement.covariance is not None
-    assert placement.covariance_relative is not None
-    to_anchors = placement.covariance_relative + drift_covariance(parents, placement.frame)
+    to_anchors = placement.covariance_relative + parents_covariance(parents, placement.frame, relative=True)
     rows = tuple(int(r) for r in model.rows)
-    chosen = [photos[r] for r in rows]
     feature_map = build_map(
         model,
         Placement(
             method="map",
             local_from_sfm=Sim3.identity(),  # the model is in metres, in the frame, since its refinement
-            covariance=placement.covariance,
+            covariance=placement.covariance_relative + placement.on_earth,
             residual_rms_m=placement.residual_rms_m,
         ),
         placement.frame,
-        chosen,
+        [photos[r] for r in rows],
         [features_of(r) for r in rows],
         identity,
-        replace(options.maps, height_datum=parents[0][0].height_datum),
+        replace(_MAPS, height_datum=parents[0][0].height_datum),
     )
     if feature_map is None:
         return Refused(
@@ -210,62 +147,34 @@ def assemble(
             rows=rows,
             gates=placement.gates,
         )
-    agreements = map_agreements(placement, held.correspondences.take(np.flatnonzero(held.used)))
     growth = {
         "drift_m": drift_m(to_anchors, places_of(feature_map)),
-        "steps": 1 + max(_steps(m) for m, _ in parents),
-        "anchors": sorted({a for m, _ in parents for a in _anchors_of(m)}),
+        "steps": 1 + max(int(growth_of(m.placement.evidence).get("steps", 0)) for m, _ in parents),
         "covariance_relative": to_anchors.ravel().tolist(),
-        "edges": [
-            {
-                "map_id": e.map_id,
-                "parent_from_new": e.parent_from_new.log().tolist(),
-                "covariance": e.covariance.ravel().tolist(),
-                "shared_points": e.shared_points,
-                "photos": e.photos,
-            }
-            for e in placement.edges
-        ],
-        "agreeing_photos": [photos[r].name for r in placement.agreeing],
-        "disagreeing_photos": [photos[r].name for r in placement.disagreeing],
-        "agreements": [
-            {
-                "maps": [a.map_a, a.map_b],
-                "distance_m": a.distance_m,
-                "sigma_m": a.sigma_m,
-                "sigmas": a.sigmas,
-                "text": str(a),
-            }
-            for a in agreements
-        ],
-        "gates": placement.figures(),
-        **(more or {}),
+        "gates": gates.figures(placement.gates),
+        "bending_m": refined.bending_m,
+        "shared_turn": refined.shared_turn.ravel().tolist(),
     }
+    images = tuple(  # they know what their lenses leave open; as they were where nothing is known
+        replace(image, covariance=own) if np.isfinite(own).all() else image
+        for image, own in zip(feature_map.images, refined.poses, strict=True)
+    )
     grown = replace(
         feature_map,
         status="quarantined",
         generation=1 + max(m.generation for m, _ in parents),
         parents=placement.parents,
         placement=replace(feature_map.placement, evidence={GROWTH: growth}),
+        images=images,
+        provenance=without_modes(feature_map.provenance),
     )
-    return GrownMap(feature_map=grown, placement=placement, model=model, agreements=agreements)
-
-
-def _steps(feature_map: FeatureMap) -> int:
-    return int(feature_map.placement.evidence.get(GROWTH, {}).get("steps", 0))
-
-
-def _anchors_of(feature_map: FeatureMap) -> list[str]:
-    named = feature_map.placement.evidence.get(GROWTH, {}).get("anchors")
-    return list(named) if named else [feature_map.map_id]
-
-
-# What a reconstruction is refused for whose photos are at several places. Not CONTRADICTS_GPS: to cut until
-# the geotags of a part agree is to choose the photos of whoever lies. Of a block copied elsewhere, half of
-# whose tags were at its twin, the parts with those tags were left over, small enough for one forged photo to
-# confirm them: twelve photos promoted 277 m off.
-AT_SEVERAL_PLACES = ("PHOTOS_DISAGREE", "RESIDUALS", "NOT_VISIBLE")
-_LEAST_PHOTOS = 3
+    return GrownMap(
+        feature_map=grown,
+        placement=placement,
+        model=model,
+        agreements=map_agreements(placement, held),
+        left_out=refined.left_out,
+    )
 
 
 def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]] | None:
@@ -277,7 +186,7 @@ def split(model: Model, links: Sequence[float]) -> tuple[float, list[Model]] | N
         parts = connected_parts(model, level)
         if len(parts) > 1:
             kept = [
-                keep_photos(model, rows, least=_LEAST_PHOTOS) for rows in parts if len(rows) >= _LEAST_PHOTOS
+                keep_photos(model, rows, least=LEAST_PHOTOS) for rows in parts if len(rows) >= LEAST_PHOTOS
             ]
             return level, [part for part in kept if part is not None]
     return None

@@ -7,14 +7,12 @@ differs contradicts.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from featuredb.geometry.rigid3 import Rigid3
 from featuredb.geometry.rotation import so3_log
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
@@ -25,28 +23,7 @@ from ingest.growth.values import LocalisedPhoto
 # What the focal length of a localisation may be off, one sigma. A photo at the rim of a map sees it in a
 # corner, and turns a lens that is 0.5 % off into half a metre and half a degree, where its pixels say 0.1 m.
 # `brighton`'s lens is off by 1.3 %.
-FOCAL_REL = 0.01
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ContradictionOptions:
-    """When a photo contradicts.
-
-    Attributes:
-        sigmas: between its localised and its refined pose. They are those of the localisation, times the
-            spread and the neighbours factor of the similarity, those of the refined pose, and what the lens
-            that it was localised with makes where the refined one is another. Spread and
-            factor are the larger ones of before and after the refinement: poses from the same existing points
-            share their errors, which the refined model has taken over.
-    """
-
-    sigmas: float = 3.0
-
-
-def pose_offset(pose: Rigid3, photo: LocalisedPhoto) -> FloatArray:
-    """(6,) small rotation (rad) and displacement (m) from a pose to the localised one, local axes."""
-    turn = so3_log(photo.cam_from_local.rotation.T @ pose.rotation)
-    return np.concatenate([turn, photo.cam_from_local.center - pose.center])
+_FOCAL_REL = 0.01
 
 
 def contradicting_photos(
@@ -54,9 +31,13 @@ def contradicting_photos(
     localised: Mapping[int, LocalisedPhoto],
     spread: FloatArray,
     fits: Sequence[FittedSimilarity],
-    options: ContradictionOptions,
 ) -> dict[int, str]:
     """Photos of the model whose own localisation is elsewhere, by their place in it, with the figures.
+
+    The sigmas are those of the localisation, times the spread and the neighbours factor of the similarity,
+    those of the refined pose, and what the lens that it was localised with makes where the refined one is
+    another. Spread and factor are the larger ones of before and after the refinement: poses from the same
+    existing points share their errors, which the refined model has taken over.
 
     Args:
         model: refined, in metres.
@@ -64,14 +45,15 @@ def contradicting_photos(
         spread: (k, 6, 6) of `PhotoSpread`; unknown ones (NaN) add nothing.
         fits: of the model to the existing points, as it came and refined.
     """
-    limit = gates.sigmas_limit(options.sigmas, 6)
+    limit = gates.sigmas_limit(6)
     dilution = max(max(fit.spread, 1.0) ** 2 * fit.neighbours_factor for fit in fits)
     found: dict[int, str] = {}
     for k, photo in sorted(localised.items()):
-        pose = model.cam_from_sfm[k]
-        offset = pose_offset(pose, photo)
+        pose, own_pose = model.cam_from_sfm[k], photo.cam_from_local
+        turn = so3_log(own_pose.rotation.T @ pose.rotation)
+        offset = np.concatenate([turn, own_pose.center - pose.center])
         into_local = block_diag(pose.rotation.T, pose.rotation.T)
-        by_focal = pose_by_focal(photo) * FOCAL_REL
+        by_focal = pose_by_focal(photo) * _FOCAL_REL
         by_lens = pose_by_lens(photo, model.cameras[int(model.camera_of[k])])
         lenses = np.outer(by_focal, by_focal) + np.outer(by_lens, by_lens)
         own = into_local @ (np.nan_to_num(spread[k]) + lenses) @ into_local.T
@@ -87,7 +69,7 @@ def contradicting_photos(
 
 def center_variance_m2(photo: LocalisedPhoto) -> float:
     """Of a localised centre, all axes together, with what its focal length may be off."""
-    moved = pose_by_focal(photo)[3:] * FOCAL_REL
+    moved = pose_by_focal(photo)[3:] * _FOCAL_REL
     return float(np.trace(photo.covariance[3:, 3:]) + moved @ moved)
 
 

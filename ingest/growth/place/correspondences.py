@@ -1,7 +1,8 @@
 """Correspondences: pixels of a new reconstruction's photos in which points of existing maps are seen."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,18 +44,7 @@ class Correspondences:
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Correspondences":
         """The correspondences of the given rows."""
-        return Correspondences(
-            map_ids=self.map_ids,
-            photo_of=self.photo_of[rows],
-            feature=self.feature[rows],
-            pixels=self.pixels[rows],
-            points=self.points[rows],
-            covariance=self.covariance[rows],
-            map_of=self.map_of[rows],
-            point_of=self.point_of[rows],
-            model_point=self.model_point[rows],
-            carried=self.carried[rows],
-        )
+        return replace(self, **{name: getattr(self, name)[rows] for name in _COLUMNS})
 
     def existing(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """One of each existing point (first row), and the number (m,) of each one's point."""
@@ -63,110 +53,21 @@ class Correspondences:
         return first, number.reshape(-1)
 
 
+_COLUMNS = Correspondences.__slots__[1:]
+
+
 def find_correspondences(
     model: Model, localised: Mapping[int, LocalisedPhoto], keypoints: Mapping[int, FloatArray]
 ) -> Correspondences:
-    """Correspondences of a model's photos, own and carried along its tracks.
+    """Correspondences of a model's photos, own and carried along its tracks; photos are in one frame.
 
     Args:
-        localised: by row of the photos, all in one frame.
         keypoints: pixels (n, 2) of all features of the model's photos, by row.
     """
-    map_ids = tuple(sorted({m for r in model.rows if int(r) in localised for m in localised[int(r)].map_ids}))
-    own = _own(model, localised, map_ids)
-    carried = _carried(model, own, keypoints)
-    return _concatenate(own, carried)
-
-
-def _own(model: Model, localised: Mapping[int, LocalisedPhoto], map_ids: tuple[str, ...]) -> Correspondences:
-    parts: list[Correspondences] = []
-    for k, row in enumerate(model.rows.tolist()):
-        photo = localised.get(row)
-        if photo is None:
-            continue
-        number = np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)
-        seen = model.photo_of == k
-        point_of_feature = dict(
-            zip(model.keypoint_of[seen].tolist(), model.point_of[seen].tolist(), strict=True)
-        )
-        count = len(photo.feature_rows)
-        parts.append(
-            Correspondences(
-                map_ids=map_ids,
-                photo_of=np.full(count, k, dtype=np.int64),
-                feature=photo.feature_rows,
-                pixels=photo.pixels,
-                points=photo.points,
-                covariance=photo.point_covariance,
-                map_of=number[photo.map_of],
-                point_of=photo.point_of,
-                model_point=np.array(
-                    [point_of_feature.get(f, -1) for f in photo.feature_rows.tolist()], dtype=np.int64
-                ).reshape(-1),
-                carried=np.zeros(count, dtype=np.bool_),
-            )
-        )
-    return _concatenate(*parts) if parts else _empty(map_ids)
-
-
-def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatArray]) -> Correspondences:
-    """Where more than half of a track's matches with one map name one point, its other photos see it too."""
-    linked = np.flatnonzero(own.model_point >= 0)
-    if not len(linked):
-        return _empty(own.map_ids)
-    triple = np.stack([own.model_point[linked], own.map_of[linked], own.point_of[linked]], axis=1)
-    links, first, votes = np.unique(triple, axis=0, return_index=True, return_counts=True)
-    pair, number = np.unique(links[:, :2], axis=0, return_inverse=True)
-    total = np.bincount(number.reshape(-1), weights=votes, minlength=len(pair))
-    sure = votes > 0.5 * total[number.reshape(-1)]
-    links, example = links[sure], linked[first[sure]]
-    start = np.searchsorted(model.point_of, np.arange(len(model.xyz) + 1))
-    have = set(zip(own.photo_of.tolist(), own.feature.tolist(), own.map_of.tolist(), strict=True))
-    found: list[int] = []
-    source: list[int] = []
-    for (point, map_row, _), row in zip(links.tolist(), example.tolist(), strict=True):
-        for o in range(int(start[point]), int(start[point + 1])):
-            if (int(model.photo_of[o]), int(model.keypoint_of[o]), map_row) not in have:
-                found.append(o)
-                source.append(row)
-    seen, s = np.array(found, dtype=np.int64), np.array(source, dtype=np.int64)
-    photo_of = model.photo_of[seen]
-    pixels = np.zeros((len(seen), 2))
-    for k in np.unique(photo_of):
-        mine = photo_of == k
-        pixels[mine] = keypoints[int(model.rows[k])][model.keypoint_of[seen[mine]]]
-    return Correspondences(
-        map_ids=own.map_ids,
-        photo_of=photo_of,
-        feature=model.keypoint_of[seen],
-        pixels=pixels,
-        points=own.points[s],
-        covariance=own.covariance[s],
-        map_of=own.map_of[s],
-        point_of=own.point_of[s],
-        model_point=model.point_of[seen],
-        carried=np.ones(len(seen), dtype=np.bool_),
-    )
-
-
-def _concatenate(*parts: Correspondences) -> Correspondences:
-    return Correspondences(
-        map_ids=parts[0].map_ids,
-        photo_of=np.concatenate([p.photo_of for p in parts]),
-        feature=np.concatenate([p.feature for p in parts]),
-        pixels=np.concatenate([p.pixels for p in parts]),
-        points=np.concatenate([p.points for p in parts]),
-        covariance=np.concatenate([p.covariance for p in parts]),
-        map_of=np.concatenate([p.map_of for p in parts]),
-        point_of=np.concatenate([p.point_of for p in parts]),
-        model_point=np.concatenate([p.model_point for p in parts]),
-        carried=np.concatenate([p.carried for p in parts]),
-    )
-
-
-def _empty(map_ids: tuple[str, ...]) -> Correspondences:
+    mine = {k: localised[r] for k, r in enumerate(model.rows.tolist()) if r in localised}
+    map_ids = tuple(sorted({m for photo in mine.values() for m in photo.map_ids}))
     none = np.zeros(0, dtype=np.int64)
-    return Correspondences(
+    nothing = Correspondences(
         map_ids=map_ids,
         photo_of=none,
         feature=none,
@@ -177,4 +78,62 @@ def _empty(map_ids: tuple[str, ...]) -> Correspondences:
         point_of=none,
         model_point=none,
         carried=np.zeros(0, dtype=np.bool_),
+    )
+    own = _joined(nothing, *(_own(model, k, photo, map_ids) for k, photo in mine.items()))
+    return _joined(own, _carried(model, own, keypoints))
+
+
+def _joined(*parts: Correspondences) -> Correspondences:
+    columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in _COLUMNS}
+    return replace(parts[0], **columns)
+
+
+def _own(model: Model, k: int, photo: LocalisedPhoto, map_ids: tuple[str, ...]) -> Correspondences:
+    number = np.array([map_ids.index(m) for m in photo.map_ids], dtype=np.int64)
+    seen = model.photo_of == k
+    points = dict(zip(model.keypoint_of[seen].tolist(), model.point_of[seen].tolist(), strict=True))
+    return Correspondences(
+        map_ids=map_ids,
+        photo_of=np.full(len(photo.feature_rows), k, dtype=np.int64),
+        feature=photo.feature_rows,
+        pixels=photo.pixels,
+        points=photo.points,
+        covariance=photo.point_covariance,
+        map_of=number[photo.map_of],
+        point_of=photo.point_of,
+        model_point=np.array([points.get(f, -1) for f in photo.feature_rows.tolist()], dtype=np.int64),
+        carried=np.zeros(len(photo.feature_rows), dtype=np.bool_),
+    )
+
+
+def _carried(model: Model, own: Correspondences, keypoints: Mapping[int, FloatArray]) -> Correspondences:
+    """Where more than half of a track's matches with one map name one point, its other photos see it too."""
+    linked = np.flatnonzero(own.model_point >= 0)
+    triple = np.stack([own.model_point[linked], own.map_of[linked], own.point_of[linked]], axis=1)
+    links, first, votes = np.unique(triple, axis=0, return_index=True, return_counts=True)
+    pair, number = np.unique(links[:, :2], axis=0, return_inverse=True)
+    total = np.bincount(number.reshape(-1), weights=votes, minlength=len(pair))
+    sure = votes > 0.5 * total[number.reshape(-1)]
+    links, example = links[sure], linked[first[sure]]
+    start = np.searchsorted(model.point_of, np.arange(len(model.xyz) + 1))
+    have = set(zip(own.photo_of.tolist(), own.feature.tolist(), own.map_of.tolist(), strict=True))
+    found = [
+        (o, row)
+        for (point, map_row, _), row in zip(links.tolist(), example.tolist(), strict=True)
+        for o in range(int(start[point]), int(start[point + 1]))
+        if (int(model.photo_of[o]), int(model.keypoint_of[o]), map_row) not in have
+    ]
+    seen, source = np.array(found, dtype=np.int64).reshape(-1, 2).T
+    photo_of, feature = model.photo_of[seen], model.keypoint_of[seen]
+    pixels = np.zeros((len(seen), 2))
+    for k in np.unique(photo_of):
+        mine = photo_of == k
+        pixels[mine] = keypoints[int(model.rows[k])][feature[mine]]
+    return replace(
+        own.take(source),
+        photo_of=photo_of,
+        feature=feature,
+        pixels=pixels,
+        model_point=model.point_of[seen],
+        carried=np.ones(len(seen), dtype=np.bool_),
     )

@@ -19,33 +19,17 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import skew
 from featuredb.geometry.sim3 import point_jacobian
 from ingest.colmap.adjust import longest_side, residuals_of
-from ingest.colmap.anchored import (
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    block_and_marks,
-)
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, block_and_marks
 from ingest.colmap.bridge import Model, with_observations
 from ingest.colmap.precision import design_effect
 
 _LEAST_FREEDOM = 0.1
 _PIECE = 5  # photos; a photo alone says more of its own noise than of where its neighbourhood looks
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DriftOptions:
-    """How the bending is judged.
-
-    Attributes:
-        least_px: of the standard deviation of an observation with what its neighbours share; it is measured
-            on the residuals, which a handful of observations keeps too small.
-        max_photos: of more, the rest is taken to be no worse; the equations are dense.
-        max_points: free points that take part; fewer know less, so the bound stays one.
-    """
-
-    least_px: float = 0.1
-    max_photos: int = 300
-    max_points: int = 20_000
+# Of the standard deviation of an observation with what its neighbours share; it is measured on the residuals,
+# which a handful of observations keeps too small.
+_LEAST_PX = 0.1
+_MOST_PHOTOS = 300  # of more, nothing is said; the equations are dense
+_MOST_POINTS = 20_000  # free points that take part; fewer know less, so the bound stays one
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -54,7 +38,7 @@ class PhotoSpread:
 
     Attributes:
         poses: (k, 6, 6) of the left perturbation of each cam_from_local; NaN for photos that see nothing, and
-            for all where there are more than `DriftOptions.max_photos`.
+            for all where there are more than `_MOST_PHOTOS`.
         turns: (k, 3, 3) radians squared, about the local axes: how the piece of the model around each photo
             may be turned: the mean rotation of the photo and those that share most points with it. What comes
             next is tied to such a piece. NaN as before.
@@ -66,13 +50,6 @@ class PhotoSpread:
     turns: FloatArray
     lens_turns: FloatArray
 
-    def of(self, rows: Sequence[int]) -> "PhotoSpread":
-        """Of some of the photos."""
-        chosen = list(rows)
-        return PhotoSpread(
-            poses=self.poses[chosen], turns=self.turns[chosen], lens_turns=self.lens_turns[chosen]
-        )
-
 
 def photo_covariances(
     model: Model,
@@ -81,7 +58,6 @@ def photo_covariances(
     kept: NDArray[np.bool_],
     lenses: Lenses,
     adjust: AnchoredOptions,
-    options: DriftOptions,
 ) -> PhotoSpread:
     """Of all photos, relative to the existing points.
 
@@ -101,13 +77,13 @@ def photo_covariances(
         turns=np.full((count, 3, 3), np.nan),
         lens_turns=np.full((count, 3, 3), np.nan),
     )
-    if count > options.max_photos or not kept.any():
+    if count > _MOST_PHOTOS or not kept.any():
         return spread
-    model = _thinned(model, options)
+    model = _thinned(model)
     everything = np.ones(len(model.point_of), dtype=np.bool_)
     block, marks = block_and_marks(model, everything, keypoints, fixed, kept)
     dilution = adjust.mapping.dilution
-    sigma_px = float(np.sqrt(_variance_px2(block, marks, options)))
+    sigma_px = float(np.sqrt(_variance_px2(block, marks)))
     terms = Terms(
         keypoint_px=sigma_px,
         dilution=dilution,
@@ -151,22 +127,22 @@ def _view_turns(block: Block, found: Marginals) -> FloatArray:
     return result
 
 
-def _variance_px2(block: Block, marks: Marks, options: DriftOptions) -> float:
+def _variance_px2(block: Block, marks: Marks) -> float:
     """Of an observation, with what its neighbours share and what points and poses take up of it."""
     count = 2.0 * (len(block.point_of) + len(marks.xyz))
     taken = 3 * len(block.xyz) + 6 * len(block.names)
     freedom = max(1.0 - taken / count, _LEAST_FREEDOM)
     residuals, pixels, photo_of = residuals_of(block, marks)
     shared = design_effect(residuals, pixels, photo_of, longest_side(block.cameras))
-    return max(float((residuals**2).mean()) * shared / freedom, options.least_px**2)
+    return max(float((residuals**2).mean()) * shared / freedom, _LEAST_PX**2)
 
 
-def _thinned(model: Model, options: DriftOptions) -> Model:
+def _thinned(model: Model) -> Model:
     """The model with at most so many points, evenly chosen."""
-    if len(model.xyz) <= options.max_points:
+    if len(model.xyz) <= _MOST_POINTS:
         return model
     chosen = np.zeros(len(model.xyz), dtype=np.bool_)
-    chosen[np.linspace(0, len(model.xyz) - 1, options.max_points).astype(np.int64)] = True
+    chosen[np.linspace(0, len(model.xyz) - 1, _MOST_POINTS).astype(np.int64)] = True
     return with_observations(model, chosen[model.point_of])
 
 

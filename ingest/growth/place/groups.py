@@ -6,52 +6,25 @@ localised photo is never enough.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
-from ingest.colmap.anchored import (
-    AnchoredOptions,
-    FixedPoints,
-    Lenses,
-    adjust_anchored,
-    triangulate_posed,
-)
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored, triangulate_posed
 from ingest.colmap.bridge import Model, SfmPhoto, TwoView, verify_pair
 from ingest.growth.place.localised import in_frame
-from ingest.growth.values import FeaturesOf, LocalisedPhoto
+from ingest.growth.values import TOLERANCE_PX, FeaturesOf, LocalisedPhoto, pixel_scale, tied_together
 from ingest.sfm.matching import MatchOptions, mutual_matches
 
-_REFERENCE_SIDE_PX = 1600.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GroupOptions:
-    """When two localised photos vouch for each other.
-
-    Attributes:
-        partners: photos that each one is compared with, those first that share most existing points.
-        max_features: of each photo, strongest and best spread first.
-        matching: and verification of pairs, as for reconstruction.
-        tolerance_px: of a match against the two poses, at images of 1600 pixels: two poses, each good to
-            the 4 px of their inliers.
-        min_fitting: share of a pair's verified matches that must fit the poses.
-        min_angle_deg: median angle between the rays. Below, any two photos from one spot fit, and two copies
-            of one picture.
-    """
-
-    partners: int = 6
-    max_features: int = 6000
-    matching: MatchOptions = field(default_factory=MatchOptions)
-    tolerance_px: float = 8.0
-    min_fitting: float = 0.7
-    min_angle_deg: float = 1.0
+_PARTNERS = 6  # photos that each one is compared with, those first that share most existing points
+_MOST_FEATURES = 6000  # of each photo, strongest and best spread first
+_LEAST_FITTING = 0.7  # share of a pair's verified matches that must fit the poses
+# Median between the rays. Below, any two photos from one spot fit, and two copies of one picture.
+_LEAST_ANGLE_DEG = 1.0
+_MATCHING = MatchOptions()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,28 +32,27 @@ class PairCheck:
     """What two photos say of each other's poses.
 
     Attributes:
-        pair: their rows.
         verified: matches with a two-view geometry of their own.
         fitting: share of these that fits the two poses.
         angle_deg: median angle between the rays of those that fit.
     """
 
-    pair: tuple[int, int]
     verified: int
     fitting: float
     angle_deg: float
 
-    def agrees(self, options: GroupOptions) -> bool:
+    @property
+    def agrees(self) -> bool:
         """Whether the pair bears the two poses out."""
         return (
-            self.verified >= options.matching.min_inliers
-            and self.fitting >= options.min_fitting
-            and self.angle_deg >= options.min_angle_deg
+            self.verified >= _MATCHING.min_inliers
+            and self.fitting >= _LEAST_FITTING
+            and self.angle_deg >= _LEAST_ANGLE_DEG
         )
 
 
 def lone_groups(
-    localised: Mapping[int, LocalisedPhoto], features_of: FeaturesOf, options: GroupOptions | None = None
+    localised: Mapping[int, LocalisedPhoto], features_of: FeaturesOf
 ) -> tuple[list[Model], dict[int, str]]:
     """Groups among localised photos that no reconstruction holds, and for those in none the reason.
 
@@ -91,19 +63,20 @@ def lone_groups(
         A model of each group, of its matches alone, with the lenses of the localisations and near their
         poses; its rows are those of the photos.
     """
-    options = options or GroupOptions()
     if not localised:
         return [], {}
     frame = next(iter(localised.values())).frame
     photos = {r: in_frame(p, frame) for r, p in sorted(localised.items())}
     geometries: dict[tuple[int, int], TwoView] = {}
-    for pair in candidate_pairs(photos, options):
-        view = _verified(photos, pair, features_of, options)
-        if check_pair(photos[pair[0]], photos[pair[1]], view, features_of, options).agrees(options):
-            geometries[pair] = view
+    for a, b in _candidate_pairs(photos):
+        view = _verified(photos[a], photos[b], features_of)
+        if _check_pair(photos[a], photos[b], view, features_of).agrees:
+            geometries[a, b] = view
     reasons = dict.fromkeys(photos, "ALONE: no other photo bears its pose out")
     groups: list[Model] = []
-    for rows in _connected(sorted(photos), list(geometries)):
+    group_of = dict(zip(photos, tied_together(list(photos), geometries), strict=True))
+    for group in sorted(set(group_of.values())):
+        rows = [r for r in photos if group_of[r] == group]
         if len(rows) >= 2:
             own = {pair: view for pair, view in geometries.items() if pair[0] in rows}
             groups.append(_triangulated(rows, photos, own, features_of))
@@ -112,7 +85,7 @@ def lone_groups(
     return groups, reasons
 
 
-def candidate_pairs(photos: Mapping[int, LocalisedPhoto], options: GroupOptions) -> list[tuple[int, int]]:
+def _candidate_pairs(photos: Mapping[int, LocalisedPhoto]) -> list[tuple[int, int]]:
     """Pairs that share existing points or look at the same place, most shared first."""
     seen = {
         r: {(p.map_ids[m], q) for m, q in zip(p.map_of.tolist(), p.point_of.tolist(), strict=True)}
@@ -126,60 +99,43 @@ def candidate_pairs(photos: Mapping[int, LocalisedPhoto], options: GroupOptions)
     pairs: set[tuple[int, int]] = set()
     for r in photos:
         scores = []
-        for other in photos:
-            if other == r:
-                continue
+        for other in photos.keys() - {r}:
             shared = len(seen[r] & seen[other])
             gap = float(np.linalg.norm(scene[r] - scene[other]))
             if shared or gap < 0.5 * min(reach[r], reach[other]):
                 scores.append((-shared, gap, other))
-        for _, _, other in sorted(scores)[: options.partners]:
-            pairs.add((min(r, other), max(r, other)))
+        pairs |= {(min(r, other), max(r, other)) for _, _, other in sorted(scores)[:_PARTNERS]}
     return sorted(pairs)
 
 
-def _verified(
-    photos: Mapping[int, LocalisedPhoto],
-    pair: tuple[int, int],
-    features_of: FeaturesOf,
-    options: GroupOptions,
-) -> TwoView:
+def _verified(a: LocalisedPhoto, b: LocalisedPhoto, features_of: FeaturesOf) -> TwoView:
     """Two-view geometry of the pair; the lenses are those of the localisations, no pose takes part."""
-    a, b = (features_of(r).features for r in pair)
-    count = options.max_features
-    matches = mutual_matches(a.descriptors[:count], b.descriptors[:count], options.matching)
-    side = max(a.width, a.height, b.width, b.height)
+    one, two = features_of(a.row).features, features_of(b.row).features
+    matches = mutual_matches(one.descriptors[:_MOST_FEATURES], two.descriptors[:_MOST_FEATURES], _MATCHING)
     return verify_pair(
-        photos[pair[0]].camera,
-        a.xy,
-        photos[pair[1]].camera,
-        b.xy,
+        a.camera,
+        one.xy,
+        b.camera,
+        two.xy,
         matches,
         focal_known=True,
-        max_error_px=options.matching.max_error_px * max(1.0, side / _REFERENCE_SIDE_PX),
-        seed=options.matching.seed,
+        max_error_px=_MATCHING.max_error_px * pixel_scale(a.camera, b.camera),
+        seed=_MATCHING.seed,
     )
 
 
-def check_pair(
-    a: LocalisedPhoto, b: LocalisedPhoto, view: TwoView, features_of: FeaturesOf, options: GroupOptions
-) -> PairCheck:
+def _check_pair(a: LocalisedPhoto, b: LocalisedPhoto, view: TwoView, features_of: FeaturesOf) -> PairCheck:
     """How far a pair's verified matches fit the two localised poses, both in one frame."""
     pixels_a = features_of(a.row).features.xy[view.inliers[:, 0]].astype(np.float64)
     pixels_b = features_of(b.row).features.xy[view.inliers[:, 1]].astype(np.float64)
     if not len(pixels_a):
-        return PairCheck(pair=(a.row, b.row), verified=0, fitting=0.0, angle_deg=0.0)
+        return PairCheck(verified=0, fitting=0.0, angle_deg=0.0)
     points, angle = intersections(a.camera, a.cam_from_local, pixels_a, b.camera, b.cam_from_local, pixels_b)
     fits = np.ones(len(points), dtype=np.bool_)
-    for camera, pose, pixels in (
-        (a.camera, a.cam_from_local, pixels_a),
-        (b.camera, b.cam_from_local, pixels_b),
-    ):
-        error = np.linalg.norm(camera.project(pose.act(points)) - pixels, axis=1)
-        limit = options.tolerance_px * max(1.0, max(camera.width, camera.height) / _REFERENCE_SIDE_PX)
-        fits &= np.where(np.isfinite(error), error, np.inf) < limit
+    for photo, pixels in ((a, pixels_a), (b, pixels_b)):
+        error = np.linalg.norm(photo.camera.project(photo.cam_from_local.act(points)) - pixels, axis=1)
+        fits &= np.nan_to_num(error, nan=np.inf) < TOLERANCE_PX * pixel_scale(photo.camera)
     return PairCheck(
-        pair=(a.row, b.row),
         verified=len(points),
         fitting=float(fits.mean()),
         angle_deg=float(np.median(np.degrees(angle[fits]))) if fits.any() else 0.0,
@@ -213,15 +169,6 @@ def _rays(camera: Camera, pose: Rigid3, pixels: FloatArray) -> FloatArray:
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def _connected(rows: Sequence[int], pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    place = {r: k for k, r in enumerate(rows)}
-    a: NDArray[np.int64] = np.array([place[p] for p, _ in pairs], dtype=np.int64)
-    b: NDArray[np.int64] = np.array([place[q] for _, q in pairs], dtype=np.int64)
-    graph = coo_array((np.ones(len(a)), (a, b)), shape=(len(rows), len(rows)))
-    count, label = connected_components(graph, directed=False)
-    return [tuple(r for r, of in zip(rows, label, strict=True) if of == c) for c in range(count)]
-
-
 def _triangulated(
     rows: Sequence[int],
     photos: Mapping[int, LocalisedPhoto],
@@ -237,9 +184,7 @@ def _triangulated(
     cameras = list(dict.fromkeys(photos[r].camera for r in rows))
     sfm = [
         SfmPhoto(
-            name=str(r),
-            camera_row=cameras.index(photos[r].camera),
-            keypoints=features_of(r).features.xy,
+            name=str(r), camera_row=cameras.index(photos[r].camera), keypoints=features_of(r).features.xy
         )
         for r in rows
     ]

@@ -1,7 +1,13 @@
-"""Step: the reconstruction adjusted, around lenses of existing maps, with their points where they are."""
+"""Step: a placed reconstruction is adjusted to the existing points, and photos that do not hold are left out.
 
+The lenses of existing maps are adopted before. Photos are left out that contradict the placement before or
+after, that hang on the others by little, and that may be further off than allowed; the others are adjusted
+without them, and say anew how sure they are.
+"""
+
+from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,23 +24,55 @@ from ingest.colmap.anchored import (
     adjust_anchored,
 )
 from ingest.colmap.bridge import Model, with_observations
+from ingest.growth import gates
+from ingest.growth.map_places import SIGMAS_95
+from ingest.growth.place.contradictions import contradicting_photos
 from ingest.growth.place.correspondences import Correspondences
-from ingest.growth.values import LocalisedPhoto
+from ingest.growth.place.drift import (
+    bending_variance_m2,
+    center_covariances,
+    photo_covariances,
+    shared_turn,
+    turning_covariance,
+)
+from ingest.growth.place.placement import SupportedPlacement, edges_of
+from ingest.growth.place.similarity_fit import fit_similarity
+from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto, MapsPlacement, Refused, pixel_scale
 from ingest.photos.photo import Photo
+from ingest.sfm.links import bottleneck_share, select_photos
+
+# Reasons of photos that nothing holds well enough, and of those that their own localisation has elsewhere.
+_LOOSE, _CONTRADICTS = "DRIFT_BUDGET", "CONTRADICTS"
+_SHOWS_LITTLE = "the photo shows too little of what existing maps say it should show from where it would be"
+_ELSEWHERE = "the photo by itself sees existing points elsewhere than the others put it"
+# `bottleneck_share` that photos need which are not localised themselves. In simulated communities photos tied
+# to look-alike halls, 68 and 78 m off, had 0.15 and 0.04; right photos nearly all 0.46 and more, single ones
+# 0.14. Those wait, and are localised by themselves once their neighbours are in an active map.
+_LEAST_LINK = 0.25
+_ROUNDS = 4  # of leaving photos out; the others are adjusted without them
+_ADJUST = AnchoredOptions()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RefineOptions:
-    """How existing points and lenses hold a new reconstruction.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Refinement:
+    """A refined reconstruction.
 
     Attributes:
-        max_point_sigma_px: existing points whose own uncertainty, seen from the new photo, is larger do
-            not hold it (at images of 1600 pixels): twice the inlier tolerance of a pose.
-        adjust: the adjustment itself.
+        model: of the photos that are kept, in metres, in the placement's frame; existing points that at least
+            two of them see are its own.
+        placement: with the gates asked here and the covariances of the refined model.
+        poses: (k, 6, 6) of `PhotoSpread`, of the photos that are kept.
+        bending_m: what the photos' positions lack beyond the similarity, one sigma along the worst axis.
+        shared_turn: (7, 3) of `drift.shared_turn`.
+        left_out: photos that are not kept although they agree, by row, with reason and message.
     """
 
-    max_point_sigma_px: float = 8.0
-    adjust: AnchoredOptions = field(default_factory=AnchoredOptions)
+    model: Model
+    placement: MapsPlacement
+    poses: FloatArray
+    bending_m: float
+    shared_turn: FloatArray
+    left_out: Mapping[int, tuple[str, str]]
 
 
 def adopt_lenses(
@@ -43,7 +81,6 @@ def adopt_lenses(
     photos: Sequence[Photo],
     areas: Sequence[Area],
     keypoints: Sequence[FloatArray],
-    options: RefineOptions,
 ) -> tuple[Model, Lenses]:
     """The model adjusted, in its own frame, around the lenses that existing maps have for its cameras.
 
@@ -53,78 +90,157 @@ def adopt_lenses(
         keypoints: pixels of all features of the model's photos, in the order of its rows.
     """
     lent: dict[int, Camera] = {}
+    focals: dict[int, float] = {}
     for c, camera in enumerate(model.cameras):
         rows = model.rows[model.camera_of == c].tolist()
         lens = _lens_of_maps([localised[r] for r in rows if r in localised])
         lens = lens or _lens_for_key({photos[r].camera_key for r in rows}, areas)
         if lens is not None and (lens.width, lens.height) == (camera.width, camera.height):
             lent[c] = lens
-    lenses = Lenses(lent=lent, focal_px=exif_focals(model, photos))
+        told = {photos[r].focal_px for r in rows}
+        focal_px = told.pop() if len(told) == 1 else None  # none where EXIF tells several
+        if focal_px is not None:
+            focals[c] = focal_px
+    lenses = Lenses(lent=lent, focal_px=focals)
     if not lent:
         return model, lenses
     given = replace(model, cameras=tuple(lent.get(c, own) for c, own in enumerate(model.cameras)))
-    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses, options.adjust).model, lenses
+    return adjust_anchored(given, keypoints, FixedPoints.none(), lenses, _ADJUST).model, lenses
 
 
 def _lens_of_maps(photos: Sequence[LocalisedPhoto]) -> Camera | None:
     """The lens that a map lent to most of these photos; None where none did."""
-    lent: dict[Camera, int] = {}
-    for photo in photos:
-        if photo.result.pose is not None and photo.result.pose.camera_source == "map":
-            lent[photo.camera] = lent.get(photo.camera, 0) + 1
-    return max(lent, key=lambda camera: lent[camera]) if lent else None
+    lent = Counter(p.camera for p in photos if p.result.pose and p.result.pose.camera_source == "map")
+    return lent.most_common(1)[0][0] if lent else None
 
 
 def _lens_for_key(keys: set[str], areas: Sequence[Area]) -> Camera | None:
     """The lens that the areas have for a camera's EXIF key, the first area's first."""
-    if len(keys) != 1:
-        return None
-    key = keys.pop()
+    key = keys.pop() if len(keys) == 1 else ""
     found = (area.camera_for_key(key) for area in areas) if key else iter(())
     return next((camera for camera in found if camera is not None), None)
 
 
-def refine_with_maps(
+def refine_placed(
     model: Model,
-    local_from_sfm: Sim3,
+    held: SupportedPlacement,
     correspondences: Correspondences,
-    lenses: Lenses,
+    localised: Mapping[int, LocalisedPhoto],
     keypoints: Sequence[FloatArray],
-    options: RefineOptions,
-) -> tuple[Anchored, FixedPoints, NDArray[np.int64]]:
-    """The model in the local frame, metres, adjusted with the existing points that it sees held fixed.
+    lenses: Lenses,
+    max_bound_m: float,
+) -> Refinement | Refused:
+    """Refine an accepted placement with the existing points held fixed.
 
     Args:
-        correspondences: those that agree with the placement.
-
-    Returns:
-        The adjusted model, the fixed points with their observations, and for each of these (m,) its row of
-        the correspondences.
+        localised: the model's photos that the existing maps localise, by row.
+        keypoints: pixels of all features of the model's photos, in the order of its rows.
+        max_bound_m: photos that may be further off (95 %), against the existing points and with what their
+            lens leaves open, are left out: a photo hangs on its neighbours by a corner sometimes.
     """
-    placed = in_metres(model, local_from_sfm)
-    sharp = np.flatnonzero(_sigma_px(placed, correspondences) <= options.max_point_sigma_px)
-    held = correspondences.take(sharp)
-    first, number = held.existing()
-    fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
-    free = without_anchored(placed, held)
-    return adjust_anchored(free, keypoints, fixed, lenses, options.adjust), fixed, sharp
+    placement = held.placement
+    assert placement.local_from_sfm is not None
+    assert held.fit is not None
+    rows = tuple(int(r) for r in model.rows)
+    placed = in_metres(model, placement.local_from_sfm)
+    outside = [rows.index(r) for r in (*placement.disagreeing, *placement.blind)]
+    holding = [rows.index(r) for r in placement.agreeing if r not in placement.blind]
+    weak = weak_photos(model, outside, holding)
+    left_out = dict.fromkeys(placement.disagreeing, (_CONTRADICTS, _ELSEWHERE))
+    left_out |= dict.fromkeys(placement.blind, ("NOT_VISIBLE", _SHOWS_LITTLE))
+    left_out |= {rows[k]: ("WEAK_LINK", message) for k, message in weak.items()}
+    outside += sorted(weak)
+    for _ in range(_ROUNDS):
+        good = correspondences.take(np.flatnonzero(held.used & ~np.isin(correspondences.photo_of, outside)))
+        good = good.take(_sigma_px(placed, good) <= TOLERANCE_PX)
+        adjusted, fixed = _refined(placed, outside, good, lenses, keypoints)
+        spread = photo_covariances(adjusted.model, keypoints, fixed, adjusted.fixed_kept, lenses, _ADJUST)
+        fit = fit_similarity(adjusted.model, Sim3.identity(), good, adjusted.fixed_kept)
+        inside = {rows.index(r): localised[r] for r in placement.agreeing if rows.index(r) not in outside}
+        against = contradicting_photos(adjusted.model, inside, spread.poses, (held.fit, fit))
+        loose = {
+            k: message
+            for k, message in loose_photos(adjusted.model, spread.poses, max_bound_m).items()
+            if k not in outside and k not in against
+        }
+        left_out |= {rows[k]: (_CONTRADICTS, message) for k, message in against.items()}
+        left_out |= {rows[k]: (_LOOSE, message) for k, message in loose.items()}
+        outside += sorted({**against, **loose})
+        if not (against or loose) or len(outside) > len(rows) - 2:
+            break
+    for reason, named, what in (
+        (_LOOSE, loose, "hardly a photo is held well enough"),
+        (_CONTRADICTS, against, "photos contradict the others again and again"),
+    ):
+        if named:
+            message = f"{what}: {next(iter(named.values()))}"
+            return Refused(reason=reason, message=message, rows=rows, gates=placement.gates)
+    edges = edges_of(adjusted.model, fit, good, adjusted.fixed_kept)
+    if {e.map_id for e in edges} != set(placement.parents):  # a parent that hardly held: as it was
+        edges = placement.edges
+    whole = _with_existing(adjusted, fixed, good, [e.map_id for e in edges])
+    for k in sorted(set(range(len(rows))) - set(outside) - set(whole.photo_of.tolist())):
+        left_out[rows[k]] = _LOOSE, "the photo shows nothing that another photo of the map shows as well"
+        outside.append(k)
+    contradict = {r for r, (reason, _) in left_out.items() if reason == _CONTRADICTS}
+    agreeing = tuple(r for r in placement.agreeing if rows.index(r) not in outside)
+    disagreeing = tuple(sorted({*placement.disagreeing, *contradict}))
+    gate = gates.agreement(len(agreeing), len(disagreeing))
+    if not gate.passes:
+        message = f"once refined, {gate.message}"
+        return Refused(reason=gate.reason, message=message, rows=rows, gates=placement.gates)
+    # Until now the reconstruction was bent as it came, and its residuals said more of that than of where it
+    # lies.
+    turning = turning_covariance(adjusted.model, fit.covariance, spread)
+    bending_m2 = bending_variance_m2(adjusted.model, fit.covariance + turning, spread.poses)
+    kept = [k for k in range(len(rows)) if k not in outside]
+    return Refinement(
+        model=select_photos(whole, [rows[k] for k in kept]),
+        placement=replace(
+            placement,
+            edges=edges,
+            agreeing=agreeing,
+            disagreeing=disagreeing,
+            covariance_relative=fit.covariance + turning + np.diag([0.0] * 4 + [bending_m2] * 3),
+        ),
+        poses=spread.poses[kept],
+        bending_m=float(np.sqrt(bending_m2)),
+        shared_turn=shared_turn(adjusted.model, spread),
+        left_out=left_out,
+    )
 
 
-def exif_focals(model: Model, photos: Sequence[Photo]) -> dict[int, float]:
-    """Focal lengths of EXIF, pixels, by camera of the model; none where a camera's photos tell several.
+def weak_photos(model: Model, outside: Sequence[int], held: Sequence[int]) -> dict[int, str]:
+    """Photos that hang on those that are held by too little, and how little.
 
     Args:
-        photos: all, rows as in the model.
+        outside: photos that do not count. held: photos that are localised and agree.
     """
-    told: dict[int, set[float | None]] = {}
-    for row, camera in zip(model.rows.tolist(), model.camera_of.tolist(), strict=True):
-        told.setdefault(camera, set()).add(photos[row].focal_px)
-    found: dict[int, float] = {}
-    for camera, focals in told.items():
-        only = next(iter(focals))
-        if len(focals) == 1 and only is not None:
-            found[camera] = only
-    return found
+    firm = bottleneck_share(model, held, outside)
+    return {
+        k: f"{100 * firm[k]:.1f} % of its points tie the photo to those that are localised, "
+        f"{100 * _LEAST_LINK:.0f} % needed: look-alike places tie photos so"
+        for k in np.flatnonzero(firm < _LEAST_LINK).tolist()
+        if k not in outside
+    }
+
+
+def loose_photos(model: Model, spread: FloatArray, max_bound_m: float) -> dict[int, str]:
+    """Photos that may be further off than the bound (95 %) against the existing points, and how far.
+
+    Args:
+        spread: (k, 6, 6) of `PhotoSpread`; photos that see nothing any more are loose, unless none was asked.
+    """
+    if not np.isfinite(spread).any():
+        return {}
+    bounds = np.full(len(spread), np.inf)
+    seen = np.isfinite(spread[:, 0, 0])
+    centers = center_covariances(model, spread)[seen]
+    bounds[seen] = SIGMAS_95 * np.sqrt(np.maximum(np.linalg.eigvalsh(centers)[:, -1], 0.0))
+    return {
+        k: f"the photo may be {bounds[k]:.2f} m off, {max_bound_m:.2f} m are allowed"
+        for k in np.flatnonzero(bounds > max_bound_m).tolist()
+    }
 
 
 def in_metres(model: Model, local_from_sfm: Sim3) -> Model:
@@ -136,57 +252,51 @@ def in_metres(model: Model, local_from_sfm: Sim3) -> Model:
     )
 
 
-def without_anchored(model: Model, correspondences: Correspondences) -> Model:
-    """The model without observations by features that existing points hold: those are their points now."""
-    size = int(max(model.keypoint_of.max(initial=0), correspondences.feature.max(initial=0))) + 1
-    held = np.unique(correspondences.photo_of * size + correspondences.feature)
-    free = ~np.isin(model.photo_of * size + model.keypoint_of, held)
-    counts = np.bincount(model.point_of[free], minlength=len(model.xyz))
-    free &= counts[model.point_of] >= 2
-    return with_observations(model, free)
+def _refined(
+    model: Model,
+    outside: Sequence[int],
+    held: Correspondences,
+    lenses: Lenses,
+    keypoints: Sequence[FloatArray],
+) -> tuple[Anchored, FixedPoints]:
+    """The model adjusted without the photos `outside`, which stay with poses, existing points held fixed.
+
+    Observations by features that existing points hold are their points' now.
+    """
+    first, number = held.existing()
+    fixed = FixedPoints(xyz=held.points[first], point_of=number, photo_of=held.photo_of, pixels=held.pixels)
+    size = int(max(model.keypoint_of.max(initial=0), held.feature.max(initial=0))) + 1
+    free = _in_tracks(model, ~np.isin(model.photo_of, outside))
+    taken = np.isin(model.photo_of * size + model.keypoint_of, held.photo_of * size + held.feature)
+    free = _in_tracks(model, free & ~taken)
+    return adjust_anchored(with_observations(model, free), keypoints, fixed, lenses, _ADJUST), fixed
+
+
+def _in_tracks(model: Model, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those observations (m,) whose points at least two of them see."""
+    views = np.bincount(model.point_of[seen], minlength=len(model.xyz))
+    return np.asarray(seen & (views[model.point_of] >= 2))
 
 
 def _sigma_px(model: Model, correspondences: Correspondences) -> FloatArray:
-    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600."""
+    """(m,) largest standard deviation of each existing point across the line of sight, in pixels at 1600.
+
+    Points that are less sure than `TOLERANCE_PX` do not hold a reconstruction.
+    """
     sigma = np.zeros(len(correspondences))
     for k, pose in enumerate(model.cam_from_sfm):
         rows = np.flatnonzero(correspondences.photo_of == k)
-        if not len(rows):
-            continue
         camera = model.cameras[int(model.camera_of[k])]
         toward = correspondences.points[rows] - pose.center
-        depth = np.linalg.norm(toward, axis=1)
-        ray = toward / np.maximum(depth, 1e-9)[:, None]
+        depth = np.maximum(np.linalg.norm(toward, axis=1), 1e-9)
+        ray = toward / depth[:, None]
         across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
         spread = np.linalg.eigvalsh(across @ correspondences.covariance[rows] @ across)[:, -1]
-        scale = camera.focal_px / max(1.0, max(camera.width, camera.height) / 1600.0)
-        sigma[rows] = scale * np.sqrt(np.maximum(spread, 0.0)) / np.maximum(depth, 1e-9)
+        sigma[rows] = camera.focal_px / pixel_scale(camera) * np.sqrt(np.maximum(spread, 0.0)) / depth
     return sigma
 
 
-def without_photos(model: Model, photos: Sequence[int]) -> Model:
-    """The model without these photos' observations; points keep at least two. The photos stay, with poses."""
-    seen = ~np.isin(model.photo_of, photos)
-    seen &= np.bincount(model.point_of[seen], minlength=len(model.xyz))[model.point_of] >= 2
-    return with_observations(model, seen)
-
-
-def only_photos(model: Model, photos: Sequence[int]) -> Model:
-    """The model of the chosen photos; the others must have no observations."""
-    number = np.full(len(model.rows), -1, dtype=np.int64)
-    number[list(photos)] = np.arange(len(photos))
-    cameras, camera_of = np.unique(model.camera_of[list(photos)], return_inverse=True)
-    return replace(
-        model,
-        cameras=tuple(model.cameras[int(c)] for c in cameras),
-        rows=model.rows[list(photos)],
-        camera_of=camera_of.reshape(-1),
-        cam_from_sfm=tuple(model.cam_from_sfm[k] for k in photos),
-        photo_of=number[model.photo_of],
-    )
-
-
-def with_existing(
+def _with_existing(
     adjusted: Anchored, fixed: FixedPoints, correspondences: Correspondences, parents: Sequence[str]
 ) -> Model:
     """The adjusted model with the existing points that at least two of its photos see as points of its own.

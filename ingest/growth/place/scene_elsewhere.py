@@ -21,8 +21,9 @@ from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.vocabulary import Vocabulary
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import MapSummary, Snapshot
-from ingest.growth.map_images import features_of_image
-from ingest.growth.place.overlaps import Overlap, OverlapOptions, measure_overlap
+from ingest.growth.map_images import features_and_points
+from ingest.growth.place.overlaps import measure_overlap
+from ingest.growth.values import LEAST_PHOTOS, Edge
 from ingest.register.variance_components import NOISE_SPREAD
 from ingest.workspace import read_array, write_arrays
 
@@ -33,20 +34,18 @@ _MAPS, _IMAGES = 3, 8  # that look most alike are asked; a scene's own map and i
 _FAR_M = 10_000.0  # the Earth's curvature, not the height, is what is vertical at such distances
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SceneElsewhere:
     """An existing map that has the same scene at another place.
 
     Attributes:
-        east_m, north_m: of the scene in that map from the scene in the new one.
-        photos, points: of the new map that agree on it.
+        offset_m: (2,) east and north of the scene in that map from the scene in the new one.
+        overlap: of the new map with it.
     """
 
     summary: MapSummary
-    east_m: float
-    north_m: float
-    photos: int
-    points: int
+    offset_m: FloatArray
+    overlap: Edge
 
     @property
     def message(self) -> str:
@@ -54,7 +53,8 @@ class SceneElsewhere:
         of = self.summary
         return (
             f"map {of.map_id} ({of.name}, placed by {of.method}) has the same scene "
-            f"{way_words(self.east_m, self.north_m)}, by {self.photos} photos and {self.points} points in "
+            f"{way_words(*self.offset_m)}, by {self.overlap.photos} photos and "
+            f"{self.overlap.shared_points} points in "
             "common: one of both is misplaced, or two places look alike. Retire that one if it is wrong "
             "(`featuredb retire`), then `featuredb promote` takes this one into service"
         )
@@ -70,7 +70,6 @@ def same_scene_elsewhere(
     """
     own = _vectors(feature_map, vocabulary)
     ranked: list[tuple[float, MapSummary, FloatArray]] = []
-    least = OverlapOptions().min_photos
     for summary in snapshot.maps():
         if not _comparable(summary, feature_map):
             continue
@@ -80,28 +79,20 @@ def same_scene_elsewhere(
             logger.warning("map %s is not compared with the new one: %s", summary.map_id, error)
             continue
         alike = (own @ theirs.T).max(axis=1, initial=-1.0)
-        ranked.append((float(np.sort(alike)[-least:].sum()), summary, alike))
+        ranked.append((float(np.sort(alike)[-LEAST_PHOTOS:].sum()), summary, alike))
     ranked.sort(key=lambda entry: (-entry[0], entry[1].map_id))
     found: list[tuple[float, SceneElsewhere]] = []
     for _, summary, alike in ranked[:_MAPS]:
         images = [feature_map.images[k] for k in np.argsort(-alike, kind="stable")[:_IMAGES]]
         other = snapshot.load_map(summary.map_id)
         overlap = measure_overlap(feature_map, other, images=images)
-        if overlap.other_from_map is None:
+        if not isinstance(overlap, Edge):
             continue
         offset_m, covariance = _offset(feature_map, other, overlap)
         chance = chance_of_offset(offset_m, covariance)
         if chance >= _RATE:
             return None
-        east_m, north_m = offset_m.tolist()
-        told = SceneElsewhere(
-            summary=summary,
-            east_m=east_m,
-            north_m=north_m,
-            photos=overlap.photos,
-            points=overlap.shared_points,
-        )
-        found.append((chance, told))
+        found.append((chance, SceneElsewhere(summary=summary, offset_m=offset_m, overlap=overlap)))
     return min(found, key=lambda entry: entry[0])[1] if found else None
 
 
@@ -129,10 +120,8 @@ def _comparable(summary: MapSummary, feature_map: FeatureMap) -> bool:
     )
 
 
-def _offset(feature_map: FeatureMap, other: FeatureMap, overlap: Overlap) -> tuple[FloatArray, FloatArray]:
+def _offset(feature_map: FeatureMap, other: FeatureMap, overlap: Edge) -> tuple[FloatArray, FloatArray]:
     """Horizontal offset (2,) of the scene's middle in the other map, metres, and its covariance (2, 2)."""
-    assert overlap.other_from_map is not None
-    assert overlap.covariance is not None
     middle = np.median(feature_map.points_local(), axis=0)
     there = overlap.other_from_map.act(middle)
     away = there - middle
@@ -143,11 +132,7 @@ def _offset(feature_map: FeatureMap, other: FeatureMap, overlap: Overlap) -> tup
     for place, covariance, turn in (
         (middle, feature_map.placement.covariance, np.eye(3)),
         (there, overlap.covariance, np.eye(3)),
-        (
-            frame_from_other.inverse().act(there),
-            other.placement.covariance,
-            frame_from_other.rotation,
-        ),
+        (frame_from_other.inverse().act(there), other.placement.covariance, frame_from_other.rotation),
     ):
         jacobian = turn @ point_jacobian(place)
         spread += jacobian @ covariance @ jacobian.T
@@ -168,7 +153,7 @@ def _vectors_of(
 def _vectors(feature_map: FeatureMap, vocabulary: Vocabulary) -> NDArray[np.float32]:
     """(images, vocabulary.size) of unit length, of what a map keeps of its images."""
     vectors: Sequence[NDArray[np.float32]] = [
-        vocabulary.aggregate(features_of_image(feature_map, image).descriptors)
+        vocabulary.aggregate(features_and_points(feature_map, image)[0].descriptors)
         for image in feature_map.images
     ]
     return np.array(vectors, dtype=np.float32).reshape(-1, vocabulary.size)

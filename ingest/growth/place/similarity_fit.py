@@ -12,49 +12,31 @@ with noise of the pixel, of the existing point, and with what neighbours have in
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import nearest_rotation, skew
+from featuredb.geometry.rotation import nearest_rotation
 from featuredb.geometry.sim3 import Sim3, point_jacobian
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise
 from ingest.growth.place.correspondences import Correspondences
-from ingest.growth.values import LocalisedPhoto
+from ingest.growth.values import TOLERANCE_PX, LocalisedPhoto
 
 _CHI2_2_MEDIAN = 1.386  # of the squared length of two normal coordinates
 _CHI2_2_95 = 5.991
 _OPEN = np.array([10.0] * 4 + [1e4] * 3)  # log scale, radians, metres: what nothing holds; gates refuse it
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SimilarityFitOptions:
-    """How the similarity is found.
-
-    Attributes:
-        pair_samples: pairs of photos that propose a similarity by their centres, beside one proposal from
-            each photo; 300 hold a pair of right ones with a third of the photos right, 30 times over.
-        max_scored: correspondences that judge a proposal; more only take longer.
-        loose_rel: tolerance of a proposal as a share of the image's longer side (16 pixels at 1600): it
-            rests on one or two photos, whose errors it carries far. What is of another place is hundreds of
-            pixels off.
-        tolerance_rel: the same for the fitted similarity (8 pixels at 1600): twice the inlier tolerance of
-            a pose, since reconstructions of few photos are bent.
-        least_share: a photo agrees if at least this share of its own correspondences is within the tolerance.
-        rounds: of reweighting; weights settle within ten.
-        seed: of the samples.
-    """
-
-    pair_samples: int = 300
-    max_scored: int = 3000
-    loose_rel: float = 0.01
-    tolerance_rel: float = 0.005
-    least_share: float = 0.5
-    rounds: int = 20
-    seed: int = 0
+# Pairs of photos that propose a similarity by their centres; with a third of the photos right, 300 hold a
+# pair of right ones 30 times over.
+_PAIRS = 300
+_MOST_SCORED = 3000  # correspondences that judge a proposal; more only take longer
+# A proposal rests on one or two photos, whose errors it carries far. What is of another place is hundreds of
+# pixels off.
+_LOOSE_PX = 2.0 * TOLERANCE_PX
+_LEAST_SHARE = 0.5  # of a photo's own correspondences that must be within the tolerance for it to agree
+_ROUNDS = 20  # of reweighting; weights settle within ten
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,9 +44,8 @@ class FittedSimilarity:
     """A fitted similarity.
 
     Attributes:
-        local_from_sfm: the similarity. covariance: (7, 7) of its left perturbation.
+        covariance: (7, 7) of the similarity's left perturbation.
         errors_px: (m,) distances of all pixels from where the placed model sees their points.
-        weights: (m,) of the last round; 0 for correspondences that took no part.
         spread: how many times its claimed sigma the typical residual is.
         neighbours_factor: how many times the variance of what neighbours say exceeds that of independent
             errors; the larger of that by photo and that by place.
@@ -73,66 +54,61 @@ class FittedSimilarity:
     local_from_sfm: Sim3
     covariance: FloatArray
     errors_px: FloatArray
-    weights: FloatArray
     spread: float
     neighbours_factor: float
 
 
-def proposals(
+def best_proposal(
     model: Model,
-    localised: Mapping[int, LocalisedPhoto],
+    own: Mapping[int, LocalisedPhoto],
     correspondences: Correspondences,
-    options: SimilarityFitOptions,
-) -> list[Sim3]:
-    """Similarities that single photos (pose and depth of shared points) and pairs of photos propose."""
-    at = {k: localised[int(r)] for k, r in enumerate(model.rows.tolist()) if int(r) in localised}
-    found: list[Sim3] = []
-    for k, photo in at.items():
-        scale = _scale_by_depth(model, correspondences, k, photo)
-        if scale is not None:
-            found.append(_by_pose(model, k, photo, scale))
-    photos = list(at)
-    for i, j in _photo_pairs(len(photos), options):
-        a, b = photos[i], photos[j]
-        sim = _by_centres(model, (a, b), (at[a], at[b]))
+    more: Sequence[Sim3] = (),
+) -> tuple[Sim3, NDArray[np.int64]] | None:
+    """The similarity with which most photos agree, then the one of least truncated squared errors; and these.
+
+    Proposed by single photos (pose and depth of shared points), by pairs of photos, and by `more`.
+
+    Args:
+        own: localised photos, by place among the model's, in order.
+    """
+    sims = [*more, *(_by_pose(model, correspondences, k, photo) for k, photo in own.items())]
+    every = [(a, b) for a in own for b in own if a < b]
+    sims += [_by_centres(model, (a, b), (own[a], own[b])) for a, b in _at_most(every, _PAIRS)]
+    rows = _at_most(np.flatnonzero(~correspondences.carried), _MOST_SCORED)
+    scored = correspondences.take(np.array(rows, dtype=np.int64))
+    tolerance = tolerances_px(model, scored, _LOOSE_PX)
+    ranked = []
+    for sim in sims:
         if sim is not None:
-            found.append(sim)
-    return found
+            errors = correspondence_errors(model, sim, scored)
+            agree = agreeing_photos(errors, tolerance, scored)
+            ranked.append((-len(agree), float((np.minimum(errors / tolerance, 1.0) ** 2).sum()), sim, agree))
+    return min(ranked, key=lambda item: item[:2])[2:] if ranked else None
 
 
-def _photo_pairs(count: int, options: SimilarityFitOptions) -> list[tuple[int, int]]:
-    every = [(i, j) for i in range(count) for j in range(i + 1, count)]
-    if len(every) <= options.pair_samples:
-        return every
-    chosen = np.random.default_rng(options.seed).choice(len(every), options.pair_samples, replace=False)
-    return [every[int(c)] for c in np.sort(chosen)]
+def _at_most(values: Sequence[Any] | NDArray[np.int64], count: int) -> list[Any]:
+    """The values, or so many of them, always the same."""
+    if len(values) <= count:
+        return list(values)
+    chosen = np.random.default_rng(0).choice(len(values), count, replace=False)
+    return [values[int(c)] for c in np.sort(chosen)]
 
 
-def _by_pose(model: Model, k: int, photo: LocalisedPhoto, scale: float) -> Sim3:
-    rotation = nearest_rotation(photo.cam_from_local.rotation.T @ model.cam_from_sfm[k].rotation)
-    center = photo.cam_from_local.center
-    return Sim3(
-        scale=scale,
-        rotation=rotation,
-        translation=center - scale * rotation @ model.cam_from_sfm[k].center,
-    )
-
-
-def _scale_by_depth(
-    model: Model, correspondences: Correspondences, k: int, photo: LocalisedPhoto
-) -> float | None:
-    """Median ratio of the distances from the camera of existing and of new points of the same features."""
+def _by_pose(model: Model, correspondences: Correspondences, k: int, photo: LocalisedPhoto) -> Sim3 | None:
+    """Scale by the median ratio of the distances of existing and new points of one feature."""
     rows = np.flatnonzero(
         (correspondences.photo_of == k) & ~correspondences.carried & (correspondences.model_point >= 0)
     )
     if len(rows) < 5:  # a median of fewer is one point's opinion
         return None
-    here = np.linalg.norm(correspondences.points[rows] - photo.cam_from_local.center, axis=1)
-    there = np.linalg.norm(
-        model.xyz[correspondences.model_point[rows]] - model.cam_from_sfm[k].center, axis=1
-    )
-    ratio = float(np.median(here / np.maximum(there, 1e-12)))
-    return ratio if ratio > 0 else None
+    ours, center = model.cam_from_sfm[k], photo.cam_from_local.center
+    here = np.linalg.norm(correspondences.points[rows] - center, axis=1)
+    there = np.linalg.norm(model.xyz[correspondences.model_point[rows]] - ours.center, axis=1)
+    scale = float(np.median(here / np.maximum(there, 1e-12)))
+    if scale <= 0:
+        return None
+    rotation = nearest_rotation(photo.cam_from_local.rotation.T @ ours.rotation)
+    return Sim3(scale=scale, rotation=rotation, translation=center - scale * rotation @ ours.center)
 
 
 def _by_centres(
@@ -146,8 +122,7 @@ def _by_centres(
     sigma = float(np.sqrt(sum(np.linalg.eigvalsh(p.covariance[3:, 3:])[-1] for p in poses)))
     if base_sfm <= 0 or base < 5.0 * sigma:  # a scale to 20 %; what is shorter says nothing
         return None
-    turns = [t.rotation.T @ o.rotation for t, o in zip(theirs, ours, strict=True)]
-    rotation = nearest_rotation(turns[0] + turns[1])
+    rotation = nearest_rotation(sum(t.rotation.T @ o.rotation for t, o in zip(theirs, ours, strict=True)))
     middle_sfm = 0.5 * (ours[0].center + ours[1].center)
     middle = 0.5 * (theirs[0].center + theirs[1].center)
     scale = base / base_sfm
@@ -166,54 +141,27 @@ def correspondence_errors(model: Model, sim: Sim3, correspondences: Corresponden
     return np.where(np.isfinite(errors), errors, np.inf)
 
 
-def tolerances_px(model: Model, correspondences: Correspondences, share: float) -> FloatArray:
-    """(m,) that share of the longer side of each correspondence's photo."""
+def tolerances_px(
+    model: Model, correspondences: Correspondences, at_1600_px: float = TOLERANCE_PX
+) -> FloatArray:
+    """(m,) that many pixels of an image of 1600, at the size of each correspondence's photo."""
     sides = np.array([max(c.width, c.height) for c in model.cameras], dtype=np.float64)
-    return np.asarray(share * sides[model.camera_of[correspondences.photo_of]])
+    return np.asarray(at_1600_px / 1600.0 * sides[model.camera_of[correspondences.photo_of]])
 
 
 def agreeing_photos(
-    errors_px: FloatArray, tolerance_px: FloatArray, correspondences: Correspondences, least_share: float
+    errors_px: FloatArray, tolerance_px: FloatArray, correspondences: Correspondences
 ) -> NDArray[np.int64]:
-    """Model's photos of whose own correspondences at least that share lies within the tolerance."""
+    """Model's photos of whose own correspondences half lies within the tolerance."""
     own = ~correspondences.carried
     count = int(correspondences.photo_of.max(initial=-1)) + 1
     total = np.bincount(correspondences.photo_of[own], minlength=count)
     near = np.bincount(correspondences.photo_of[own & (errors_px < tolerance_px)], minlength=count)
-    return np.flatnonzero((total > 0) & (near >= least_share * total))
-
-
-def rank_proposals(
-    model: Model, sims: Sequence[Sim3], correspondences: Correspondences, options: SimilarityFitOptions
-) -> list[tuple[Sim3, NDArray[np.int64]]]:
-    """Proposals with the photos that agree, most photos first, then by truncated squared errors."""
-    scored = _thinned(correspondences, options)
-    tolerance = tolerances_px(model, scored, options.loose_rel)
-    ranked = []
-    for sim in sims:
-        errors = correspondence_errors(model, sim, scored)
-        agree = agreeing_photos(errors, tolerance, scored, options.least_share)
-        cost = float(np.minimum(errors / tolerance, 1.0).__pow__(2).sum())
-        ranked.append((sim, agree, cost))
-    ranked.sort(key=lambda item: (-len(item[1]), item[2]))
-    return [(sim, agree) for sim, agree, _ in ranked]
-
-
-def _thinned(correspondences: Correspondences, options: SimilarityFitOptions) -> Correspondences:
-    """Own correspondences, at most so many, of each photo the same share."""
-    own = np.flatnonzero(~correspondences.carried)
-    if len(own) <= options.max_scored:
-        return correspondences.take(own)
-    chosen = np.random.default_rng(options.seed).choice(len(own), options.max_scored, replace=False)
-    return correspondences.take(own[np.sort(chosen)])
+    return np.flatnonzero((total > 0) & (near >= _LEAST_SHARE * total))
 
 
 def fit_similarity(
-    model: Model,
-    start: Sim3,
-    correspondences: Correspondences,
-    use: NDArray[np.bool_],
-    options: SimilarityFitOptions,
+    model: Model, start: Sim3, correspondences: Correspondences, use: NDArray[np.bool_]
 ) -> FittedSimilarity:
     """Robust least squares over the pixels of the correspondences in `use` (m,), Gauss-Newton on SIM(3).
 
@@ -223,9 +171,8 @@ def fit_similarity(
     `start` has it, and has standard deviations of `_OPEN`.
     """
     chosen = correspondences.take(np.flatnonzero(use))
-    sim, covariance = start, np.eye(7)
-    weights, spread, factor = np.ones(len(chosen)), 1.0, 1.0
-    for _ in range(options.rounds):
+    sim, covariance, spread, factor = start, np.eye(7), 1.0, 1.0
+    for _ in range(_ROUNDS):
         residual, jacobian, information = _equations(model, sim, chosen)
         squared = np.einsum("mi,mij,mj->m", residual, information, residual)
         spread = float(np.sqrt(max(np.median(squared) / _CHI2_2_MEDIAN, 1e-8)))
@@ -236,17 +183,14 @@ def fit_similarity(
         inverse = np.linalg.inv(normal + np.diag(1.0 / _OPEN**2))
         step = -inverse @ score.sum(axis=0)
         factor = neighbours_factor(score, inverse, chosen)
-        covariance = inverse * (max(spread, 1.0) ** 2 if spread > 0 else 1.0) * factor
+        covariance = inverse * max(spread, 1.0) ** 2 * factor
         sim = Sim3.exp(step) @ sim
         if step @ normal @ step < 1e-6:  # a thousandth of a sigma
             break
-    every = np.zeros(len(correspondences))
-    every[np.flatnonzero(use)] = weights
     return FittedSimilarity(
         local_from_sfm=sim,
         covariance=np.asarray((covariance + covariance.T) / 2),
         errors_px=correspondence_errors(model, sim, correspondences),
-        weights=every,
         spread=spread,
         neighbours_factor=factor,
     )
@@ -259,24 +203,21 @@ def _equations(
 
     exp(xi) S moves the cameras by exp(xi), which is as if the points moved by exp(-xi).
     """
-    poses = [sim.act_on_pose(pose) for pose in model.cam_from_sfm]
-    m = len(correspondences)
     linear = linearise(
         model.cameras,
         model.camera_of,
-        poses,
+        [sim.act_on_pose(pose) for pose in model.cam_from_sfm],
         correspondences.points,
-        np.arange(m),
+        np.arange(len(correspondences)),
         correspondences.photo_of,
         correspondences.pixels,
     )
     by_point = np.where(np.isfinite(linear.by_point), linear.by_point, 0.0)
     residual = np.where(np.isfinite(linear.residual), linear.residual, 1e6)
     # A SIFT keypoint is good to about half a pixel of the image of 1600 that it was found on.
-    sigma = 0.5 * np.maximum(1.0, tolerances_px(model, correspondences, 1.0) / 1600.0)
-    noise = sigma[:, None, None] ** 2 * np.eye(2) + by_point @ correspondences.covariance @ np.swapaxes(
-        by_point, 1, 2
-    )
+    sigma = 0.5 * np.maximum(1.0, tolerances_px(model, correspondences, 1.0))
+    noise = sigma[:, None, None] ** 2 * np.eye(2)
+    noise = noise + by_point @ correspondences.covariance @ np.swapaxes(by_point, 1, 2)
     jacobian = by_point @ point_jacobian(correspondences.points)
     return residual, np.asarray(jacobian), np.asarray(np.linalg.inv(noise))
 
@@ -312,39 +253,3 @@ def _cells(correspondences: Correspondences) -> NDArray[np.int64]:
     cells = np.floor((correspondences.points - low) / side).astype(np.int64)
     both = np.concatenate([cells, correspondences.map_of[:, None]], axis=1)
     return np.unique(both, axis=0, return_inverse=True)[1].reshape(-1)
-
-
-_SHORT = 1.0  # entries of the adjoint below which the series has converged after a dozen terms
-
-
-def small_adjoint(tangent: FloatArray) -> FloatArray:
-    """(7, 7) matrix of the Lie bracket with (sigma, omega, nu), the derivative of Sim3.adjoint."""
-    sigma, omega, nu = float(tangent[0]), tangent[1:4], tangent[4:]
-    ad = np.zeros((7, 7))
-    ad[1:4, 1:4] = skew(omega)
-    ad[4:, 0] = -nu
-    ad[4:, 1:4] = skew(nu)
-    ad[4:, 4:] = sigma * np.eye(3) + skew(omega)
-    return ad
-
-
-def left_jacobian(tangent: FloatArray) -> FloatArray:
-    """J (7, 7) with exp(x + dx) = exp(J dx) exp(x) to first order.
-
-    The integral of exp(t ad) over t in [0, 1]: its series where that is short, else the corner of one matrix
-    exponential (Van Loan 1978).
-    """
-    ad = small_adjoint(np.asarray(tangent, dtype=np.float64))
-    size = float(np.abs(ad).max())
-    if size < _SHORT:
-        total = term = np.eye(7)
-        for k in range(2, 30):
-            term = term @ ad / k
-            total = total + term
-            if np.abs(term).max() < 1e-17 * max(1.0, size):
-                break
-        return total
-    both = np.zeros((14, 14))
-    both[:7, :7] = ad
-    both[:7, 7:] = np.eye(7)
-    return np.asarray(expm(both)[:7, 7:], dtype=np.float64)

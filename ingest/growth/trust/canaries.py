@@ -10,7 +10,7 @@ and, asked of the new map alone, a new map that shows their place somewhere else
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +24,8 @@ from featuredb.geometry.rotation import matrix_from_quaternion, rotation_angle
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store import Database
 from featuredb.store.canaries import Canary, KnownPose, list_canaries, load_canary_image
-from ingest.growth.map_images import features_of_image
+from ingest.growth.gates import SIGMAS, Gate
+from ingest.growth.map_images import LEAST_FEATURES, NEAR_M, features_and_points
 from reloc.localise.acceptance import AcceptanceOptions
 from reloc.localise.localise import localise_features
 from reloc.localise.options import LocaliseOptions
@@ -39,31 +40,10 @@ _OWN_FEATURES = AcceptanceOptions(min_spread=0.0, min_agreement=0.0)
 
 Verdict = Literal["right", "lost", "moved", "found", "not_found"]
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CanaryOptions:
-    """Which images of maps are asked, and what counts as moved.
-
-    Attributes:
-        own_near: images of active maps around the new one. own_elsewhere: from the rest of the database.
-        near_m: how far from the new map's box "around" reaches.
-        min_features: observations with descriptors that an image needs to be asked; an answer has at least
-            15 inliers, and a third of the features of a good image are.
-        tolerance_m, tolerance_deg: of an own image's answer; half the drift budget's order, and well above
-            what new points within their sigma move a pose by.
-        sigmas: an answer by the new map alone may miss by so many of its own standard deviations instead,
-            if that is more.
-        limits: sizes of images that are decoded.
-    """
-
-    own_near: int = 8
-    own_elsewhere: int = 4
-    near_m: float = 50.0
-    min_features: int = 60
-    tolerance_m: float = 0.5
-    tolerance_deg: float = 1.0
-    sigmas: float = 3.0
-    limits: DecodeLimits = field(default_factory=DecodeLimits)
+_OWN_NEAR, _OWN_ELSEWHERE = 8, 4  # images of active maps that are asked, around the new one and elsewhere
+# Of an own image's answer; the drift budget's order, and well above what new points within their sigma move a
+# pose by. An answer by the new map alone may miss by `SIGMAS` of its own instead, if that is more.
+_TOLERANCE_M, _TOLERANCE_DEG = 0.5, 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,10 +51,8 @@ class CanaryCheck:
     """One canary.
 
     Attributes:
-        name: for people.
         before, after: verdict on the answers; `alone`: of the new map alone, "" where it was not asked.
         error_before_m, error_m: of the answers; NaN where there is none.
-        regression: why it is one, "" where it is none.
     """
 
     name: str
@@ -115,6 +93,14 @@ class CanaryRun:
         count = f"{len(self.regressions)} of {len(self.checks)} canaries regress"
         return f"{count}: {first.name}: {first.regression}"
 
+    @property
+    def gate(self) -> Gate:
+        """Whether no known answer got worse."""
+        count = len(self.regressions)
+        return Gate(
+            name="canaries", reason="CANARY", figure=count, limit=0, passes=not count, message=self.message
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Miss:
@@ -124,13 +110,12 @@ class _Miss:
     degrees: float
     sigma_m: float
 
+    def __str__(self) -> str:
+        return f"{self.metres:.2f} m and {self.degrees:.2f} degrees"
+
 
 def run_canaries(
-    database: Database,
-    before: Localiser,
-    after: Localiser,
-    new_maps: Sequence[FeatureMap],
-    options: CanaryOptions | None = None,
+    database: Database, before: Localiser, after: Localiser, new_maps: Sequence[FeatureMap]
 ) -> CanaryRun:
     """Ask all known queries and images of the maps, before and after.
 
@@ -141,39 +126,30 @@ def run_canaries(
     Raises:
         StoreError, CanaryNotFoundError: a canary's image cannot be read.
     """
-    options = options or CanaryOptions()
     known = list_canaries(database)
-    checks = [check_known(database, canary, before, after, options) for canary in known]
-    own = own_canaries(before, new_maps, options)
-    checks += [
-        _check_own(feature_map, image, before, after, [m.map_id for m in new_maps], options)
-        for feature_map, image in own
-    ]
+    checks = [check_known(database, canary, before, after) for canary in known]
+    own, new_ids = own_canaries(before, new_maps), tuple(m.map_id for m in new_maps)
+    checks += [_check_own(feature_map, image, before, after, new_ids) for feature_map, image in own]
     note = f"{len(known)} known queries, {len(own)} images of the active maps"
     if not known:
         note += "; the database has no known queries, `featuredb canary add` adds them"
     return CanaryRun(checks=tuple(checks), note=note)
 
 
-def check_known(
-    database: Database, canary: Canary, before: Localiser, after: Localiser, options: CanaryOptions
-) -> CanaryCheck:
+def check_known(database: Database, canary: Canary, before: Localiser, after: Localiser) -> CanaryCheck:
     """Ask one known query of both."""
     data = load_canary_image(database, canary)
-    gray = decode_gray(data, options.limits)
+    gray = decode_gray(data, DecodeLimits())
     asked = LocaliseWireRequest.model_validate_json(json.dumps(dict(canary.request)))
     request = localise_request(asked, data, gray)
     results = [localiser.localise(gray, request) for localiser in (before, after)]
-    verdicts = [known_verdict(result, canary.pose) for result in results]
-    miss = _miss_of_known(results[1].pose, canary.pose)
-    return CanaryCheck(
-        name=canary.name,
-        before=verdicts[0],
-        after=verdicts[1],
-        error_before_m=_metres(_miss_of_known(results[0].pose, canary.pose)),
-        error_m=_metres(miss),
-        regression=_regression(verdicts[0], verdicts[1], miss, results[1]),
-    )
+    misses = [_miss_of_known(result.pose, canary.pose) for result in results]
+    if canary.pose is None:
+        verdicts: list[Verdict] = ["not_found" if r.pose is None else "found" for r in results]
+    else:
+        limits = (canary.pose.tolerance_m, canary.pose.tolerance_deg)
+        verdicts = [_verdict(miss, *limits) for miss in misses]
+    return _checked(canary.name, verdicts, misses, results[1])
 
 
 def answer_now(
@@ -200,20 +176,14 @@ def answer_now(
     return known, localiser.snapshot
 
 
-def known_verdict(result: LocaliseResult, expected: KnownPose | None) -> Verdict:
-    """What an answer to a known query is worth."""
-    if expected is None:
-        return "not_found" if result.pose is None else "found"
-    miss = _miss_of_known(result.pose, expected)
+def _verdict(miss: _Miss | None, metres: float, degrees: float) -> Verdict:
+    """What an answer is worth that should be no further off than that."""
     if miss is None:
         return "lost"
-    near = miss.metres <= expected.tolerance_m and miss.degrees <= expected.tolerance_deg
-    return "right" if near else "moved"
+    return "right" if miss.metres <= metres and miss.degrees <= degrees else "moved"
 
 
-def own_canaries(
-    before: Localiser, new_maps: Sequence[FeatureMap], options: CanaryOptions
-) -> list[tuple[FeatureMap, MapImage]]:
+def own_canaries(before: Localiser, new_maps: Sequence[FeatureMap]) -> list[tuple[FeatureMap, MapImage]]:
     """Images of the active maps that can be asked: those around the new maps, some from elsewhere.
 
     The choice hangs on the images' names only, so that another run asks the same.
@@ -225,50 +195,32 @@ def own_canaries(
         for feature_map in indexed.area.maps:
             count = _described(feature_map)
             for image in feature_map.images:
-                if count.get(image.image_id, 0) < options.min_features:
+                if count.get(image.image_id, 0) < LEAST_FEATURES:
                     continue
                 key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
-                around = any(_near(feature_map, image, frame, box, options.near_m) for frame, box in boxes)
+                around = any(_near(feature_map, image, frame, box) for frame, box in boxes)
                 (near if around else far).append((key, feature_map, image))
-    chosen = sorted(near, key=lambda e: e[0])[: options.own_near]
-    chosen += sorted(far, key=lambda e: e[0])[: options.own_elsewhere]
+    chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
+    chosen += sorted(far, key=lambda e: e[0])[:_OWN_ELSEWHERE]
     return [(feature_map, image) for _, feature_map, image in chosen]
 
 
 def _check_own(
-    feature_map: FeatureMap,
-    image: MapImage,
-    before: Localiser,
-    after: Localiser,
-    new_ids: Sequence[str],
-    options: CanaryOptions,
+    feature_map: FeatureMap, image: MapImage, before: Localiser, after: Localiser, new_ids: tuple[str, ...]
 ) -> CanaryCheck:
     """Ask an image of a map of both, and of the new maps alone."""
-    features = features_of_image(feature_map, image)
+    features, _ = features_and_points(feature_map, image)
     request = LocaliseRequest(camera=feature_map.cameras[image.camera_id])
-    results = [
-        _ask(features, request, before, None),
-        _ask(features, request, after, None),
-        _ask(features, request, after, tuple(new_ids)),
-    ]
+    asked = ((before, None), (after, None), (after, new_ids))
+    results = [_ask(features, request, localiser, ids) for localiser, ids in asked]
     misses = [_miss_of_image(result.pose, feature_map, image) for result in results]
-    verdicts = [_own_verdict(miss, options, sigmas=0.0) for miss in misses[:2]]
-    alone = _own_verdict(misses[2], options, sigmas=options.sigmas)
-    regression = _regression(verdicts[0], verdicts[1], misses[1], results[1])
-    if not regression and alone == "moved" and misses[2] is not None:
-        regression = (
-            f"the new map alone has it {misses[2].metres:.2f} m and {misses[2].degrees:.2f} degrees "
-            "from where it is"
-        )
-    return CanaryCheck(
-        name=f"{image.name} of map {feature_map.map_id}",
-        before=verdicts[0],
-        after=verdicts[1],
-        alone=alone,
-        error_before_m=_metres(misses[0]),
-        error_m=_metres(misses[1]),
-        regression=regression,
-    )
+    verdicts = [_verdict(miss, _TOLERANCE_M, _TOLERANCE_DEG) for miss in misses[:2]]
+    may_miss_m = SIGMAS * misses[2].sigma_m if misses[2] else 0.0
+    alone = _verdict(misses[2], max(_TOLERANCE_M, may_miss_m), _TOLERANCE_DEG)
+    check = _checked(f"{image.name} of map {feature_map.map_id}", verdicts, misses, results[1])
+    if check.regression or alone != "moved":
+        return replace(check, alone=alone)
+    return replace(check, alone=alone, regression=f"the new map alone has it {misses[2]} from where it is")
 
 
 def _ask(
@@ -280,21 +232,26 @@ def _ask(
     return localise_features(features, request, areas, options).result
 
 
-def _regression(before: Verdict, after: Verdict, miss: _Miss | None, result: LocaliseResult) -> str:
-    if after in ("right", "not_found") or before not in ("right", "not_found"):
-        return ""
-    if after == "found":
-        return "a photo of elsewhere now finds a place"
-    if miss is None:
-        return f"no longer localised: {result.reason}: {result.detail}"
-    return f"now {miss.metres:.2f} m and {miss.degrees:.2f} degrees off"
-
-
-def _own_verdict(miss: _Miss | None, options: CanaryOptions, sigmas: float) -> Verdict:
-    if miss is None:
-        return "lost"
-    metres = max(options.tolerance_m, sigmas * miss.sigma_m)
-    return "right" if miss.metres <= metres and miss.degrees <= options.tolerance_deg else "moved"
+def _checked(
+    name: str, verdicts: Sequence[Verdict], misses: Sequence[_Miss | None], result: LocaliseResult
+) -> CanaryCheck:
+    """What became of an answer: verdicts and misses before and after, and the result after."""
+    (before, after), regression = verdicts, ""
+    if before in ("right", "not_found") and after not in ("right", "not_found"):
+        regression = f"now {misses[1]} off"
+        if after == "found":
+            regression = "a photo of elsewhere now finds a place"
+        elif misses[1] is None:
+            regression = f"no longer localised: {result.reason}: {result.detail}"
+    errors = [float("nan") if miss is None else miss.metres for miss in misses[:2]]
+    return CanaryCheck(
+        name=name,
+        before=before,
+        after=after,
+        error_before_m=errors[0],
+        error_m=errors[1],
+        regression=regression,
+    )
 
 
 def _miss_of_known(pose: LocalisedPose | None, expected: KnownPose | None) -> _Miss | None:
@@ -311,10 +268,6 @@ def _miss_of_image(pose: LocalisedPose | None, feature_map: FeatureMap, image: M
         return None
     expected = image.cam_from_local @ feature_map.frame.enu_from(pose.frame)
     return _miss(pose, expected.center, expected.rotation)
-
-
-def _metres(miss: _Miss | None) -> float:
-    return float("nan") if miss is None else miss.metres
 
 
 def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -> _Miss:
@@ -339,8 +292,6 @@ def _box(feature_map: FeatureMap) -> tuple[LocalFrame, FloatArray]:
     return feature_map.frame, np.percentile(points, (2, 98), axis=0)
 
 
-def _near(
-    feature_map: FeatureMap, image: MapImage, frame: LocalFrame, box: FloatArray, margin_m: float
-) -> bool:
+def _near(feature_map: FeatureMap, image: MapImage, frame: LocalFrame, box: FloatArray) -> bool:
     center = frame.enu_from(feature_map.frame).act(image.cam_from_local.center)[:2]
-    return bool((center >= box[0] - margin_m).all() and (center <= box[1] + margin_m).all())
+    return bool((center >= box[0] - NEAR_M).all() and (center <= box[1] + NEAR_M).all())

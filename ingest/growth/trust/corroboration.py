@@ -6,38 +6,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.states import OPERATOR
-from ingest.growth.map_images import features_and_points
-from ingest.growth.place.localised import LocaliseEachOptions, in_frame, localise_each
-from ingest.growth.place.overlaps import localise_image
+from ingest.growth.gates import SIGMAS
+from ingest.growth.map_images import LEAST_FEATURES, MOST_IMAGES, NEAR_M, features_and_points
+from ingest.growth.place.localised import in_frame, localise_each
+from ingest.growth.place.overlaps import indexed_area, localise_image
 from ingest.growth.trust.confirmation import CorroboratingImage, Source, Sources
 from ingest.growth.values import FeaturesOf, LocalisedPhoto
 from ingest.photos.photo import Photo
 from ingest.sfm.pairs import Pair
 from reloc.localise.candidates import IndexedArea
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CorroborationOptions:
-    """Who is asked.
-
-    Attributes:
-        max_images: of other maps, nearest to the map's own cameras first.
-        near_m: images of other maps whose camera is within the map's box and so far around it are asked.
-        min_features: observations with descriptors that an image needs.
-        sigmas, least_m: a photo whose place is known contradicts the map if the map has it further away than
-            so many standard deviations of both, and than that length.
-    """
-
-    max_images: int = 24
-    near_m: float = 50.0
-    min_features: int = 60
-    sigmas: float = 3.0
-    least_m: float = 0.5
-    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
+# A photo whose place is known contradicts the map if the map has it further away than that, and than `SIGMAS`
+# standard deviations of both.
+_LEAST_M = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -85,9 +68,9 @@ def corroborate(
     others: Sequence[FeatureMap],
     new: NewPhotos | None,
     sources: Sources,
-    options: CorroborationOptions | None = None,
     *,
     write_id: str,
+    threads: int = 1,
 ) -> Corroboration:
     """Localise photos of other owners than the map's, whose word counts, in the map alone.
 
@@ -95,17 +78,15 @@ def corroborate(
         others: maps around it, active or quarantined.
         write_id: of the map as it is.
     """
-    options = options or CorroborationOptions()
-    area = build_area([feature_map])
-    if not len(area.points):
+    indexed = indexed_area(feature_map)
+    if not len(indexed.area.points):
         return Corroboration(corroborating=(), contradictions=())
-    indexed = IndexedArea(area=area, index=build_index(area.descriptors))
     own = set(sources.of_map(feature_map))
     names = {image.sha256 for image in feature_map.images}
     corroborating: list[CorroboratingImage] = []
     against: list[str] = []
-    for other, image, source in _images_around(feature_map, others, own, sources, options):
-        found = localise_image(other, image, 0, [indexed], options.localise)
+    for other, image, source in _images_around(feature_map, others, own, sources):
+        found = localise_image(other, image, 0, [indexed])
         if found is None or image.sha256 in names:
             continue
         found = in_frame(found, feature_map.frame)
@@ -113,9 +94,9 @@ def corroborate(
         apart = float(np.linalg.norm(known.center - found.cam_from_local.center))
         spread = _spread(found) + _center_variance(other, image)
         what = f"{image.name} of map {other.map_id}"
-        _sort_in(found, source, what, apart, spread, options, corroborating, against)
+        _sort_in(found, source, what, apart, spread, corroborating, against)
     if new is not None:
-        _hear_new(feature_map, write_id, indexed, new, own, names, sources, options, corroborating, against)
+        _hear_new(feature_map, write_id, indexed, new, own, names, sources, threads, corroborating, against)
     return Corroboration(corroborating=tuple(corroborating), contradictions=tuple(against))
 
 
@@ -127,7 +108,7 @@ def _hear_new(
     own: set[Source],
     names: set[str],
     sources: Sources,
-    options: CorroborationOptions,
+    threads: int,
     corroborating: list[CorroboratingImage],
     against: list[str],
 ) -> None:
@@ -141,7 +122,7 @@ def _hear_new(
         if new.photos[row].sha256 not in names and source.speaks_to(own)
     ]
     unheard = [row for row in asked if (write_id, row) not in new.heard]
-    for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], options.localise):
+    for row, said in localise_each(new.photos, unheard, new.features_of, [indexed], threads):
         new.heard[write_id, row] = said if isinstance(said, LocalisedPhoto) else None
     for row in asked:
         found = new.heard[write_id, row]
@@ -153,7 +134,7 @@ def _hear_new(
             there = in_frame(new.localised[row], feature_map.frame)
             apart = float(np.linalg.norm(there.cam_from_local.center - found.cam_from_local.center))
             spread += _spread(there)
-        _sort_in(found, source_of[row], new.photos[row].name, apart, spread, options, corroborating, against)
+        _sort_in(found, source_of[row], new.photos[row].name, apart, spread, corroborating, against)
 
 
 def _sort_in(
@@ -162,12 +143,11 @@ def _sort_in(
     name: str,
     apart_m: float,
     variance: float,
-    options: CorroborationOptions,
     corroborating: list[CorroboratingImage],
     against: list[str],
 ) -> None:
     """A photo that the map has where it is known to be speaks for it, another one against it."""
-    if apart_m > max(options.least_m, options.sigmas * float(np.sqrt(variance))):
+    if apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(variance))):
         against.append(f"{name} is {apart_m:.2f} m from where the map has it")
         return
     corroborating.append(
@@ -198,7 +178,6 @@ def _images_around(
     others: Sequence[FeatureMap],
     own: set[Source],
     sources: Sources,
-    options: CorroborationOptions,
 ) -> list[tuple[FeatureMap, MapImage, Source]]:
     """Images of other maps whose owners' word counts, nearest to the map's cameras first."""
     centers = np.array([image.cam_from_local.center for image in feature_map.images])
@@ -212,13 +191,13 @@ def _images_around(
                 continue
             center = here_from_other.act(image.cam_from_local.center)
             distance = float(np.linalg.norm(centers - center, axis=1).min())
-            if distance <= options.near_m + _reach(centers):
+            if distance <= NEAR_M + _reach(centers):
                 found.append((distance, f"{other.map_id} {image.name}", other, image, source))
     chosen = []
     for _, _, other, image, source in sorted(found, key=lambda e: e[:2]):
-        if len(features_and_points(other, image)[1]) >= options.min_features:
+        if len(features_and_points(other, image)[1]) >= LEAST_FEATURES:
             chosen.append((other, image, source))
-        if len(chosen) == options.max_images:
+        if len(chosen) == MOST_IMAGES:
             break
     return chosen
 

@@ -3,20 +3,26 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from featuredb.store import Database, Snapshot
 from featuredb.store.canaries import list_canaries
 from ingest.fingerprint import digest, options_fingerprint
 from ingest.growth.gates import Gate
+from ingest.growth.place.localised import QUERY
+from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.workspace import read_json, write_json
 
+_VERSION = "1"  # raised when the same question gets another answer
 
-def question(database: Database, snapshot: Snapshot, photos: Sequence[str], options: Any) -> str:
+
+def question(
+    database: Database, snapshot: Snapshot, photos: Sequence[str], options: ConfirmationOptions
+) -> str:
     """Digest of all that an examination depends on: live maps, canaries, photos (their digests), options."""
     maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
-    return digest(options_fingerprint(options), *maps, "|", *canaries, "|", *sorted(photos))
+    asks = options_fingerprint(options, QUERY)
+    return digest(_VERSION, asks, *maps, "|", *canaries, "|", *sorted(photos))
 
 
 def recall(work: Path | None, map_id: str, asked: str) -> tuple[str, str, tuple[Gate, ...]] | None:
@@ -38,8 +44,7 @@ def remember(
         return
     told = [{**asdict(gate), "passes": bool(gate.passes), "figure": float(gate.figure)} for gate in gates]
     write_json(
-        _file(work, map_id),
-        {"question": asked, "reason_code": reason_code, "reason": reason, "gates": told},
+        _file(work, map_id), {"question": asked, "reason_code": reason_code, "reason": reason, "gates": told}
     )
 
 

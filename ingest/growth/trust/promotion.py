@@ -2,9 +2,9 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from featuredb.errors import ConflictError, StoreError
 from featuredb.maps.feature_map import FeatureMap
@@ -12,63 +12,39 @@ from featuredb.store import Database, MapSummary, Snapshot
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import mark_confirmed
 from featuredb.store.changes import is_imported
+from ingest.growth import gates
 from ingest.growth.gates import Gate
-from ingest.growth.trust.canaries import CanaryOptions, CanaryRun, run_canaries
+from ingest.growth.trust.canaries import CanaryRun, run_canaries
 from ingest.growth.trust.confirmation import Confirmation, ConfirmationOptions, Sources, confirm
-from ingest.growth.trust.corroboration import CorroborationOptions, NewPhotos, corroborate
+from ingest.growth.trust.corroboration import NewPhotos, corroborate
 from ingest.growth.trust.examined import question, recall, remember
 from ingest.growth.trust.trusted_points import answering_with, confirmed_points
 from reloc.localiser import Localiser
 
 _LOG = logging.getLogger(__name__)
 _AROUND_M = 100.0  # boxes of maps that come this close may show the same
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PromotionOptions:
-    """What a promotion needs.
-
-    Attributes:
-        answer_with: "confirmed": only points that independent sources have seen keep their descriptors and
-            answer queries; "all": a photo that is altered in one part brings that part in.
-    """
-
-    answer_with: Literal["confirmed", "all"] = "confirmed"
-    confirmation: ConfirmationOptions = field(default_factory=ConfirmationOptions)
-    corroboration: CorroborationOptions = field(default_factory=CorroborationOptions)
-    canaries: CanaryOptions = field(default_factory=CanaryOptions)
+PARENT_MOVED = "was placed anew"  # said of maps whose parent was, see featuredb.store.changes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ExaminedMap:
-    """A map that others confirm; `feature_map` has descriptors where they do."""
+    """A map that others confirm, and the write id of its state in the database.
+
+    Attributes:
+        feature_map: with descriptors where they confirm it: a photo that is altered in one part brings that
+            part in otherwise.
+        earned: candidate ids of its photos that make a record for their owners.
+    """
 
     feature_map: FeatureMap
     confirmation: Confirmation
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Ready:
-    """A map that only the canaries may still refuse, and the write id of its state in the database.
-
-    `earned`: candidate ids of its photos that make a record for their owners.
-    """
-
-    map_id: str
     write_id: str
-    found: ExaminedMap
     earned: frozenset[str]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Promotion:
-    """What became of one quarantined map.
-
-    Attributes:
-        promoted: whether it is active now.
-        reason_code, reason: why it stays in quarantine; the reason of the promotion otherwise.
-        gates: of confirmation and canaries.
-    """
+    """What became of one quarantined map, and why it stays one or was promoted."""
 
     map_id: str
     promoted: bool
@@ -82,18 +58,19 @@ class Promotion:
             "promoted": self.promoted,
             "reason_code": self.reason_code,
             "reason": self.reason,
-            "gates": {gate.name: gate.as_json() for gate in self.gates},
+            "gates": gates.figures(self.gates),
         }
 
 
 def promote_confirmed(
     database: Database,
     localiser: Localiser,
-    options: PromotionOptions | None = None,
+    confirmation: ConfirmationOptions | None = None,
     new: NewPhotos | None = None,
     *,
     budget_m: float,
     work: Path | None = None,
+    threads: int = 1,
 ) -> list[Promotion]:
     """Try every quarantined map that growth has made.
 
@@ -106,36 +83,36 @@ def promote_confirmed(
     Raises:
         StoreError
     """
-    options = options or PromotionOptions()
+    confirmation = confirmation or ConfirmationOptions()
     snapshot = database.snapshot()
-    sources = Sources(owners=read_owners(database, snapshot), trusted=options.confirmation.trusted)
-    asked = _question(database, snapshot, sources, new, options)
-    waiting = [m for m in snapshot.maps() if m.status == "quarantined" and m.method == "map"]
-    ready: list[_Ready] = []
-    outcomes: list[Promotion] = []
+    sources = Sources(owners=read_owners(database, snapshot), trusted=confirmation.trusted)
+    asked = _question(database, snapshot, sources, new, confirmation)
     open_maps: list[MapSummary] = []
-    for summary in waiting:
+    ready: list[ExaminedMap] = []
+    outcomes: list[Promotion] = []
+    for summary in snapshot.maps():
+        if summary.status != "quarantined" or summary.method != "map":
+            continue
         held_back = _held_back(summary, snapshot, budget_m)
+        known = None if held_back else recall(work, summary.map_id, asked)
         if held_back is not None:
             outcomes.append(held_back)
-            continue
-        known = recall(work, summary.map_id, asked)
-        if known is not None:
+        elif known is not None:
             outcomes.append(_stays(summary.map_id, *known))
-            continue
-        open_maps.append(summary)
-    for summary, found in zip(open_maps, _examined(open_maps, snapshot, sources, options, new), strict=True):
-        if isinstance(found, Confirmation):
-            gate = found.gate
-            outcomes.append(_stays(summary.map_id, gate.reason, gate.message, (gate,)))
-            remember(work, summary.map_id, asked, gate.reason, gate.message, (gate,))
         else:
-            ready.append(_committed(database, summary, found, sources))
+            open_maps.append(summary)
+    found = _examined(open_maps, snapshot, sources, confirmation, new, threads)
+    for summary, one in zip(open_maps, found, strict=True):
+        if isinstance(one, ExaminedMap):
+            ready.append(_committed(database, summary, one))
+        else:
+            outcomes.append(_stays(summary.map_id, one.gate.reason, one.gate.message, (one.gate,)))
+            remember(work, summary.map_id, asked, one.gate.reason, one.gate.message, (one.gate,))
     if ready:
-        decided = _promote(database, localiser, ready, options)
+        decided = _promote(database, localiser, ready)
         now = database.snapshot()
         sources = replace(sources, owners=read_owners(database, now))
-        after = _question(database, now, sources, new, options)
+        after = _question(database, now, sources, new, confirmation)
         for outcome in decided:
             if not outcome.promoted and outcome.reason_code != "CONFLICT":
                 remember(work, outcome.map_id, after, outcome.reason_code, outcome.reason, outcome.gates)
@@ -147,14 +124,15 @@ def _examined(
     waiting: Sequence[MapSummary],
     snapshot: Snapshot,
     sources: Sources,
-    options: PromotionOptions,
+    by: ConfirmationOptions,
     new: NewPhotos | None,
+    threads: int,
 ) -> list[ExaminedMap | Confirmation]:
     """All of them, with the records that they make for each other: else what two newcomers show beside what
     an anchor shows would lose its descriptors, which do not come back.
     """
     while True:
-        found = [examine(snapshot.load_map(m.map_id), snapshot, sources, options, new) for m in waiting]
+        found = [examine(snapshot.load_map(m.map_id), snapshot, sources, by, new, threads) for m in waiting]
         more = sources.with_records(
             sources.owners.of_image(one.feature_map, image)
             for one in found
@@ -168,11 +146,15 @@ def _examined(
 
 
 def _question(
-    database: Database, snapshot: Snapshot, sources: Sources, new: NewPhotos | None, options: PromotionOptions
+    database: Database,
+    snapshot: Snapshot,
+    sources: Sources,
+    new: NewPhotos | None,
+    by: ConfirmationOptions,
 ) -> str:
     photos = [] if new is None else [new.photos[row].sha256 for row in new.rows]
     records = [f"{owner} is on record" for owner in sources.owners.on_record]
-    return question(database, snapshot, [*photos, *records], options)
+    return question(database, snapshot, [*photos, *records], by)
 
 
 def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool) -> Promotion:
@@ -188,8 +170,7 @@ def promote_by_hand(database: Database, map_id: str, reason: str, *, force: bool
         return Promotion(map_id=map_id, promoted=True, reason_code="", reason="it was active already")
     if summary.status == "retired":
         raise StoreError(f"map {map_id} is retired ({summary.status_reason}); commit it again")
-    before = Localiser.open(database)
-    gate = canary_gate(_tried(database, before, [snapshot.load_map(map_id)], PromotionOptions()))
+    gate = _tried(database, Localiser.open(database), [snapshot.load_map(map_id)]).gate
     if not gate.passes and not force:
         return _stays(map_id, gate.reason, gate.message, (gate,))
     text = f"{reason} (by hand; {gate.message})"
@@ -202,69 +183,44 @@ def examine(
     feature_map: FeatureMap,
     snapshot: Snapshot,
     sources: Sources,
-    options: PromotionOptions,
+    by: ConfirmationOptions,
     new: NewPhotos | None,
+    threads: int = 1,
 ) -> ExaminedMap | Confirmation:
     """How far others confirm a map: photos of its own, and from outside; the map, where they do."""
-    heard = corroborate(
-        feature_map,
-        _others(feature_map.map_id, snapshot),
-        new,
-        sources,
-        options.corroboration,
-        write_id=snapshot.get(feature_map.map_id).write_id,
-    )
-    confirmation = confirm(
-        feature_map, sources, options.confirmation, heard.corroborating, heard.contradictions
-    )
+    write_id = snapshot.get(feature_map.map_id).write_id
+    others = _others(feature_map.map_id, snapshot)
+    heard = corroborate(feature_map, others, new, sources, write_id=write_id, threads=threads)
+    confirmation = confirm(feature_map, sources, by, heard.corroborating, heard.contradictions)
     if not confirmation.gate.passes:
         return confirmation
-    part = feature_map
-    if options.answer_with == "confirmed":
-        points = confirmed_points(feature_map, sources, options.confirmation, heard.corroborating)
-        part = answering_with(feature_map, points)
-    return ExaminedMap(feature_map=part, confirmation=confirmation)
-
-
-def canary_gate(run: CanaryRun) -> Gate:
-    """Whether no known answer got worse."""
-    return Gate(
-        name="canaries",
-        reason="CANARY",
-        figure=len(run.regressions),
-        limit=0,
-        passes=not run.regressions,
-        message=run.message,
+    points = confirmed_points(feature_map, sources, by, heard.corroborating)
+    contributed = sources.owners.made_of.get(feature_map.map_id, frozenset())
+    earned = {i.sha256[:32] for i in feature_map.images if i.image_id in confirmation.earned}
+    return ExaminedMap(
+        feature_map=answering_with(feature_map, points),
+        confirmation=confirmation,
+        write_id=write_id,
+        earned=frozenset(earned & contributed),
     )
 
 
 def _held_back(summary: MapSummary, snapshot: Snapshot, budget_m: float) -> Promotion | None:
     """What keeps a map in quarantine before anybody is asked."""
     if is_imported(summary.status, summary.status_reason):
-        return _stays(summary.map_id, "IMPORTED", summary.status_reason, ())
-    if "was placed anew" in summary.status_reason:
-        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason, ())
-    inactive = [p for p in summary.parents if not _active(snapshot, p)]
-    if len(inactive) == len(summary.parents):
-        return _stays(
-            summary.map_id, "NO_PARENT", f"no active map holds it: {', '.join(inactive)} is not active", ()
-        )
-    if summary.drift_m is not None and summary.drift_m > budget_m:
-        return _stays(
-            summary.map_id,
-            "DRIFT_BUDGET",
-            f"it may have drifted {summary.drift_m:.2f} m from its anchors, {budget_m:.2f} m are allowed",
-            (),
-        )
-    return None
+        return _stays(summary.map_id, "IMPORTED", summary.status_reason)
+    if PARENT_MOVED in summary.status_reason:
+        return _stays(summary.map_id, "PARENT_MOVED", summary.status_reason)
+    active = {m.map_id for m in snapshot.maps() if m.status == "active"}
+    if not active.intersection(summary.parents):
+        text = f"no active map holds it: {', '.join(summary.parents)} is not active"
+        return _stays(summary.map_id, "NO_PARENT", text)
+    gate = gates.drift(summary.drift_m or 0.0, budget_m)
+    return None if gate.passes else _stays(summary.map_id, gate.reason, gate.message)
 
 
-def _active(snapshot: Snapshot, map_id: str) -> bool:
-    return any(m.map_id == map_id and m.status == "active" for m in snapshot.maps())
-
-
-def _stays(map_id: str, code: str, reason: str, gates: tuple[Gate, ...]) -> Promotion:
-    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=gates)
+def _stays(map_id: str, code: str, reason: str, asked: tuple[Gate, ...] = ()) -> Promotion:
+    return Promotion(map_id=map_id, promoted=False, reason_code=code, reason=reason, gates=asked)
 
 
 def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
@@ -272,78 +228,65 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
     me = snapshot.get(map_id)
     if me.box is None:
         return []
-    box = me.box
     near = snapshot.maps_in(
         me.epsg,
-        box.min_easting - _AROUND_M,
-        box.min_northing - _AROUND_M,
-        box.max_easting + _AROUND_M,
-        box.max_northing + _AROUND_M,
+        me.box.min_easting - _AROUND_M,
+        me.box.min_northing - _AROUND_M,
+        me.box.max_easting + _AROUND_M,
+        me.box.max_northing + _AROUND_M,
     )
     heard = [m for m in near if m.map_id != map_id and not is_imported(m.status, m.status_reason)]
     same = [m for m in heard if m.extractor_fingerprint == me.extractor_fingerprint]
     return [snapshot.load_map(m.map_id) for m in same if m.height_datum == me.height_datum]
 
 
-def _committed(database: Database, summary: MapSummary, found: ExaminedMap, sources: Sources) -> _Ready:
+def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> ExaminedMap:
     """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    feature_map, write_id = found.feature_map, summary.write_id
-    if int(feature_map.observations.has_descriptor.sum()) != summary.descriptors:
-        result = database.commit_map(feature_map, replaces=summary.map_id, based_on=write_id, moves=False)
-        write_id = result.write_id
-    known, earned = sources.owners.made_of.get(summary.map_id, frozenset()), found.confirmation.earned
-    theirs = frozenset(i.sha256[:32] for i in feature_map.images if i.image_id in earned)
-    return _Ready(map_id=summary.map_id, write_id=write_id, found=found, earned=theirs & known)
+    if int(found.feature_map.observations.has_descriptor.sum()) == summary.descriptors:
+        return found
+    result = database.commit_map(
+        found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
+    )
+    return replace(found, write_id=result.write_id)
 
 
-def _promote(
-    database: Database,
-    before: Localiser,
-    ready: Sequence[_Ready],
-    options: PromotionOptions,
-) -> list[Promotion]:
+def _promote(database: Database, before: Localiser, ready: Sequence[ExaminedMap]) -> list[Promotion]:
     """Ask the canaries: of all of them together, and one by one where that shows a regression."""
-    together = _tried(database, before, [r.found.feature_map for r in ready], options)
+    together = _tried(database, before, [found.feature_map for found in ready])
     if not together.regressions or len(ready) == 1:
         return _decide(database, before, ready, together)
     outcomes: list[Promotion] = []
-    localiser = before
-    for item in ready:
-        run = _tried(database, localiser, [item.found.feature_map], options)
-        decided = _decide(database, localiser, [item], run)
-        outcomes += decided
-        if decided[0].promoted:
-            localiser = Localiser.open(database, previous=localiser)
+    for found in ready:
+        run = _tried(database, before, [found.feature_map])
+        outcomes += _decide(database, before, [found], run)
+        if outcomes[-1].promoted:
+            before = Localiser.open(database, previous=before)
     return outcomes
 
 
-def _tried(
-    database: Database, before: Localiser, maps: Sequence[FeatureMap], options: PromotionOptions
-) -> CanaryRun:
+def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
     after = Localiser.open(database, previous=before, also=[m.map_id for m in maps])
-    return run_canaries(database, before, after, maps, options.canaries)
+    return run_canaries(database, before, after, maps)
 
 
 def _decide(
-    database: Database, before: Localiser, ready: Sequence[_Ready], run: CanaryRun
+    database: Database, before: Localiser, ready: Sequence[ExaminedMap], run: CanaryRun
 ) -> list[Promotion]:
-    gate = canary_gate(run)
-    ids = [r.map_id for r in ready]
-    gates = {r.map_id: (r.found.confirmation.gate, gate) for r in ready}
-    if not gate.passes:
-        return [_stays(m, gate.reason, gate.message, gates[m]) for m in ids]
-    confirmed = "; ".join(dict.fromkeys(r.found.confirmation.message for r in ready))
+    asked = {found.feature_map.map_id: (found.confirmation.gate, run.gate) for found in ready}
+    if not run.gate.passes:
+        return [_stays(m, run.gate.reason, run.message, of) for m, of in asked.items()]
+    confirmed = "; ".join(dict.fromkeys(found.confirmation.message for found in ready))
     reason = f"{confirmed}; {run.message}"
-    asked = database.snapshot(before.snapshot)
-    active = [m.write_id for m in asked.maps() if m.status == "active"]
-    for item in ready:
-        mark_confirmed(database, item.earned, item.map_id)
+    active = [m.write_id for m in database.snapshot(before.snapshot).maps() if m.status == "active"]
+    based_on = {found.feature_map.map_id: found.write_id for found in ready}
+    for found in ready:
+        mark_confirmed(database, found.earned, found.feature_map.map_id)
     try:
-        database.set_status(
-            ids, "active", reason, based_on={r.map_id: r.write_id for r in ready}, active=active
-        )
+        database.set_status(list(asked), "active", reason, based_on=based_on, active=active)
     except ConflictError as error:
-        _LOG.info("promotion of %s waits: %s", ids, error)
-        return [_stays(m, "CONFLICT", str(error), gates[m]) for m in ids]
-    _LOG.info("promoted %s: %s", ids, reason)
-    return [Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=gates[m]) for m in ids]
+        _LOG.info("promotion of %s waits: %s", list(asked), error)
+        return [_stays(m, "CONFLICT", str(error), of) for m, of in asked.items()]
+    _LOG.info("promoted %s: %s", list(asked), reason)
+    return [
+        Promotion(map_id=m, promoted=True, reason_code="", reason=reason, gates=of) for m, of in asked.items()
+    ]

@@ -6,7 +6,7 @@ covers the map, the rigid motion that brings the map's points onto its surface m
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +18,12 @@ from featuredb.geometry.rotation import so3_exp, so3_log
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.lidar.load import load_cloud
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.render.cloud import PointCloud
 from featuredb.store import Database
 from featuredb.store.scans import has_scans
-from ingest.growth.gates import Gate, sigmas_limit
-from ingest.growth.map_places import growth_of
+from ingest.growth.gates import SIGMAS, Gate, sigmas_limit
+from ingest.growth.map_places import growth_of, with_growth
+from ingest.growth.values import LEAST_VIEWS, MAD
 from ingest.register.structure.surface_fit import (
     MIN_REACH_M,
     Surface,
@@ -33,123 +33,86 @@ from ingest.register.structure.surface_fit import (
 )
 
 _LOG = logging.getLogger(__name__)
-_MAD = 1.4826  # standard deviation of a normal distribution over its median absolute value
-_CUT = 3.0  # sigmas beyond which a point is of something else: a wall, a car
-_NARROW, _WIDE_TO_NARROW = 0.0, (2.0, 1.0, 0.5, 0.0)  # metres; 0: `_CUT`
+_NARROW, _WIDE_TO_NARROW = 0.0, (2.0, 1.0, 0.5, 0.0)  # metres; 0: `SIGMAS`
 _ROUNDS = 5  # of nearest planes, each cut
 _OPEN = np.diag([1.0] * 3 + [1e-8] * 3)  # 1 rad and 10 km: what nothing holds
+_LEAST_POINTS, _MOST_POINTS = 100, 8000  # over the scan; fewer decide nothing, more say nothing new
+_SCAN_SIGMA_M = 0.1  # of a scan on Earth, per axis: what airborne scans promise
+_CELL_M = 5.0  # points of one patch of roof are off together; a cell of this size counts as one
+# Of the points over the scan, those within its reach. Honest maps have 0.4 and more, maps that float or are
+# sunk by 10 m up to 0.15. It is asked only of maps whose claim is smaller than the reach.
+_LEAST_NEAR = 0.1
+_MARGIN_M = 20.0  # of scan around the map
+# Of the squared distances, by which a far place must lie better than the one nearby: flat ground lies
+# anywhere, and a fit from afar slides.
+_LEAST_GAIN = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ScanCheckOptions:
-    """When a scan says that a map is elsewhere.
-
-    Attributes:
-        min_views: of the points that take part; two views leave points along a ray.
-        min_points: over the scan; fewer decide nothing.
-        max_sigmas: of the motion, in standard deviations of the map's placement, the scan and the fit.
-        scan_sigma_m: of a scan on Earth, per axis: what airborne scans promise.
-        cell_m: points of one patch of roof are off together; a cell of this size counts as one.
-        min_gain: of the squared distances, by which a far place must lie better than the one nearby: flat
-            ground lies anywhere, and a fit from afar slides.
-        min_near_share: of the points over the scan, those within its reach. Honest maps have 0.4 and more,
-            maps that float or are sunk by 10 m up to 0.15. It is asked only of maps whose claim is
-            smaller than the reach.
-        margin_m: of scan around the map. max_points: of the map; more say nothing new.
-    """
-
-    min_views: int = 3
-    min_points: int = 100
-    max_sigmas: float = 3.0
-    scan_sigma_m: float = 0.1
-    cell_m: float = 5.0
-    min_near_share: float = 0.1
-    margin_m: float = 20.0
-    min_gain: float = 0.1
-    max_points: int = 8000
-
-
-def scan_gate(
-    database: Database, feature_map: FeatureMap, options: ScanCheckOptions
-) -> tuple[Gate | None, str]:
-    """The gate, or None where no scan, or too little of one, says anything about the map.
+def checked_by_scan(database: Database, feature_map: FeatureMap) -> tuple[FeatureMap, Gate | None, str]:
+    """The map with the gate's figure in its evidence; the gate, None where no scan says anything of it.
 
     Args:
         feature_map: with the covariance of its placement on Earth.
 
     Returns:
-        The gate, and why a scan that is there could not be compared, "" otherwise.
+        The third is why a scan that is there could not be compared, "" otherwise.
 
     Raises:
         StoreError: the scans cannot be read.
     """
-    if not has_scans(database):
-        return None, ""
-    points = _points(feature_map, options)
-    if len(points) < options.min_points:
-        return None, ""
-    low, high = points[:, :2].min(axis=0) - options.margin_m, points[:, :2].max(axis=0) + options.margin_m
+    points = _points(feature_map) if has_scans(database) else np.zeros((0, 3))
+    if len(points) < _LEAST_POINTS:
+        return feature_map, None, ""
+    low, high = points[:, :2].min(axis=0) - _MARGIN_M, points[:, :2].max(axis=0) + _MARGIN_M
+    gate, why = None, ""
     try:
         cloud = load_cloud(database, feature_map.frame, (*low.tolist(), *high.tolist()))
-        if not len(cloud.xyz):
-            return None, ""
-        if cloud.height_datum != feature_map.height_datum:
-            return None, _unasked(
-                feature_map, f"its heights are {feature_map.height_datum}, theirs {cloud.height_datum}"
-            )
-        return cloud_gate(cloud, points, feature_map.placement.covariance, options), ""
+        if len(cloud.xyz) and cloud.height_datum != feature_map.height_datum:
+            why = f"its heights are {feature_map.height_datum}, theirs {cloud.height_datum}"
+        elif len(cloud.xyz):
+            gate = cloud_gate(cloud, points, feature_map.placement.covariance)
     except (MissingExtraError, ScanError) as error:  # no small_gicp; heights of several datums
-        return None, _unasked(feature_map, str(error))
+        why = str(error)
+    if gate is not None:
+        told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}
+        return with_growth(feature_map, gates=told), gate, ""
+    if why:
+        why = f"map {feature_map.map_id} was not compared with the scans in store: {why}"
+        _LOG.warning("%s", why)
+    return feature_map, None, why
 
 
-def _unasked(feature_map: FeatureMap, why: str) -> str:
-    note = f"map {feature_map.map_id} was not compared with the scans in store: {why}"
-    _LOG.warning("%s", note)
-    return note
-
-
-def cloud_gate(
-    cloud: PointCloud, points: FloatArray, covariance: FloatArray, options: ScanCheckOptions
-) -> Gate | None:
+def cloud_gate(cloud: PointCloud, points: FloatArray, covariance: FloatArray) -> Gate | None:
     """The gate for points (n, 3) in the cloud's local frame, of a placement with that covariance (7, 7)."""
     surface = surface_near(cloud, points)
     if surface is None:
         return None
-    over = points[_over_scan(surface, points, options)]
-    if len(over) < options.min_points:
+    over = points[_over_scan(surface, points)]
+    if len(over) < _LEAST_POINTS:
         return None
     reach = reach_of(surface)
     distances = plane_distances(surface, over, reach)
     near = np.isfinite(distances)
     middle = over.mean(axis=0)
     jacobian = point_jacobian(middle)
-    claim = jacobian @ covariance @ jacobian.T + np.eye(3) * options.scan_sigma_m**2
-    claimed_m = options.max_sigmas * float(np.sqrt(np.linalg.eigvalsh(claim)[-1]))
-    if near.mean() < options.min_near_share:
+    claim = jacobian @ covariance @ jacobian.T + np.eye(3) * _SCAN_SIGMA_M**2
+    claimed_m = SIGMAS * float(np.sqrt(np.linalg.eigvalsh(claim)[-1]))
+    if near.mean() < _LEAST_NEAR:
         if claimed_m > reach:
             return None
-        return _gate(np.inf, options, f"{near.mean():.0%} of its points lie within {reach:.1f} m of the scan")
-    laid = _Laid(surface=surface, points=over, middle=middle, options=options)
+        return _gate(np.inf, f"{near.mean():.0%} of its points lie within {reach:.1f} m of the scan")
+    laid = _Laid(surface=surface, points=over, middle=middle)
     here = laid.fitted(Rigid3.identity(), (_NARROW,))
     there = laid.fitted(Rigid3.identity(), _WIDE_TO_NARROW)
     sigma = laid.sigma_m(there)
     gain = 1.0 - laid.cost(there, sigma) / max(laid.cost(here, sigma), 1e-9)
-    best = there if gain > options.min_gain else here
-    chi2 = laid.chi_square(best, claim_at_middle(covariance, middle), sigma)
+    best = there if gain > _LEAST_GAIN else here
+    chi2 = laid.chi_square(best, covariance, sigma)
     shift = float(np.linalg.norm(best.act(middle) - middle))
     return _gate(
         chi2,
-        options,
         f"it would have to move by {shift:.2f} m to lie on the scan; its placement allows {claimed_m:.2f} m",
     )
-
-
-def claim_at_middle(covariance: FloatArray, middle: FloatArray) -> FloatArray:
-    """(6, 6) of turn and shift at a point, of a left perturbation (7, 7) of the map's similarity."""
-    jacobian = np.zeros((6, 7))
-    jacobian[:3, 1:4] = np.eye(3)
-    jacobian[3:] = point_jacobian(middle)
-    return np.asarray(jacobian @ covariance @ jacobian.T)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,7 +122,6 @@ class _Laid:
     surface: Surface
     points: FloatArray
     middle: FloatArray
-    options: ScanCheckOptions
 
     def residuals(self, move: Rigid3) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Distances (n,) from the planes, normals (n, 3), places (n, 3)."""
@@ -173,18 +135,18 @@ class _Laid:
     def sigma_m(self, move: Rigid3) -> float:
         """Standard deviation of those distances that are not of something else."""
         distance = np.abs(self.residuals(move)[0])
-        return max(_MAD * float(np.median(distance)), 0.02)  # below is the scan's own noise
+        return max(MAD * float(np.median(distance)), 0.02)  # below is the scan's own noise
 
     def weights(self, places: FloatArray) -> FloatArray:
         """(n,) such that the points of one cell weigh one together."""
-        cells = np.floor(places / self.options.cell_m).astype(np.int64)
+        cells = np.floor(places / _CELL_M).astype(np.int64)
         _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
         return np.asarray(1.0 / count[cell.reshape(-1)])
 
     def cost(self, move: Rigid3, sigma_m: float) -> float:
         """Truncated squares of the distances."""
         distance, _, _ = self.residuals(move)
-        return float((self.weights(self.points) * np.minimum((distance / sigma_m) ** 2, _CUT**2)).sum())
+        return float((self.weights(self.points) * np.minimum((distance / sigma_m) ** 2, SIGMAS**2)).sum())
 
     def normal_equations(self, move: Rigid3, cut_m: float, sigma_m: float) -> tuple[FloatArray, FloatArray]:
         """Information (6, 6) and gradient (6,) of turn and shift at the middle."""
@@ -200,38 +162,31 @@ class _Laid:
         for cut in cuts:
             for _ in range(_ROUNDS):
                 sigma = self.sigma_m(move)
-                information, gradient = self.normal_equations(move, cut or _CUT * sigma, sigma)
+                information, gradient = self.normal_equations(move, cut or SIGMAS * sigma, sigma)
                 step = -np.linalg.solve(information + _OPEN, gradient)
                 at = move.act(self.middle)
                 turn = so3_exp(step[:3])
                 move = Rigid3(rotation=turn, translation=at + step[3:] - turn @ at) @ move
         return move
 
-    def chi_square(self, move: Rigid3, claim: FloatArray, sigma_m: float) -> float:
-        """Of the motion against nothing: what the placement, the scan and the fit leave open.
+    def chi_square(self, move: Rigid3, covariance: FloatArray, sigma_m: float) -> float:
+        """Of the motion against nothing: what the placement (7, 7), the scan and the fit leave open.
 
         Flat ground leaves shifts and the heading open, in which the fit slides; they count as far as roofs
         and walls hold them.
         """
-        information, _ = self.normal_equations(move, _CUT * sigma_m, sigma_m)
-        allowed = claim + np.linalg.inv(information + _OPEN)
+        at_middle = np.concatenate([np.eye(7)[1:4], point_jacobian(self.middle)])  # turn and shift there
+        information, _ = self.normal_equations(move, SIGMAS * sigma_m, sigma_m)
+        allowed = at_middle @ covariance @ at_middle.T + np.linalg.inv(information + _OPEN)
         # What the scan may be off differs from one end of the map to the other.
         half = float(np.percentile(np.linalg.norm(self.points - self.middle, axis=1), 90.0))
-        allowed += np.diag([1.0 / half**2] * 3 + [1.0] * 3) * self.options.scan_sigma_m**2
+        allowed += np.diag([1.0 / half**2] * 3 + [1.0] * 3) * _SCAN_SIGMA_M**2
         delta = np.concatenate([so3_log(move.rotation), move.act(self.middle) - self.middle])
         return float(delta @ np.linalg.solve(allowed, delta))
 
 
-def with_gate(feature_map: FeatureMap, gate: Gate) -> FeatureMap:
-    """The map with the gate's figure in its evidence."""
-    placement = feature_map.placement
-    growth = growth_of(placement.evidence)
-    growth = {**growth, "gates": {**growth.get("gates", {}), gate.name: gate.as_json()}}
-    return replace(feature_map, placement=replace(placement, evidence={**placement.evidence, GROWTH: growth}))
-
-
-def _gate(chi2: float, options: ScanCheckOptions, what: str) -> Gate:
-    limit = sigmas_limit(options.max_sigmas, 6)
+def _gate(chi2: float, what: str) -> Gate:
+    limit = sigmas_limit(6)
     return Gate(
         name="scan",
         reason="CONTRADICTS_SCAN",
@@ -242,18 +197,18 @@ def _gate(chi2: float, options: ScanCheckOptions, what: str) -> Gate:
     )
 
 
-def _points(feature_map: FeatureMap, options: ScanCheckOptions) -> FloatArray:
+def _points(feature_map: FeatureMap) -> FloatArray:
     """Points (n, 3) that enough photos see; single far ones would load a county of scan."""
     views = np.bincount(feature_map.observations.point_index, minlength=len(feature_map.points))
-    points = feature_map.points_local()[views >= options.min_views]
+    points = feature_map.points_local()[views >= LEAST_VIEWS]
     if not len(points):
         return points
     low, high = np.percentile(points, (1.0, 99.0), axis=0)
     inside = points[((points >= low) & (points <= high)).all(axis=1)]
-    return np.asarray(inside[:: -(-max(len(inside), 1) // options.max_points)])
+    return np.asarray(inside[:: -(-max(len(inside), 1) // _MOST_POINTS)])
 
 
-def _over_scan(surface: Surface, points: FloatArray, options: ScanCheckOptions) -> NDArray[np.bool_]:
+def _over_scan(surface: Surface, points: FloatArray) -> NDArray[np.bool_]:
     """Points with scan around them in plan: elsewhere there is a hole, and its rim says nothing."""
     cell = max(MIN_REACH_M, 2.0 * surface.spacing_m)
     filled = _cells(surface.points + surface.middle, cell)

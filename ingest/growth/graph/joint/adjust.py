@@ -8,37 +8,61 @@ the anchors among them, as a whole.
 """
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.errors import InvalidValueError
-from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.sim3 import Sim3
 from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
-from ingest.colmap.anchored import Anchored, FixedPoints, Lenses, adjust_anchored
+from ingest.colmap.anchored import AnchoredOptions, FixedPoints, Lenses, adjust_anchored
 from ingest.colmap.bridge import Model
-from ingest.growth.graph.joint.adjusted_map import adjusted_map, precision_of
+from ingest.growth.gates import SIGMAS
+from ingest.growth.graph.joint.adjusted_map import AdjustedMap, adjusted_map, precision_of
 from ingest.growth.graph.joint.joined import JoinedMaps, join_maps
 from ingest.growth.graph.joint.judge import describe, placement_sigma_m, refusal
 from ingest.growth.graph.joint.links import find_links
-from ingest.growth.graph.joint.values import JointAdjustment, JointOptions
 from ingest.growth.place.refine import in_metres
+from ingest.growth.values import LEAST_SHARED_POINTS, tied_together
 
 _AS_SURE = 2.0  # anchors up to so many times as uncertain as the surest hold the place of all
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class JointAdjustment:
+    """Adjusted maps, or why there are none.
+
+    Attributes:
+        reason: None, or UNCONNECTED, PHOTO_LOST, RESIDUALS, OBSERVATIONS_LOST, ANCHOR_MOVED; `message` for
+            people.
+        maps: those that moved, new; empty where there is a reason. reports: of all, as far as it came.
+        shared_points: points that more than one map has.
+        elsewhere: photos that other maps have elsewhere than their own; they were not heard.
+    """
+
+    reason: str | None
+    message: str
+    maps: tuple[FeatureMap, ...] = ()
+    reports: tuple[AdjustedMap, ...] = ()
+    shared_points: int = 0
+    elsewhere: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "reason": self.reason,
+            "message": self.message,
+            "maps": [report.as_json() for report in self.reports],
+            "shared_points": self.shared_points,
+            "elsewhere": list(self.elsewhere),
+        }
+
+
 def adjust_together(
-    maps: Sequence[FeatureMap],
-    held: Collection[str] = (),
-    options: JointOptions | None = None,
-    *,
-    free: Collection[str] = (),
+    maps: Sequence[FeatureMap], held: Collection[str] = (), *, free: Collection[str] = ()
 ) -> JointAdjustment:
     """Adjust maps that overlap, all at once.
 
@@ -50,19 +74,18 @@ def adjust_together(
     Raises:
         InvalidValueError: fewer than two maps, or of different extractors or datums.
     """
-    options = options or JointOptions()
     _check(maps, held)
     # What comes first lends the others its photos' poses, its lenses and points.
     maps = sorted(maps, key=lambda m: (m.map_id not in held, m.generation, -len(m.images), m.map_id))
     frame = maps[0].frame
-    links = find_links(maps, options.links)
+    links = find_links(maps)
     joined = join_maps(maps, links, frame)
     shared = int(np.triu(joined.shared, 1).sum())
-    alone = _unconnected(maps, joined.shared, options.min_shared_points)
+    alone = _unconnected(maps, joined.shared)
     if alone:
         return JointAdjustment(
             reason="UNCONNECTED",
-            message=f"maps {', '.join(alone)} have fewer than {options.min_shared_points} points in common "
+            message=f"maps {', '.join(alone)} have fewer than {LEAST_SHARED_POINTS} points in common "
             f"with the others; {links.heard} photos were found in other maps"
             + (
                 f", {len(links.elsewhere)} others {links.elsewhere_m:,.0f} m from where their own map has "
@@ -80,7 +103,7 @@ def adjust_together(
         joined.keypoints,
         FixedPoints.none(),
         Lenses(held=np.unique(joined.model.camera_of[constant]).tolist(), focal_px=joined.known_focal_px),
-        options.adjust,
+        AnchoredOptions(),
         held_photos=constant.tolist(),
         held_points=np.unique(
             np.concatenate([np.zeros(0, np.int64), *(joined.maps[a].point_of for a in kept)])
@@ -88,7 +111,24 @@ def adjust_together(
     )
     if not len(constant):
         result = replace(result, model=in_metres(result.model, _back(maps, joined, result.model)))
-    return _judged(maps, held, free, joined, result, frame, shared, links.elsewhere, options)
+    reports = describe(maps, held, joined, result, frame)
+    reason, message = refusal(maps, free, joined, result.model, reports)
+    adjusted: list[FeatureMap] = []
+    if reason is None:
+        precision = precision_of(joined, result.model)
+        adjusted = [
+            adjusted_map(feature_map, joined.maps[a], result, precision, frame, maps, reports[a])
+            for a, feature_map in enumerate(maps)
+            if feature_map.map_id not in held
+        ]
+    return JointAdjustment(
+        reason=reason,
+        message=message,
+        maps=tuple(adjusted),
+        reports=tuple(reports),
+        shared_points=shared,
+        elsewhere=links.elsewhere,
+    )
 
 
 def _photos_of(joined: JoinedMaps, maps: Sequence[int]) -> NDArray[np.int64]:
@@ -111,11 +151,11 @@ def _check(maps: Sequence[FeatureMap], held: Collection[str]) -> None:
         raise InvalidValueError("adjust_together: all maps are held, nothing could move")
 
 
-def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64], least: int) -> list[str]:
+def _unconnected(maps: Sequence[FeatureMap], shared: NDArray[np.int64]) -> list[str]:
     """Maps outside the largest group of maps with enough points in common."""
-    _, label = connected_components(sparse.csr_array((shared >= least).astype(np.int8)), directed=False)
-    largest = int(np.argmax(np.bincount(label)))
-    return [m.map_id for m, group in zip(maps, label.tolist(), strict=True) if group != largest]
+    groups = tied_together(range(len(maps)), zip(*np.nonzero(shared >= LEAST_SHARED_POINTS), strict=True))
+    largest = int(np.argmax(np.bincount(groups)))
+    return [m.map_id for m, group in zip(maps, groups, strict=True) if group != largest]
 
 
 def _back(maps: Sequence[FeatureMap], joined: JoinedMaps, adjusted: Model) -> Sim3:
@@ -135,7 +175,7 @@ def _back(maps: Sequence[FeatureMap], joined: JoinedMaps, adjusted: Model) -> Si
             break
         best = found
         off = np.linalg.norm(best.act(source) - target, axis=1)
-        weights = off <= 3.0 * max(float(np.median(off)), 1e-9)
+        weights = off <= SIGMAS * max(float(np.median(off)), 1e-9)
     return best
 
 
@@ -148,34 +188,3 @@ def _reach(model: Model, rows: NDArray[np.int64]) -> FloatArray:
     centers = model.centers()[rows]
     axes = np.array([model.cam_from_sfm[r].rotation for r in rows.tolist()])
     return np.concatenate([centers, *(centers + distance * axes[:, k] for k in range(3))])
-
-
-def _judged(
-    maps: Sequence[FeatureMap],
-    held: Collection[str],
-    free: Collection[str],
-    joined: JoinedMaps,
-    result: Anchored,
-    frame: LocalFrame,
-    shared: int,
-    elsewhere: tuple[str, ...],
-    options: JointOptions,
-) -> JointAdjustment:
-    reports = describe(maps, held, joined, result, frame)
-    reason, message = refusal(maps, free, joined, result.model, reports, options)
-    adjusted: list[FeatureMap] = []
-    if reason is None:
-        precision = precision_of(joined, result.model)
-        adjusted = [
-            adjusted_map(feature_map, joined.maps[a], result, precision, frame, maps, reports[a])
-            for a, feature_map in enumerate(maps)
-            if feature_map.map_id not in held
-        ]
-    return JointAdjustment(
-        reason=reason,
-        message=message,
-        maps=tuple(adjusted),
-        reports=tuple(reports),
-        shared_points=shared,
-        elsewhere=elsewhere,
-    )

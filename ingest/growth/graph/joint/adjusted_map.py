@@ -1,7 +1,8 @@
 """A map made anew of the reconstruction in which it was adjusted with others."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,19 +17,37 @@ from ingest.colmap.anchored import Anchored
 from ingest.colmap.bridge import Model
 from ingest.colmap.precision import linearise, point_covariances, residual_variance, upper_triangle
 from ingest.growth.graph.joint.joined import JoinedMaps, MapRows, observed_pixels
-from ingest.growth.graph.joint.values import JOINT, AdjustedMap
+
+JOINT = "joint"  # key of Placement.evidence
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Precision:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AdjustedMap:
+    """What became of one map.
+
+    Attributes:
+        held: it was not to move.
+        shape_m: root mean square of what its camera centres moved against each other: what no similarity of
+            the map explains. move_m: largest way of a camera centre from where the map has it.
+        sigma_before_px, sigma_px: of its reprojection errors, before and after.
+        kept: share of its observations that still fit.
+    """
+
+    map_id: str
+    held: bool
+    photos: int
+    shape_m: float
+    move_m: float
+    sigma_before_px: float
+    sigma_px: float
+    kept: float
+
+    def as_json(self) -> dict[str, Any]:
+        return {key: round(v, 4) if isinstance(v, float) else v for key, v in asdict(self).items()}
+
+
+def precision_of(joined: JoinedMaps, model: Model) -> tuple[FloatArray, FloatArray]:
     """Of all points of the model: covariances (n, 3, 3) in its frame, mean errors (n,) in pixels."""
-
-    covariance: FloatArray
-    error_px: FloatArray
-
-
-def precision_of(joined: JoinedMaps, model: Model) -> Precision:
-    """Of the points of an adjusted model."""
     linear = linearise(
         model.cameras,
         model.camera_of,
@@ -38,21 +57,18 @@ def precision_of(joined: JoinedMaps, model: Model) -> Precision:
         model.photo_of,
         observed_pixels(joined, model),
     )
-    variance = residual_variance(linear, len(model.rows), len(model.xyz))
-    errors = np.bincount(
-        model.point_of, weights=np.linalg.norm(linear.residual, axis=1), minlength=len(model.xyz)
-    )
-    return Precision(
-        covariance=point_covariances(linear, len(model.xyz), variance),
-        error_px=errors / np.maximum(model.track_lengths(), 1),
-    )
+    count = len(model.xyz)
+    variance = residual_variance(linear, len(model.rows), count)
+    off = np.linalg.norm(linear.residual, axis=1)
+    errors = np.bincount(model.point_of, weights=off, minlength=count) / np.maximum(model.track_lengths(), 1)
+    return point_covariances(linear, count, variance), errors
 
 
 def adjusted_map(
     feature_map: FeatureMap,
     rows: MapRows,
     result: Anchored,
-    precision: Precision,
+    precision: tuple[FloatArray, FloatArray],
     frame: LocalFrame,
     together: Sequence[FeatureMap],
     report: AdjustedMap,
@@ -71,12 +87,9 @@ def adjusted_map(
     index, joint = index.reshape(-1).astype(np.int64), joint_point[first]
     places = to_own.act(model.xyz[joint])
     move = similarity_closed_form(feature_map.points_local()[points], places) if len(points) >= 3 else None
-    turned = to_own.rotation @ precision.covariance[joint] @ to_own.rotation.T
+    turned = to_own.rotation @ precision[0][joint] @ to_own.rotation.T
     placement = feature_map.placement
-    evidence = {
-        **placement.evidence,
-        JOINT: {"with": sorted(m.map_id for m in together), **report.as_json()},
-    }
+    told = {JOINT: {"with": sorted(m.map_id for m in together), **report.as_json()}}
     return replace(
         feature_map,
         cameras=tuple(cameras),
@@ -85,14 +98,14 @@ def adjusted_map(
             utm=feature_map.frame.utm_from_enu(places, feature_map.epsg),
             rgb=old.rgb[points],
             track_length=np.bincount(index, minlength=len(points)).astype(np.int32),
-            error_px=precision.error_px[joint].astype(np.float32),
+            error_px=precision[1][joint].astype(np.float32),
             covariance=upper_triangle(turned),
         ),
         observations=replace(take_observations(seen, kept), point_index=index),
         placement=replace(
             placement,
             local_from_sfm=(move or Sim3.identity()) @ placement.local_from_sfm,
-            evidence=evidence,
+            evidence={**placement.evidence, **told},
         ),
     )
 

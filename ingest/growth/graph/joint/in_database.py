@@ -7,14 +7,12 @@ from typing import Any
 from featuredb.errors import InvalidValueError
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
-from featuredb.maps.lineage import GROWTH
 from featuredb.store import Database, MapSummary, Snapshot
-from ingest.growth.graph.joint.adjust import adjust_together
-from ingest.growth.graph.joint.values import JointAdjustment, JointOptions
-from ingest.growth.graph.map_graph import StoredEdge, place_of
+from ingest.growth.graph.joint.adjust import JointAdjustment, adjust_together
+from ingest.growth.graph.map_graph import place_of
 from ingest.growth.graph.replacing import ask_persons_canaries
-from ingest.growth.map_places import growth_of
-from ingest.growth.trust.canaries import CanaryOptions
+from ingest.growth.map_places import growth_of, with_growth
+from ingest.growth.values import Edge
 
 # Their places were measured by more than photos.
 _MEASURED = ("lidar", "gcp")
@@ -50,19 +48,13 @@ class DatabaseAdjustment:
 
 
 def adjust_maps(
-    database: Database,
-    named: Sequence[str],
-    *,
-    free: Collection[str] = (),
-    dry_run: bool = False,
-    options: JointOptions | None = None,
+    database: Database, named: Sequence[str], *, free: Collection[str] = (), dry_run: bool = False
 ) -> DatabaseAdjustment:
     """Adjust active maps together, with all active maps that hang on them, held by the parents of them all.
 
     Args:
         named: ids or their first letters.
         free: anchors, likewise, that may move although LiDAR or control points placed them; others are held.
-        dry_run: adjust, and commit nothing.
 
     Raises:
         InvalidValueError: fewer than two maps, one that is not active, several extractors or datums.
@@ -81,35 +73,25 @@ def adjust_maps(
     parents = sorted({p for m in wanted for p in active[m].parents if p in active} - set(wanted))
     held |= set(parents)
     maps = [snapshot.load_map(m) for m in (*parents, *wanted)]
-    found = adjust_together(maps, held, options, free=free_ids)
-    descendants = tuple(m for m in wanted if m not in chosen)
-    if found.reason is not None:
-        return DatabaseAdjustment(
-            reason=found.reason, message=found.message, adjustment=found, descendants=descendants
-        )
-    new = _with_overlaps(found.maps, [m for m in maps if m.map_id in held])
-    canaries = ask_persons_canaries(database, {m.map_id: m for m in new}, CanaryOptions())
-    if canaries.regressions:
-        return DatabaseAdjustment(
-            reason="CANARY",
-            message=f"nothing is moved: {canaries.message}",
-            adjustment=found,
-            descendants=descendants,
-        )
-    version, flagged = -1, tuple[str, ...]()
-    if not dry_run:
-        ids = [m.map_id for m in new]
-        results = database.commit_maps(new, replaces=ids, based_on={m: active[m].write_id for m in ids})
-        version = max(result.version for result in results)
-        flagged = tuple(sorted({m for result in results for m in result.flagged}))
-    return DatabaseAdjustment(
-        reason=None,
+    found = adjust_together(maps, held, free=free_ids)
+    told = DatabaseAdjustment(
+        reason=found.reason,
         message=found.message,
         adjustment=found,
-        version=version,
-        descendants=descendants,
-        flagged=flagged,
+        descendants=tuple(m for m in wanted if m not in chosen),
     )
+    if found.reason is not None:
+        return told
+    new = _with_overlaps(found.maps, [m for m in maps if m.map_id in held])
+    canaries = ask_persons_canaries(database, {m.map_id: m for m in new})
+    if canaries.regressions:
+        return replace(told, reason="CANARY", message=f"nothing is moved: {canaries.message}")
+    if dry_run:
+        return told
+    ids = [m.map_id for m in new]
+    results = database.commit_maps(new, replaces=ids, based_on={m: active[m].write_id for m in ids})
+    flagged = tuple(sorted({m for result in results for m in result.flagged}))
+    return replace(told, version=max(result.version for result in results), flagged=flagged)
 
 
 def _active(snapshot: Snapshot, name: str) -> str:
@@ -135,19 +117,15 @@ def _with_overlaps(maps: Sequence[FeatureMap], held: Sequence[FeatureMap]) -> li
     places = {m.map_id: place_of(m) for m in (*maps, *held)}
     new = []
     for feature_map in maps:
-        growth = growth_of(feature_map.placement.evidence)
-        if "edges" not in growth:
+        known = growth_of(feature_map.placement.evidence).get("edges")
+        if known is None:
             new.append(feature_map)
             continue
-        edges = [StoredEdge.from_json(edge) for edge in growth["edges"]]
-        growth["edges"] = [
-            (
-                replace(e, place=places[e.map_id], other_from_map=Sim3.identity())
-                if e.map_id in places
-                else replace(e, place="")
-            ).as_json()
-            for e in edges
+        edges = [
+            replace(e, place=places[e.map_id], other_from_map=Sim3.identity())
+            if e.map_id in places
+            else replace(e, place="")
+            for e in map(Edge.from_json, known)
         ]
-        evidence = {**feature_map.placement.evidence, GROWTH: growth}
-        new.append(replace(feature_map, placement=replace(feature_map.placement, evidence=evidence)))
+        new.append(with_growth(feature_map, edges=[e.as_json() for e in edges]))
     return new

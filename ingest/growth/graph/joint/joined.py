@@ -10,8 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.sparse.csgraph import connected_components
 
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -21,6 +19,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from ingest.colmap.bridge import Model
 from ingest.growth.graph.joint.links import Links
+from ingest.growth.values import tied_together
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +45,6 @@ class JoinedMaps:
         keypoints: pixels (n, 2) of each photo of the model.
         known_focal_px: by camera, what the maps say of a focal length that EXIF has told: the median. From
             above, focal length and height hardly differ in the pixels, and maps do not keep EXIF's own.
-        maps: rows of each map.
         shared: (maps, maps) numbers of points that two maps have in common.
     """
 
@@ -112,34 +110,32 @@ def join_maps(maps: Sequence[FeatureMap], links: Links, frame: LocalFrame) -> Jo
 
 
 class _Photos:
-    """Photos and cameras of all maps, each once."""
+    """Photos and cameras of all maps, each once; rows of the photos (i,) of each map's images."""
 
     def __init__(self, maps: Sequence[FeatureMap], frame: LocalFrame) -> None:
         self.poses: list[Rigid3] = []
         self.camera_of: list[int] = []
         self.cameras: list[Camera] = []
-        self._focals_px: dict[int, list[float]] = {}
-        camera_name = _same_cameras(maps)
-        photo_row: dict[tuple[str, ...], int] = {}
-        camera_row: dict[tuple[str, ...], int] = {}
         self.rows: list[NDArray[np.int64]] = []
+        self._focals_px: dict[int, list[float]] = {}
+        same = _same_cameras(maps)
+        photo_row: dict[tuple[str, ...], int] = {}
+        camera_row: dict[int, int] = {}
         for feature_map in maps:
             to_frame = Sim3.from_rigid3(frame.enu_from(feature_map.frame))
-            mine = []
             for image in feature_map.images:
-                name = _photo_name(feature_map, image)
-                if name not in photo_row:
-                    photo_row[name] = len(self.poses)
-                    self.poses.append(to_frame.act_on_pose(image.cam_from_local))
-                    camera = camera_name[feature_map.map_id, image.camera_id]
-                    if camera not in camera_row:
-                        camera_row[camera] = len(self.cameras)
-                        self.cameras.append(feature_map.cameras[image.camera_id])
-                    self.camera_of.append(camera_row[camera])
-                    if _tells_focal(_key(feature_map, image.camera_id)):
-                        focals = self._focals_px.setdefault(camera_row[camera], [])
-                        focals.append(feature_map.cameras[image.camera_id].focal_px)
-                mine.append(photo_row[name])
+                name, camera = _photo_name(feature_map, image), feature_map.cameras[image.camera_id]
+                if name in photo_row:
+                    continue
+                photo_row[name] = len(self.poses)
+                self.poses.append(to_frame.act_on_pose(image.cam_from_local))
+                row = camera_row.setdefault(same[feature_map.map_id, image.camera_id], len(self.cameras))
+                if row == len(self.cameras):
+                    self.cameras.append(camera)
+                self.camera_of.append(row)
+                if _tells_focal(_key(feature_map, image.camera_id)):
+                    self._focals_px.setdefault(row, []).append(camera.focal_px)
+            mine = [photo_row[_photo_name(feature_map, image)] for image in feature_map.images]
             self.rows.append(np.array(mine, dtype=np.int64))
 
     def known_focal_px(self) -> dict[int, float]:
@@ -159,26 +155,19 @@ def _tells_focal(key: str) -> bool:
     return re.search(r"\|f\d+(\||$)", key) is not None
 
 
-def _same_cameras(maps: Sequence[FeatureMap]) -> dict[tuple[str, int], tuple[str, ...]]:
-    """A name for each map's cameras; those of one EXIF key with focal length, and of one photo, have one."""
+def _same_cameras(maps: Sequence[FeatureMap]) -> dict[tuple[str, int], int]:
+    """A number for each map's cameras; those of one EXIF key with focal length, or of one photo, have one."""
     nodes = [(m.map_id, c) for m in maps for c in range(len(m.cameras))]
-    place = {node: k for k, node in enumerate(nodes)}
-    groups: dict[tuple[str, ...], list[int]] = {}
+    groups: dict[tuple[str, ...], list[tuple[str, int]]] = {}
     for feature_map in maps:
         for image in feature_map.images:
-            node = place[feature_map.map_id, image.camera_id]
+            node = feature_map.map_id, image.camera_id
             groups.setdefault(("photo", *_photo_name(feature_map, image)), []).append(node)
             key, camera = _key(feature_map, image.camera_id), feature_map.cameras[image.camera_id]
             if _tells_focal(key):
                 groups.setdefault(("key", key, f"{camera.width}x{camera.height}"), []).append(node)
-    pairs = np.array(
-        [(group[0], other) for group in groups.values() for other in group] or [(0, 0)], dtype=np.int64
-    )
-    graph = sparse.csr_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(nodes), len(nodes))
-    )
-    _, label = connected_components(graph, directed=False)
-    return {node: (str(label[k]),) for node, k in place.items()}
+    pairs = [(group[0], other) for group in groups.values() for other in group]
+    return dict(zip(nodes, tied_together(nodes, pairs), strict=True))
 
 
 def _photo_of(feature_map: FeatureMap, photos: NDArray[np.int64]) -> NDArray[np.int64]:

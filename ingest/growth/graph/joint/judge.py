@@ -10,18 +10,27 @@ from featuredb.geometry.similarity import similarity_closed_form
 from featuredb.maps.feature_map import FeatureMap
 from ingest.colmap.anchored import Anchored
 from ingest.colmap.bridge import Model
-from ingest.growth.graph.joint.adjusted_map import kept_observations
+from ingest.growth.gates import SIGMAS
+from ingest.growth.graph.joint.adjusted_map import AdjustedMap, kept_observations
 from ingest.growth.graph.joint.joined import JoinedMaps, observed_pixels
-from ingest.growth.graph.joint.values import AdjustedMap, JointOptions
 from ingest.growth.map_places import place_sigmas_m
+from ingest.growth.values import MAD, pixel_scale
+
+_LEAST_OBSERVATIONS = 15  # photos that keep fewer refuse the adjustment, if they had more
+# The residuals of a map after the adjustment over those before, or over the second where they are smaller;
+# more, and the maps contradict each other. On `sacre_coeur` they shrink. Keypoints are not located better, at
+# images of 1600; below, residuals say how few photos a map has: one of three photos of `lewis` had 0.14 px
+# alone and 0.30 px with the others, of 4,000.
+_MOST_GROWTH, _LEAST_SIGMA_PX = 1.5, 0.3
+# Share of a map's observations that must still fit. On `sacre_coeur`, whose first map was bent by a fiftieth
+# of its viewing distance, 0.98 to 1 do; 0.83 where one of two maps shows a scene that is bent as much in
+# truth.
+_LEAST_KEPT = 0.9
+_LEAST_MOVE_M = 0.05  # that an anchor's photos may move by, or `SIGMAS` of its placement
 
 
 def describe(
-    maps: Sequence[FeatureMap],
-    held: Collection[str],
-    joined: JoinedMaps,
-    result: Anchored,
-    frame: LocalFrame,
+    maps: Sequence[FeatureMap], held: Collection[str], joined: JoinedMaps, result: Anchored, frame: LocalFrame
 ) -> list[AdjustedMap]:
     """What became of each map.
 
@@ -57,35 +66,33 @@ def refusal(
     joined: JoinedMaps,
     adjusted: Model,
     reports: Sequence[AdjustedMap],
-    options: JointOptions,
 ) -> tuple[str | None, str]:
     """The first reason (see `JointAdjustment`) against the adjusted model, or None; and a message."""
     counts = [np.bincount(m.photo_of, minlength=len(m.rows)) for m in (joined.model, adjusted)]
-    poor = np.flatnonzero((counts[0] >= options.min_observations) & (counts[1] < options.min_observations))
+    poor = np.flatnonzero((counts[0] >= _LEAST_OBSERVATIONS) & (counts[1] < _LEAST_OBSERVATIONS))
     if len(poor):
         return "PHOTO_LOST", (
-            f"{len(poor)} photos keep fewer than {options.min_observations} of their observations: the maps "
+            f"{len(poor)} photos keep fewer than {_LEAST_OBSERVATIONS} of their observations: the maps "
             "contradict each other there"
         )
     for feature_map, report in zip(maps, reports, strict=True):
-        side = max(max(camera.width, camera.height) for camera in feature_map.cameras)
-        least = options.least_sigma_px * max(1.0, side / options.reference_side_px)
-        limit = options.max_residual_growth * max(report.sigma_before_px, least)
+        least = _LEAST_SIGMA_PX * pixel_scale(*feature_map.cameras)
+        limit = _MOST_GROWTH * max(report.sigma_before_px, least)
         if report.sigma_px > limit:
             return "RESIDUALS", (
                 f"map {report.map_id}: residuals of {report.sigma_before_px:.2f} px became "
                 f"{report.sigma_px:.2f} px, at most {limit:.2f} px are expected"
             )
-    poor_maps = [r for r in reports if r.kept < options.min_kept]
+    poor_maps = [r for r in reports if r.kept < _LEAST_KEPT]
     if poor_maps:
         return "OBSERVATIONS_LOST", (
             f"map {poor_maps[0].map_id}: {poor_maps[0].kept:.0%} of its observations still fit, "
-            f"{options.min_kept:.0%} are needed: the maps contradict each other"
+            f"{_LEAST_KEPT:.0%} are needed: the maps contradict each other"
         )
     for feature_map, report in zip(maps, reports, strict=True):
         if feature_map.parents or report.held or report.map_id in free:
             continue
-        most = max(options.sigmas * placement_sigma_m(feature_map), options.least_move_m)
+        most = max(SIGMAS * placement_sigma_m(feature_map), _LEAST_MOVE_M)
         if report.move_m > most:
             return "ANCHOR_MOVED", (
                 f"map {report.map_id} would move by {report.move_m:.2f} m, its own placement allows "
@@ -112,7 +119,7 @@ def _own_sigma_px(feature_map: FeatureMap) -> float:
 
 
 def _sigma_px(off: FloatArray) -> float:
-    return 1.4826 * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else 0.0
+    return MAD * float(np.nanmedian(np.abs(off))) if np.isfinite(off).any() else 0.0
 
 
 def _sigmas_px(joined: JoinedMaps, model: Model) -> list[float]:

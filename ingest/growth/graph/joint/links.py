@@ -5,35 +5,21 @@ An image that the others have elsewhere than its own map is not heard: it shows 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.index.area import build_area
-from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap
 from ingest.growth.map_images import features_and_points
-from ingest.growth.place.localised import LocaliseEachOptions, in_frame
-from ingest.growth.place.overlaps import localise_image
-from reloc.localise.candidates import IndexedArea
+from ingest.growth.place.localised import in_frame
+from ingest.growth.place.overlaps import indexed_area, localise_image
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LinkOptions:
-    """When points of two maps are taken for one.
-
-    Attributes:
-        min_features: observations with descriptors that an image needs to be asked.
-        max_shift_rel: how far the others may have an image from where its own map has it, over its median
-            viewing distance. Maps of six photos are off by some 3 %; a street further on is another place.
-        min_share: of the votes on both points that name this pair.
-    """
-
-    min_features: int = 30
-    max_shift_rel: float = 0.1
-    min_share: float = 0.5
-    localise: LocaliseEachOptions = field(default_factory=LocaliseEachOptions)
+_LEAST_FEATURES = 30  # observations with descriptors that an image needs to be asked
+# How far the others may have an image from where its own map has it, over its median viewing distance. Maps
+# of six photos are off by some 3 %; a street further on is another place.
+_MOST_SHIFT = 0.1
+_LEAST_SHARE = 0.5  # of the votes on both points that name a pair
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,27 +41,25 @@ class Links:
     elsewhere_m: float = 0.0
 
 
-def find_links(maps: Sequence[FeatureMap], options: LinkOptions) -> Links:
+def find_links(maps: Sequence[FeatureMap]) -> Links:
     """Links between any two of the maps; they have one extractor and one height datum."""
     found: list[NDArray[np.int64]] = []
     heard, elsewhere = 0, dict[str, float]()
     for a, feature_map in enumerate(maps):
-        others = [m for m in maps if m is not feature_map]
         index = {m.map_id: b for b, m in enumerate(maps)}
-        area = build_area(others)
-        indexed = IndexedArea(area=area, index=build_index(area.descriptors))
+        indexed = indexed_area(*(m for m in maps if m is not feature_map))
         for row, image in enumerate(feature_map.images):
-            features, points = features_and_points(feature_map, image)
-            if len(features) < options.min_features:
+            _, points = features_and_points(feature_map, image)
+            if len(points) < _LEAST_FEATURES:
                 continue
-            photo = localise_image(feature_map, image, row, [indexed], options.localise)
+            photo = localise_image(feature_map, image, row, [indexed])
             if photo is None:
                 continue
             center = image.cam_from_local.center
             there = in_frame(photo, feature_map.frame).cam_from_local.center
             reach = float(np.median(np.linalg.norm(feature_map.points_local()[points] - center, axis=1)))
             shift = float(np.linalg.norm(there - center))
-            if shift > options.max_shift_rel * max(reach, 1e-9):
+            if shift > _MOST_SHIFT * max(reach, 1e-9):
                 elsewhere[image.name] = shift
                 continue
             heard += 1
@@ -85,12 +69,10 @@ def find_links(maps: Sequence[FeatureMap], options: LinkOptions) -> Links:
             swap = b < a
             quads[swap] = quads[swap][:, [2, 3, 0, 1]]
             found.append(quads)
-    return _voted(np.concatenate([np.zeros((0, 4), np.int64), *found]), heard, elsewhere, options)
+    return _voted(np.concatenate([np.zeros((0, 4), np.int64), *found]), heard, elsewhere)
 
 
-def _voted(
-    quads: NDArray[np.int64], heard: int, elsewhere: Mapping[str, float], options: LinkOptions
-) -> Links:
+def _voted(quads: NDArray[np.int64], heard: int, elsewhere: Mapping[str, float]) -> Links:
     """The pairs that most of the images that have a say name, on both sides, most votes first."""
     pairs, votes = np.unique(quads, axis=0, return_counts=True)
     sure = np.ones(len(pairs), dtype=np.bool_)
@@ -98,7 +80,7 @@ def _voted(
         key = pairs[:, [*one, other]]
         _, number = np.unique(key, axis=0, return_inverse=True)
         total = np.bincount(number.reshape(-1), weights=votes)
-        sure &= votes > options.min_share * total[number.reshape(-1)]
+        sure &= votes > _LEAST_SHARE * total[number.reshape(-1)]
     pairs, votes = pairs[sure], votes[sure]
     pairs = pairs[np.lexsort((*pairs.T[::-1], -votes))]
     return Links(
