@@ -15,7 +15,7 @@ from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
 from ingest.growth.trust.confirmation import ConfirmationOptions
-from ingest.growth.trust.promotion import Promotion, PromotionOptions, promote_by_hand, promote_confirmed
+from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from reloc.localiser import Localiser
 from tests.support.scene_strip import FRAME, note_contributed, put_on_record, strip_map
 
@@ -41,7 +41,7 @@ def _add(database: Database, feature_map: FeatureMap, owner: str = "") -> None:
 
 
 def _promoted(database: Database, *trusted: str) -> dict[str, Promotion]:
-    options = PromotionOptions(confirmation=ConfirmationOptions(trusted=trusted))
+    options = ConfirmationOptions(trusted=trusted)
     found = promote_confirmed(database, Localiser.open(database), options, budget_m=0.5)
     return {outcome.map_id: outcome for outcome in found}
 

@@ -13,7 +13,6 @@ from featuredb.maps.lineage import GROWTH
 from ingest.growth import gates
 from ingest.growth.graph import budget
 from ingest.growth.graph.budget import rows_within
-from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.values import GrownMap, MapsPlacement
 from tests.support.scenes import box_points, random_descriptors, ring, scene_map
 
@@ -78,7 +77,7 @@ def test_each_photo_that_is_cut_off_says_why(monkeypatch: pytest.MonkeyPatch) ->
     )
     monkeypatch.setattr(budget, "rows_within", lambda *_: [0, 1, 2, 4])
     monkeypatch.setattr(budget, "keep_photos", cut)
-    found = budget.grow_within_budget(whole, grown, {}, ConfirmationOptions(), BUDGET_M)  # type: ignore[arg-type]
+    found = budget.grow_within_budget(whole, grown, {}, BUDGET_M)  # type: ignore[arg-type]
     assert isinstance(found, GrownMap)
     codes = {row: code for row, (code, _) in found.left_out.items()}
     assert codes == {3: "WEAK_LINK", 4: "DRIFT_BUDGET", 5: "DRIFT_BUDGET"}
