@@ -25,11 +25,14 @@ class DescriptorIndex:
     def __len__(self) -> int:
         return int(self._index.ntotal)
 
-    def search(self, descriptors: NDArray[np.uint8], k: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def search(
+        self, descriptors: NDArray[np.uint8], k: int, among: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The k nearest rows of each descriptor.
 
         Args:
             descriptors: (n, 128) uint8.
+            among: (rows,) which rows may be found; None: all.
 
         Returns:
             Squared distances (n, k) float32, ascending, and rows (n, k) int64, -1 where there are fewer.
@@ -37,7 +40,17 @@ class DescriptorIndex:
         if len(self) == 0 or len(descriptors) == 0:
             shape = (len(descriptors), k)
             return np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int64)
-        distance, row = self._index.search(descriptors.astype(np.float32), k)
+        parameters: Any = None
+        if among is not None:
+            lists = isinstance(self._index, faiss.IndexIVF)
+            parameters = faiss.SearchParametersIVF() if lists else faiss.SearchParameters()
+            bits = np.packbits(among, bitorder="little")
+            select: Any = faiss.IDSelectorBitmap  # its stub is that of C++
+            selector = select(bits)
+            parameters.sel = selector
+            if lists:
+                parameters.nprobe = self._index.nprobe
+        distance, row = self._index.search(descriptors.astype(np.float32), k, params=parameters)
         return distance, row
 
 

@@ -101,7 +101,7 @@ def _existing(model: Model, k: int, sim: Sim3, areas: Sequence[Area], frame: Loc
     pixels = [np.zeros((0, 2))]
     for area in areas:
         in_area = pose @ frame.enu_from(area.frame)
-        rows = visible_points(area, np.arange(len(area.points), dtype=np.int64), camera, in_area)
+        rows = visible_points(area, area.searched_points(), camera, in_area)
         pixels.append(camera.project(in_area.act(area.points[rows])))
     return np.concatenate(pixels)
 
