@@ -43,6 +43,14 @@ class _Loaded:
     indexed: IndexedArea
 
 
+@dataclass(frozen=True, slots=True)
+class _Given(Generic[_Value]):
+    value: _Value
+
+    def __call__(self) -> _Value:
+        return self.value
+
+
 class OnDemand(Generic[_Value]):
     """An area that answers only where it is named: read when somebody first names it, and kept."""
 
@@ -58,9 +66,10 @@ class OnDemand(Generic[_Value]):
                 self._value = self._read()
             return self._value
 
-    def read(self) -> _Value:
-        """The same, not kept."""
-        return self._read() if self._value is None else self._value
+    def __reduce__(self) -> tuple[object, ...]:
+        """With its value, which is not kept for that."""
+        value = self._read() if self._value is None else self._value
+        return OnDemand, (self.write_id, _Given(value))
 
 
 _OwnArea = tuple[UnplacedMap, IndexedArea]

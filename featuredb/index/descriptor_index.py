@@ -19,8 +19,13 @@ _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the
 class DescriptorIndex:
     """Nearest descriptors of an area. Searching is thread-safe; the object never changes."""
 
-    def __init__(self, index: Any) -> None:
-        self._index = index
+    def __init__(self, index: Any, memory: NDArray[np.uint8] | None = None) -> None:
+        """`memory`: where the index has its arrays, if it does not own them."""
+        self._index, self._memory = index, memory
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """As bytes, which are not copied where they are read."""
+        return _in_memory, (faiss.serialize_index(self._index),)
 
     def __len__(self) -> int:
         return int(self._index.ntotal)
@@ -80,6 +85,12 @@ def build_index(descriptors: NDArray[np.uint8]) -> DescriptorIndex:
     for start in range(0, count, 100_000):
         index.add(descriptors[start : start + 100_000].astype(np.float32))
     return DescriptorIndex(index)
+
+
+def _in_memory(memory: NDArray[np.uint8]) -> DescriptorIndex:
+    library: Any = faiss  # its stubs lack these
+    reader = library.ZeroCopyIOReader(library.swig_ptr(memory), memory.nbytes)
+    return DescriptorIndex(faiss.read_index(reader), memory)
 
 
 def use_threads(count: int) -> None:

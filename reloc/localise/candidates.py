@@ -17,7 +17,7 @@ from reloc.localise.options import CandidateOptions
 _FAR_BELOW_M = 100_000.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class IndexedArea:
     """An area and the index over its descriptors."""
 
