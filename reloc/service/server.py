@@ -128,6 +128,10 @@ class Server:
         except zenoh.ZError as error:
             session.close()
             raise ServiceStartError(f"cannot declare the keys of {database!r}: {error}") from error
+        except ServiceStartError:
+            server._watch.close()
+            session.close()
+            raise
         return server
 
     def _declare(self) -> None:

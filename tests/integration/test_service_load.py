@@ -12,6 +12,8 @@ from featuredb.features.decode import DecodeLimits
 from reloc.client import NO_SERVER, Client
 from reloc.service.logs import JsonLinesFormatter
 from reloc.service.options import ServeOptions
+from reloc.service.session import ServiceStartError
+from reloc.service.workers import process
 from reloc.wire.query import ErrorCode, LocaliseReply
 from tests.support.service import (
     Gate,
@@ -67,6 +69,18 @@ def test_a_busy_server_is_asked_again_while_there_is_time():
         assert outcome(client, timeout_s=0.3) == "BUSY"
         gate.open()
         assert [f.result(timeout=10) for f in (first, second, third)] == ["not_localised"] * 3
+
+
+def test_a_server_whose_workers_cannot_be_started_does_not_start(monkeypatch):
+    def start(self):
+        raise EOFError
+
+    monkeypatch.setattr(process._CONTEXT.Process, "start", start)
+    with (
+        pytest.raises(ServiceStartError, match="no worker process comes up"),
+        running_server(ScriptedLocaliser(1)),
+    ):
+        pass
 
 
 def test_a_full_queue_says_busy_at_once_and_answers_the_others():

@@ -93,6 +93,8 @@ class WorkerPool:
         with self._changed:
             self._changed.wait_for(lambda: self._up or len(self._failed) == len(self._threads))
             if not self._up:
+                self._closing.set()
+                self._queue.close()
                 raise ServiceStartError(f"no worker process comes up: {next(iter(self._failed.values()))}")
 
     def abandon(self, item: PendingQuery) -> None:
@@ -139,11 +141,13 @@ class WorkerPool:
         while process is None or not process.is_alive():
             if process is not None:
                 self._gone(process)
-            process = WorkerProcess(self._limits)
+                process = None
             try:
+                process = WorkerProcess(self._limits)
                 process.open(self._published)
             except WorkerEndedError as error:
-                self._gone(process)
+                if process is not None:
+                    self._gone(process)
                 process = None
                 logger.exception("a worker does not come up", extra={"fields": {"event": "worker_failed"}})
                 with self._changed:

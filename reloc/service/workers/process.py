@@ -68,6 +68,7 @@ class WorkerProcess:
     """A process that answers one query at a time; of one thread, but for `kill`."""
 
     def __init__(self, limits: WorkerLimits) -> None:
+        """Raises WorkerEndedError where no process can be started."""
         self._connection, theirs = _CONTEXT.Pipe()
         self._open: LocaliserFiles | None = None
         self._process = _CONTEXT.Process(
@@ -76,6 +77,9 @@ class WorkerProcess:
         try:
             with _without_script():
                 self._process.start()
+        except (EOFError, OSError) as error:  # no memory, or whom it is forked from has ended
+            self._connection.close()
+            raise WorkerEndedError(None) from error
         finally:
             theirs.close()
 
