@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,8 @@ _LOG = logging.getLogger(__name__)
 # Maps whose boxes come this close belong to one area: a photo may see both.
 _AREA_GAP_M = 300.0
 
+_Value = TypeVar("_Value")
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Loaded:
@@ -38,6 +41,38 @@ class _Loaded:
     key: tuple[str, ...]
     map_ids: frozenset[str]
     indexed: IndexedArea
+
+
+@dataclass(frozen=True, slots=True)
+class _Given(Generic[_Value]):
+    value: _Value
+
+    def __call__(self) -> _Value:
+        return self.value
+
+
+class OnDemand(Generic[_Value]):
+    """An area that answers only where it is named: read when somebody first names it, and kept."""
+
+    def __init__(self, write_id: str, read: Callable[[], _Value]) -> None:
+        self.write_id = write_id
+        self._read = read
+        self._lock = threading.Lock()
+        self._value: _Value | None = None
+
+    def get(self) -> _Value:
+        with self._lock:
+            if self._value is None:
+                self._value = self._read()
+            return self._value
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """With its value, which is not kept for that."""
+        value = self._read() if self._value is None else self._value
+        return OnDemand, (self.write_id, _Given(value))
+
+
+_OwnArea = tuple[UnplacedMap, IndexedArea]
 
 
 class Localiser:
@@ -49,8 +84,8 @@ class Localiser:
         options: LocaliseOptions,
         snapshot: int,
         lineages: Mapping[str, MapLineage],
-        unplaced: Mapping[str, Callable[[], UnplacedMap]] | None = None,
-        provisional: Mapping[str, Callable[[], FeatureMap]] | None = None,
+        unplaced: Mapping[str, OnDemand[_OwnArea]] | None = None,
+        provisional: Mapping[str, OnDemand[IndexedArea]] | None = None,
     ) -> None:
         self._loaded = tuple(loaded)
         self._options = options
@@ -59,8 +94,6 @@ class Localiser:
         self._lineages = dict(lineages)
         self._unplaced = dict(unplaced or {})
         self._provisional = dict(provisional or {})
-        self._own: tuple[UnplacedMap, IndexedArea] | None = None
-        self._own_lock = threading.Lock()
 
     @classmethod
     def open(
@@ -98,13 +131,15 @@ class Localiser:
             key = tuple(sorted(f"trial {m.map_id}" if m.map_id in trial else m.write_id for m in group))
             tried = any(m.map_id in trial for m in group)
             loaded.append(known[key] if key in known and not tried else _load(snapshot, group, key, trial))
+        had = {d.write_id: d for d in previous._unplaced.values()} if previous else {}
         unplaced = {
-            m.map_id: partial(snapshot.load_unplaced, m.map_id)
+            m.map_id: had.get(m.write_id) or OnDemand(m.write_id, partial(_own_area, snapshot, m.map_id))
             for m in snapshot.unplaced_maps()
             if m.descriptors
         }
+        held = {d.write_id: d for d in previous._provisional.values()} if previous else {}
         provisional = {
-            m.map_id: partial(snapshot.load_map, m.map_id)
+            m.map_id: held.get(m.write_id) or OnDemand(m.write_id, partial(_area_of_one, snapshot, m.map_id))
             for m in snapshot.maps()
             if m.status == "quarantined" and m.method == "gps" and m.map_id not in also and m.descriptors
         }
@@ -142,7 +177,7 @@ class Localiser:
             UnplacedBesideOthersError: it is named beside others.
         """
         map_id = self._named_unplaced(map_ids)
-        return None if map_id is None else self._read_unplaced(map_id)
+        return None if map_id is None else self._unplaced[map_id].get()
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         """Pose of the image (h, w) uint8, or the reason why there is none.
@@ -185,19 +220,9 @@ class Localiser:
 
     def _in_own_frame(self, gray: NDArray[np.uint8], request: LocaliseRequest, map_id: str) -> LocaliseResult:
         """The pose in the own frame of a map without a place, or the reason why there is none."""
-        unplaced, indexed = self._read_unplaced(map_id)
+        unplaced, indexed = self._unplaced[map_id].get()
         told = replace(request, prior=None, beyond=None, map_ids=None)
         return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
-
-    def _read_unplaced(self, map_id: str) -> tuple[UnplacedMap, IndexedArea]:
-        """A map without a place, at its stand-in; the one that was asked last is kept."""
-        with self._own_lock:
-            if self._own is None or self._own[0].map_id != map_id:
-                unplaced = self._unplaced[map_id]()
-                area = build_area([at_stand_in(unplaced)])
-                index = build_index(area.descriptors)
-                self._own = (unplaced, IndexedArea(area=area, index=index))
-            return self._own
 
     def with_lineage(self, result: LocaliseResult) -> LocaliseResult:
         """The result of one of the areas, with the chain to its anchors for each map that answered."""
@@ -218,7 +243,7 @@ class Localiser:
         return replace(result, pose=replace(result.pose, lineage=tuple(told)))
 
     def _chosen(self, map_ids: tuple[str, ...] | None) -> list[IndexedArea]:
-        """The areas, or new ones of the named maps only."""
+        """The areas, or those of the named maps, of which only these are searched."""
         if map_ids is None:
             return [loaded.indexed for loaded in self._loaded]
         wanted = set(map_ids)
@@ -228,17 +253,29 @@ class Localiser:
                 f"snapshot {self._snapshot} serves no map {', '.join(sorted(unknown))}; "
                 "`featuredb maps` lists what there is"
             )
-        chosen = []
-        for loaded in self._loaded:
-            if loaded.map_ids <= wanted:
-                chosen.append(loaded.indexed)
-            elif loaded.map_ids & wanted:
-                area = build_area([m for m in loaded.indexed.area.maps if m.map_id in wanted])
-                chosen.append(IndexedArea(area=area, index=build_index(area.descriptors)))
-        for map_id in sorted(wanted & self._provisional.keys()):
-            area = build_area([self._provisional[map_id]()])
-            chosen.append(IndexedArea(area=area, index=build_index(area.descriptors)))
-        return chosen
+        chosen = [
+            loaded.indexed if loaded.map_ids <= wanted else loaded.indexed.only(wanted)
+            for loaded in self._loaded
+            if loaded.map_ids & wanted
+        ]
+        return chosen + [
+            self._provisional[map_id].get() for map_id in sorted(wanted & self._provisional.keys())
+        ]
+
+
+def _indexed(maps: Sequence[FeatureMap]) -> IndexedArea:
+    area = build_area(maps)
+    return IndexedArea(area=area, index=build_index(area.descriptors))
+
+
+def _area_of_one(snapshot: Snapshot, map_id: str) -> IndexedArea:
+    return _indexed([snapshot.load_map(map_id)])
+
+
+def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
+    """A map without a place, and its area at the stand-in."""
+    unplaced = snapshot.load_unplaced(map_id)
+    return unplaced, _indexed([at_stand_in(unplaced)])
 
 
 def _load(
@@ -247,14 +284,10 @@ def _load(
     key: tuple[str, ...],
     instead: Mapping[str, FeatureMap],
 ) -> _Loaded:
-    area = build_area([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
-    index = build_index(area.descriptors)
-    _LOG.info("area of %d maps: %d points, %d images", len(group), len(area.points), len(area.image_map))
-    return _Loaded(
-        key=key,
-        map_ids=frozenset(m.map_id for m in group),
-        indexed=IndexedArea(area=area, index=index),
-    )
+    indexed = _indexed([instead.get(m.map_id) or snapshot.load_map(m.map_id) for m in group])
+    points, images = len(indexed.area.points), len(indexed.area.image_map)
+    _LOG.info("area of %d maps: %d points, %d images", len(group), points, images)
+    return _Loaded(key=key, map_ids=frozenset(m.map_id for m in group), indexed=indexed)
 
 
 def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:

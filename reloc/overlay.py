@@ -119,7 +119,7 @@ def map_points_in_view(areas: Sequence[IndexedArea], reply: LocaliseReply) -> Fl
         grid_from_local = area.frame.grid_from_enu(center, utm.epsg)
         rotation = matrix_from_quaternion(utm.cam_from_utm_xyzw) @ grid_from_local
         cam_from_local = Rigid3(rotation=rotation, translation=-rotation @ center)
-        rows = visible_points(area, np.arange(len(area.points)), camera, cam_from_local)
+        rows = visible_points(area, area.searched_points(), camera, cam_from_local)
         return area.frame.utm_from_enu(area.points[rows], utm.epsg)
     return np.empty((0, 3))
 

@@ -32,12 +32,15 @@ class DecodeLimits:
         max_bytes: file size; the largest JPEGs of today's drones and phones have some 50 MB.
         max_pixels: width times height; medium-format cameras have 102 million, and 120 million are
             360 MB as colour.
+        max_scan_pixels: pixels times the passes over them that a JPEG asks for. Encoders make some ten,
+            which the largest pictures may have; smaller ones may have more.
         max_side_px: a JPEG's own limit; longer sides are panoramas, which no single camera model fits.
         min_side_px: below this SIFT finds too few keypoints to place anything, and icons are meant.
     """
 
     max_bytes: int = 64 << 20
     max_pixels: int = 120_000_000
+    max_scan_pixels: int = 1_200_000_000
     max_side_px: int = 65_500
     min_side_px: int = 64
 
@@ -45,7 +48,9 @@ class DecodeLimits:
 DEFAULT_LIMITS = DecodeLimits()
 # A person's own files may be larger than a stranger's query; smaller pictures are thumbnails, with too few
 # features to hold in a map.
-INGEST_LIMITS = DecodeLimits(max_bytes=256 << 20, max_pixels=200_000_000, min_side_px=240)
+INGEST_LIMITS = DecodeLimits(
+    max_bytes=256 << 20, max_pixels=200_000_000, max_scan_pixels=2_000_000_000, min_side_px=240
+)
 
 
 def probe(data: bytes | Path, limits: DecodeLimits = DEFAULT_LIMITS) -> ImageHeader:
@@ -116,6 +121,12 @@ def _check(data: bytes, limits: DecodeLimits) -> ImageHeader:
         raise ImageError(
             f"the image has {size} pixels, the limit is {limits.max_pixels / 1e6:g} million", "too_large"
         )
+    if header.width * header.height * header.scans > limits.max_scan_pixels:
+        raise ImageError(
+            f"the JPEG has {header.scans} scans of {size} pixels, the limit of both together is "
+            f"{limits.max_scan_pixels / 1e6:g} million; save it as a baseline JPEG",
+            "too_large",
+        )
     if max(header.width, header.height) > limits.max_side_px:
         raise ImageError(
             f"the image has {size} pixels, the limit of a side is {limits.max_side_px}", "too_large"
@@ -135,7 +146,7 @@ def _decode(data: bytes | Path, limits: DecodeLimits, flags: int) -> NDArray[np.
             f"{pixels.shape[1]}x{pixels.shape[0]}",
             "broken",
         )
-    if header.format == "JPEG" and _ends_early(content, header, pixels, flags):
+    if header.format == "JPEG" and header.scans == 1 and _ends_early(content, header, pixels, flags):
         raise ImageError(
             "the JPEG's end marker comes before its last pixels; copy the file again", "truncated"
         )
@@ -155,8 +166,8 @@ def _ends_early(content: bytes, header: ImageHeader, pixels: NDArray[np.uint8], 
 
     Only a picture whose last block is all fill is suspected, so others pay nothing. A complete picture
     needs no byte before its end marker beyond its own: it stays the same when some are added there,
-    whereas a cut one takes them as its next pixels. A progressive JPEG that is cut after its first scan
-    is a complete picture of lower quality, and passes.
+    whereas a cut one takes them as its next pixels. A JPEG of several scans that is cut is a picture of
+    lower quality, and is not decoded twice.
     """
     last_block = pixels[(header.height - 1) // 8 * 8 :, (header.width - 1) // 8 * 8 :]
     if not bool((last_block == _JPEG_FILL).all()):

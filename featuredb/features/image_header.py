@@ -40,6 +40,7 @@ class ImageHeader:
         width, height: pixels as stored, before EXIF orientation.
         exif: (start, stop) of the TIFF stream with the EXIF in the file's bytes, or None.
         xmp: (start, stop) of the XMP packet, or None.
+        scans: passes over the picture that decoding takes; more than one in progressive JPEGs.
         end: offset after the last byte of the image; cameras append previews and videos behind it.
     """
 
@@ -48,6 +49,7 @@ class ImageHeader:
     height: int
     exif: tuple[int, int] | None = None
     xmp: tuple[int, int] | None = None
+    scans: int = 1
     end: int = 0
 
 
@@ -152,7 +154,10 @@ def _jpeg(data: bytes) -> ImageHeader:
         if marker == 0xD9:
             if frame is None or not scans:
                 raise ImageError("the JPEG ends before any picture", "broken")
-            return ImageHeader(format="JPEG", width=frame[0], height=frame[1], exif=exif, xmp=xmp, end=at + 2)
+            width, height = frame
+            return ImageHeader(
+                format="JPEG", width=width, height=height, exif=exif, xmp=xmp, scans=scans, end=at + 2
+            )
         body, stop = at + 4, at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
         if max(body, stop) > len(data):
             raise _truncated("JPEG", data, f"within the segment at byte {at}")

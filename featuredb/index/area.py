@@ -6,8 +6,9 @@ in it.
 
 import logging
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,7 @@ class Area:
         covisible: (i, i) sparse, numbers of shared points; between maps, of neighbouring places.
         extractor_fingerprint: of all descriptors.
         modes: (m,) joint errors of each map, None of those that keep none.
+        searched: (m,) which maps take part in a search; the others are there as if they were not.
     """
 
     frame: LocalFrame
@@ -71,6 +73,19 @@ class Area:
     covisible: sparse.csr_array
     extractor_fingerprint: str
     modes: tuple[ErrorModes | None, ...]
+    searched: NDArray[np.bool_]
+
+    def only(self, map_ids: Collection[str]) -> "Area":
+        """The same arrays, of which only these maps are searched; nothing is laid out anew."""
+        return replace(self, searched=np.array([m.map_id in map_ids for m in self.maps]))
+
+    def searched_points(self) -> NDArray[np.int64]:
+        """Rows of the points of the maps that are searched."""
+        return np.flatnonzero(self.searched[self.point_map])
+
+    def searched_images(self) -> NDArray[np.bool_]:
+        """(i,) which images are of the maps that are searched."""
+        return np.asarray(self.searched[self.image_map], dtype=np.bool_)
 
     def points_of_images(self, images: NDArray[np.intp]) -> NDArray[np.int32]:
         """Rows of the points that any of these images sees, ascending, without repetition."""
@@ -86,7 +101,7 @@ class Area:
         first: it was only taken where the images asked for it.
         """
         taken: Counter[Camera] = Counter()
-        for feature_map in self.maps:
+        for feature_map in compress(self.maps, self.searched):
             images = Counter(image.camera_id for image in feature_map.images)
             for c, key in enumerate(feature_map.camera_keys[: len(feature_map.cameras)]):
                 if key and key == camera_key:
@@ -96,7 +111,7 @@ class Area:
     def cameras_of_film(self, film: str) -> list[Camera]:
         """Intrinsics that the maps have of a film's shots, each once; `film`: `film_lens.unnamed_model`."""
         found: dict[Camera, None] = {}
-        for feature_map in self.maps:
+        for feature_map in compress(self.maps, self.searched):
             for camera, key in zip(feature_map.cameras, feature_map.camera_keys, strict=False):
                 if is_of_film(key, film):
                     found[camera] = None
@@ -152,6 +167,7 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
         covisible=_covisibility(see_image, see_point, image_map, image_scene, image_reach),
         extractor_fingerprint=fingerprints[0],
         modes=tuple(_modes(feature_map) for feature_map in maps),
+        searched=np.ones(len(maps), dtype=np.bool_),
     )
 
 

@@ -19,17 +19,25 @@ _PROBES = 16  # inverted lists that a descriptor is looked for in; more find the
 class DescriptorIndex:
     """Nearest descriptors of an area. Searching is thread-safe; the object never changes."""
 
-    def __init__(self, index: Any) -> None:
-        self._index = index
+    def __init__(self, index: Any, memory: NDArray[np.uint8] | None = None) -> None:
+        """`memory`: where the index has its arrays, if it does not own them."""
+        self._index, self._memory = index, memory
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """As bytes, which are not copied where they are read."""
+        return _in_memory, (faiss.serialize_index(self._index),)
 
     def __len__(self) -> int:
         return int(self._index.ntotal)
 
-    def search(self, descriptors: NDArray[np.uint8], k: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    def search(
+        self, descriptors: NDArray[np.uint8], k: int, among: NDArray[np.bool_] | None = None
+    ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
         """The k nearest rows of each descriptor.
 
         Args:
             descriptors: (n, 128) uint8.
+            among: (rows,) which rows may be found; None: all.
 
         Returns:
             Squared distances (n, k) float32, ascending, and rows (n, k) int64, -1 where there are fewer.
@@ -37,7 +45,17 @@ class DescriptorIndex:
         if len(self) == 0 or len(descriptors) == 0:
             shape = (len(descriptors), k)
             return np.full(shape, np.inf, np.float32), np.full(shape, -1, np.int64)
-        distance, row = self._index.search(descriptors.astype(np.float32), k)
+        parameters: Any = None
+        if among is not None:
+            lists = isinstance(self._index, faiss.IndexIVF)
+            parameters = faiss.SearchParametersIVF() if lists else faiss.SearchParameters()
+            bits = np.packbits(among, bitorder="little")
+            select: Any = faiss.IDSelectorBitmap  # its stub is that of C++
+            selector = select(bits)
+            parameters.sel = selector
+            if lists:
+                parameters.nprobe = self._index.nprobe
+        distance, row = self._index.search(descriptors.astype(np.float32), k, params=parameters)
         return distance, row
 
 
@@ -67,6 +85,12 @@ def build_index(descriptors: NDArray[np.uint8]) -> DescriptorIndex:
     for start in range(0, count, 100_000):
         index.add(descriptors[start : start + 100_000].astype(np.float32))
     return DescriptorIndex(index)
+
+
+def _in_memory(memory: NDArray[np.uint8]) -> DescriptorIndex:
+    library: Any = faiss  # its stubs lack these
+    reader = library.ZeroCopyIOReader(library.swig_ptr(memory), memory.nbytes)
+    return DescriptorIndex(faiss.read_index(reader), memory)
 
 
 def use_threads(count: int) -> None:

@@ -83,7 +83,9 @@ def finder_for(
             f"--by both follows the maps of one place, found {len(maps.grounds)}; name one by --map"
         )
     area = maps.grounds[0].area
-    scan = _over(area.frame, area.image_center, _scan(database, asked.scans), database, rough)
+    scan = _over(
+        area.frame, area.image_center[area.searched_images()], _scan(database, asked.scans), database, rough
+    )
     return MapOverScanFinder(maps, scan), version
 
 

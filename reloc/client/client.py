@@ -2,6 +2,7 @@
 
 import json
 import queue
+import random
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from reloc.client.replies import NO_SERVER, TIMEOUT, read_message, service_error
 from reloc.wire.keys import ANONYMOUS, CLIENT_SETTING, Keys
 from reloc.wire.query import (
     CameraRequest,
+    ErrorCode,
     LocaliseReply,
     LocaliseWireRequest,
     PriorRequest,
@@ -32,6 +34,7 @@ DEFAULT_CONNECT = "tcp/127.0.0.1:7447"
 _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
 _DEADLINE_MARGIN_S = 0.2
+_FIRST_WAIT_S = 0.25  # before a busy server is asked again, as long as a query takes; then twice that
 _ASK_AGAIN_S = 0.05  # while no server is there yet
 
 
@@ -125,7 +128,8 @@ class Client:
             image: the image file's bytes, or its path.
             prior: where it may have been taken (degrees, metres).
             camera: intrinsics; without them EXIF, the maps' cameras or an estimate serve.
-            timeout_s: the longest wait; the server is told, and gives up in time.
+            timeout_s: the longest wait; the server is told, and gives up in time. A server that is busy is
+                asked again, ever less often, while it lasts.
             request_id: appears in the reply and in the server's log.
             inliers: the reply carries pixels and UTM points of the matches that agree.
             exif_prior: the photo's own GPS serves as prior where `prior` is None.
@@ -157,7 +161,19 @@ class Client:
         except ValidationError as error:
             raise InvalidValueError(f"localise: {error}") from error
         key = self._keys.localise(self.name)
-        return self._ask(key, LocaliseReply, timeout_s, payload=data, attachment=encode(request))
+        end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
+        while True:
+            left_s = end - time.perf_counter()
+            try:
+                return self._ask(key, LocaliseReply, left_s, payload=data, attachment=encode(request))
+            except ServiceError as error:
+                pause_s = wait_s * random.uniform(
+                    0.5, 1.5
+                )  # so that those who were refused do not return at once
+                if error.code != ErrorCode.BUSY or time.perf_counter() + pause_s >= end:
+                    raise
+            time.sleep(pause_s)
+            wait_s *= 2
 
     def status(self, timeout_s: float = _TIMEOUT_S) -> StatusReply:
         """Counts, latencies, snapshot and limits of the server."""
@@ -246,6 +262,7 @@ class Client:
             # A photo is many fragments; dropping one of them under load would lose the query silently.
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,
+            source_info=zenoh.SourceInfo(self._session().id, 0),  # one client among others
         )
         start = time.perf_counter()
         for reply in replies:

@@ -23,6 +23,7 @@ from reloc.gateway import openapi
 from reloc.gateway.failures import (
     METHOD_NOT_ALLOWED,
     NOT_FOUND,
+    NOT_READY,
     RETRY_AFTER_S,
     ErrorBody,
     status_of,
@@ -189,6 +190,9 @@ def _add_routes(app: FastAPI, gateway: Gateway) -> frozenset[str]:
             status = await gateway.status()
         except ServiceError as error:  # whatever is wrong: who balances load must not send anybody here
             return _json(ErrorBody(code=error.code, message=error.message), 503)
+        if status.queue.ready == 0:
+            message = f"none of the server's {status.queue.workers} workers can take a query"
+            return _json(ErrorBody(code=NOT_READY, message=message), 503)
         return _json(openapi.Health(database=status.database, snapshot=status.snapshot, maps=status.maps))
 
     @app.get(f"{prefix}/metrics", **openapi.METRICS)

@@ -8,6 +8,7 @@ from reloc.wire.query import ErrorCode
 
 NOT_LOCALISED = "NOT_LOCALISED"
 NOT_FOUND = "NOT_FOUND"
+NOT_READY = "NOT_READY"
 METHOD_NOT_ALLOWED = "METHOD_NOT_ALLOWED"
 NOT_ACCEPTABLE = "NOT_ACCEPTABLE"
 SLOW_BODY = "SLOW_BODY"
@@ -32,10 +33,11 @@ STATUS_OF = {
     ErrorCode.BUSY.value: 503,
     ErrorCode.SHUTTING_DOWN.value: 503,
     NO_SERVER: 503,
+    NOT_READY: 503,
     ErrorCode.DEADLINE.value: 504,
     TIMEOUT: 504,
 }
-RETRY_AFTER_S = {ErrorCode.BUSY.value: 1, ErrorCode.SHUTTING_DOWN.value: 5, NO_SERVER: 5}
+RETRY_AFTER_S = {ErrorCode.BUSY.value: 1, ErrorCode.SHUTTING_DOWN.value: 5, NO_SERVER: 5, NOT_READY: 1}
 
 
 class GatewayError(ServiceError):

@@ -25,24 +25,20 @@ class Intake:
     async def admitted(self, request: Request, media_type: str) -> AsyncIterator[Request]:
         """Within the block, the request with a body that ends in a GatewayError where it breaks a limit.
 
+        It is in hand from the end of its body on: who sends slowly takes nobody's place.
+
         Raises:
-            GatewayError: BUSY, TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also SLOW_BODY.
+            GatewayError: TOO_LARGE, UNSUPPORTED_MEDIA_TYPE; while the body is read also BUSY, SLOW_BODY.
         """
         _check_headers(request, media_type)
-        if self.in_flight >= self._options.max_in_flight:
-            raise GatewayError(
-                ErrorCode.BUSY,
-                f"{self.in_flight} photos are in hand, which is as many as are taken; try again in a second",
-            )
         body = _MeteredBody(self, request.receive, self._options)
-        self.in_flight += 1
         try:
             declared = request.headers.get("content-length", "")
             if declared.isdecimal() and int(declared) > self._options.max_body_bytes:
                 raise body.too_large()
             yield Request(request.scope, body.receive)
         finally:
-            self.in_flight -= 1
+            self.in_flight -= body.complete
             self.buffered_bytes -= body.held_bytes
 
 
@@ -70,6 +66,7 @@ class _MeteredBody:
         self._options = options
         self._end = time.monotonic() + options.body_timeout_s
         self.held_bytes = 0
+        self.complete = False
 
     async def receive(self) -> Message:
         message = await self._next()
@@ -80,7 +77,19 @@ class _MeteredBody:
             raise GatewayError(ErrorCode.BUSY, "the photos in hand fill the memory; try again in a second")
         self.held_bytes += size
         self._intake.buffered_bytes += size
+        if not (self.complete or message.get("more_body", False)):
+            self._take_place()
         return message
+
+    def _take_place(self) -> None:
+        if self._intake.in_flight >= self._options.max_in_flight:
+            raise GatewayError(
+                ErrorCode.BUSY,
+                f"{self._intake.in_flight} photos are in hand, which is as many as are taken; try again in a "
+                "second",
+            )
+        self.complete = True
+        self._intake.in_flight += 1
 
     def too_large(self) -> GatewayError:
         return GatewayError(

@@ -22,7 +22,7 @@ class GatewayOptions:
         timeout_s: the longest wait for the server's answer to one photo; Zenoh's own default.
         connect_timeout_s: the longest wait for a server to be there; who asks hears soon that none is.
         workers: questions to the server at a time; the server's own queue takes 32 and refuses the rest.
-        max_in_flight: photos in hand at a time, those that are still being received with them.
+        max_in_flight: photos in hand at a time, from the end of their bodies on.
         max_body_bytes: of one request; the server takes images of 64 MiB, which are 85.4 MiB as base64.
         max_image_bytes: of one image after base64, as the server takes them.
         max_buffered_bytes: of all bodies in hand together, so that they cannot fill the memory.

@@ -4,8 +4,10 @@ import logging
 import socket
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from featuredb.errors import FeatureDbError
 from featuredb.stop_signals import on_stop_signals
@@ -17,6 +19,32 @@ _BACKLOG = 128
 # Connections, idle ones with them; who needs more stands behind a proxy that holds them.
 _MAX_CONNECTIONS = 512
 _KEEP_ALIVE_S = 10
+_LOOK_S = 1.0  # at each connection
+
+
+class _TimedHeads(H11Protocol):
+    """Closes connections that have no request in hand for too long, also where its head comes byte by byte.
+
+    uvicorn's own timeout begins after an answer and ends with any byte.
+    """
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self._idle_since = self.loop.time()
+        self._look()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._idle_since = self.loop.time()
+
+    def _look(self) -> None:
+        if self.transport.is_closing():
+            return
+        idle = self.cycle is None or self.cycle.response_complete
+        if idle and self.loop.time() >= self._idle_since + self.timeout_keep_alive:
+            self.transport.close()
+        else:
+            self.loop.call_later(_LOOK_S, self._look)
 
 
 class GatewayStartError(FeatureDbError):
@@ -60,7 +88,7 @@ def uvicorn_server(options: GatewayOptions) -> uvicorn.Server:
             ws="none",
             # Who sends too much is answered at once; this one then reads on and throws away until the
             # keep-alive is over, so that the answer is not lost by a reset.
-            http="h11",
+            http=_TimedHeads,
             lifespan="on",
             limit_concurrency=_MAX_CONNECTIONS,
             timeout_keep_alive=_KEEP_ALIVE_S,

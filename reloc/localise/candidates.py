@@ -1,6 +1,6 @@
 """Which part of the maps a photo may show: voting for images, then clusters of images that see the same."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +17,16 @@ from reloc.localise.options import CandidateOptions
 _FAR_BELOW_M = 100_000.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, weakref_slot=True)
 class IndexedArea:
     """An area and the index over its descriptors."""
 
     area: Area
     index: DescriptorIndex
+
+    def only(self, map_ids: Collection[str]) -> "IndexedArea":
+        """The same area and index, of which only these maps are searched."""
+        return IndexedArea(area=self.area.only(map_ids), index=self.index)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -67,7 +71,8 @@ def find_clusters(
             for i, (indexed, _) in enumerate(reach)
         ]
     votes = _vote([indexed for indexed, _ in reach], features, options)
-    share = sum(float(v.sum()) for v in votes) / max(sum(len(v) for v in votes), 1)
+    searched = sum(int(np.count_nonzero(a.area.searched[a.area.point_map])) for a, _ in reach)
+    share = sum(float(v.sum()) for v in votes) / max(searched, 1)
     found: list[Cluster] = []
     for i, (indexed, allowed) in enumerate(reach):
         if small[i]:
@@ -83,7 +88,7 @@ def find_clusters(
 def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOptions) -> NDArray[np.bool_]:
     """(i,) which images may see what a camera within the prior sees. Only horizontal distances count."""
     if prior is None:
-        return np.ones(len(area.image_center), dtype=np.bool_)
+        return area.searched_images()
     height = prior.height_m if prior.height_m is not None else area.frame.height_m
     place = area.frame.enu_from_geodetic(np.array([prior.latitude_deg, prior.longitude_deg, height]))
     if place[2] < -_FAR_BELOW_M:  # the far side of the Earth: its horizontal distances come back to zero
@@ -91,7 +96,7 @@ def images_in_reach(area: Area, prior: GeoPrior | None, options: CandidateOption
     margin = options.prior_sigmas * prior.sigma_horizontal_m + options.prior_reach * area.image_reach
     to_camera = np.linalg.norm(area.image_center[:, :2] - place[:2], axis=1)
     to_scene = np.linalg.norm(area.image_scene[:, :2] - place[:2], axis=1)
-    return np.asarray(np.minimum(to_camera, to_scene) <= margin, dtype=np.bool_)
+    return np.asarray(area.searched_images() & (np.minimum(to_camera, to_scene) <= margin), dtype=np.bool_)
 
 
 def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOptions) -> list[FloatArray]:
@@ -103,7 +108,14 @@ def _vote(areas: Sequence[IndexedArea], features: Features, options: CandidateOp
     average.
     """
     asked = features.descriptors[: options.vote_features]
-    found = [indexed.index.search(asked, options.vote_background) for indexed in areas]
+    found = [
+        indexed.index.search(
+            asked,
+            options.vote_background,
+            None if indexed.area.searched.all() else indexed.area.searched[indexed.area.point_map],
+        )
+        for indexed in areas
+    ]
     rows = np.concatenate([r for _, r in found], axis=1)
     squared = np.concatenate([d for d, _ in found], axis=1).astype(np.float64)
     squared[rows < 0] = np.inf

@@ -1,7 +1,5 @@
 """One query from bytes to reply: parse, decode, localise, word the answer. No network here."""
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -41,7 +39,6 @@ def answer_query(
     limits: DecodeLimits,
     request_id: str,
     clock: StageClock,
-    before_localising: Callable[[], None] = lambda: None,
 ) -> LocaliseReply:
     """Localise the image file in `data`.
 
@@ -52,7 +49,6 @@ def answer_query(
         limits: bytes and pixels allowed.
         request_id: goes into the reply.
         clock: its stages so far (queue, request) become part of the reply's timings.
-        before_localising: called after decoding; raises RequestError to stop (deadline).
 
     Raises:
         RequestError: bad image, bad request, too large, or maps of another extractor.
@@ -61,7 +57,6 @@ def answer_query(
     clock.lap("decode")
     request = localise_request(wire_request, data, gray)
     clock.lap("exif")
-    before_localising()
     try:
         result = localiser.localise(gray, request)
     except IncompatibleExtractorError as error:

@@ -23,14 +23,18 @@ class ServeOptions:
         config_path: a Zenoh configuration (JSON5); `listen` is added to it.
         insecure: start also where whoever reaches the server could answer in its place.
         name: the database's name on the wire; "" takes the name of the database's folder.
-        workers: queries localised at a time; two fill the reference machine's two cores.
+        workers: queries localised at a time, each in a process of its own; two fill the reference machine's
+            two cores.
         threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
             case of a robot or a phone, is answered soonest; workers that run at once share them.
+        query_memory_bytes: what one query may take of memory, beyond the maps. The largest pictures that
+            `limits` lets in take 1.5 GiB.
         max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
             waiting ones are answered within 4 s, half of the deadline.
         max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
         deadline_s: from receipt to answer; under Zenoh's default query timeout of 10 s, so that the
-            client hears of it.
+            client hears of it. A worker has half of it for a query, so that those who wait behind the
+            slowest are still answered.
         poll_interval_s: how often the store is asked for a newer version; also the delay of a hot reload.
         shutdown_grace_s: how long queries in hand may take when the server stops.
         limits: bytes and pixels of a query image.
@@ -47,6 +51,7 @@ class ServeOptions:
     name: str = ""
     workers: int = 2
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
+    query_memory_bytes: int = 3 * 2**30
     max_queue: int = 32
     max_queued_bytes: int = 512 * 2**20
     deadline_s: float = 8.0
@@ -57,10 +62,16 @@ class ServeOptions:
     inbox: InboxOptions = field(default_factory=InboxOptions)
     live: LiveOptions = field(default_factory=LiveOptions)
 
+    @property
+    def work_s(self) -> float:
+        """The longest that a worker is at one query."""
+        return 0.5 * self.deadline_s
+
     def __post_init__(self) -> None:
         for name, value in (
             ("workers", self.workers),
             ("threads_per_worker", self.threads_per_worker),
+            ("query_memory_bytes", self.query_memory_bytes),
             ("max_queue", self.max_queue),
             ("max_queued_bytes", self.max_queued_bytes),
             ("deadline_s", self.deadline_s),

@@ -13,6 +13,12 @@ from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError,
 logger = logging.getLogger(__name__)
 
 
+def session_of(query: zenoh.Query) -> str:
+    """The session that asks, which nobody has verified; "" where it does not say."""
+    source = query.source_info
+    return "" if source is None else str(source.source_id.zid)
+
+
 class PendingQuery:
     """A `zenoh.Query` between receipt and answer.
 
@@ -21,6 +27,8 @@ class PendingQuery:
 
     Attributes:
         identity: name of the client, where the server authenticates its clients.
+        asker: who shares the server with others: the identity, else the session that the query came from as
+            it says itself.
     """
 
     __slots__ = (
@@ -29,6 +37,7 @@ class PendingQuery:
         "_lock",
         "_metrics",
         "_query",
+        "asker",
         "deadline",
         "identity",
         "received",
@@ -46,6 +55,7 @@ class PendingQuery:
         identity: str | None,
     ) -> None:
         self.identity = identity
+        self.asker = identity or session_of(query)
         self._query = query
         self._key = key
         self._metrics = metrics

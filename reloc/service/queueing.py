@@ -4,52 +4,84 @@ import heapq
 import itertools
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
+from collections.abc import Callable
 
 from reloc.service.pending import PendingQuery
 from reloc.wire.query import ErrorCode, RequestError
 
 
 class QueryQueue:
-    """First in, first out, bounded in number and in bytes; `put` never blocks."""
+    """Bounded in number and in bytes, and fair to those who ask; `put` never blocks.
+
+    The next query is the oldest of the asker with the fewest in hand; of several such, of the one who has had
+    least of the workers' time since he was idle. In a full queue who has most waiting makes room.
+    """
 
     def __init__(self, max_length: int, max_bytes: int) -> None:
         self._max_length = max_length
         self._max_bytes = max_bytes
-        self._items: deque[PendingQuery] = deque()
-        self._bytes = 0
+        self._waiting: dict[str, deque[PendingQuery]] = {}
+        self._in_hand: Counter[str] = Counter()
+        self._spent_s: dict[str, float] = {}
+        self._length = self._bytes = 0
         self._closed = False
         self._changed = threading.Condition()
 
     def put(self, item: PendingQuery) -> None:
-        """Append a query.
+        """Append a query; others may be refused for it.
 
         Raises:
             RequestError: BUSY when full, SHUTTING_DOWN when closed.
         """
+        refused = []
         with self._changed:
             if self._closed:
                 raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
-            if len(self._items) >= self._max_length or self._bytes + item.size > self._max_bytes:
-                raise RequestError(
-                    ErrorCode.BUSY,
-                    f"{len(self._items)} queries ({self._bytes} bytes) are waiting, the queue is full; "
-                    "try again in a second",
-                )
-            self._items.append(item)
-            self._bytes += item.size
-            self._changed.notify()
+            busy = RequestError(
+                ErrorCode.BUSY,
+                f"{self._length} queries ({self._bytes} bytes) are waiting, the queue is full; "
+                "try again in a second",
+            )
+            own = len(self._waiting.get(item.asker, ()))
+            placed = False
+            while self._length >= self._max_length or self._bytes + item.size > self._max_bytes:
+                most = max(self._waiting.values(), key=len, default=deque[PendingQuery]())
+                if len(most) <= own + 1:
+                    break
+                refused.append(self._taken(most.pop()))
+            else:
+                self._spent_s.setdefault(item.asker, min(self._spent_s.values(), default=0.0))
+                self._waiting.setdefault(item.asker, deque()).append(item)
+                self._length += 1
+                self._bytes += item.size
+                self._changed.notify()
+                placed = True
+        for other in refused:
+            other.refuse(busy)
+        if not placed:
+            raise busy
 
     def get(self) -> PendingQuery | None:
-        """The oldest query, blocking; None once closed and empty."""
+        """The next query, blocking, to be followed by `done`; None once closed and empty."""
         with self._changed:
-            while not self._items:
+            while not self._waiting:
                 if self._closed:
                     return None
                 self._changed.wait()
-            item = self._items.popleft()
-            self._bytes -= item.size
-            return item
+            asker = min(self._waiting, key=lambda name: (self._in_hand[name], self._spent_s[name]))
+            self._in_hand[asker] += 1
+            return self._taken(self._waiting[asker].popleft())
+
+    def done(self, item: PendingQuery, seconds: float) -> None:
+        """A worker has had the query for so long."""
+        with self._changed:
+            self._in_hand[item.asker] -= 1
+            self._spent_s[item.asker] += seconds
+            if not self._in_hand[item.asker]:
+                del self._in_hand[item.asker]
+                if item.asker not in self._waiting:
+                    del self._spent_s[item.asker]
 
     def close(self) -> None:
         """Take no more; what waits is still handed out."""
@@ -60,19 +92,28 @@ class QueryQueue:
     def drain(self) -> list[PendingQuery]:
         """Take out all that wait."""
         with self._changed:
-            items = list(self._items)
-            self._items.clear()
-            self._bytes = 0
+            items = [item for waiting in self._waiting.values() for item in waiting]
+            self._waiting.clear()
+            self._length = self._bytes = 0
             return items
 
     def __len__(self) -> int:
-        return len(self._items)
+        return self._length
+
+    def _taken(self, item: PendingQuery) -> PendingQuery:
+        """Account for a query that waits no more."""
+        self._length -= 1
+        self._bytes -= item.size
+        if not self._waiting[item.asker]:
+            del self._waiting[item.asker]
+        return item
 
 
 class DeadlineWatch:
-    """Answers DEADLINE the moment a query's time is over, also while a worker still has it in hand."""
+    """Says the moment a query's time is over, also while a worker still has it in hand."""
 
-    def __init__(self) -> None:
+    def __init__(self, on_late: Callable[[PendingQuery], None]) -> None:
+        self._on_late = on_late
         self._heap: list[tuple[float, int, PendingQuery]] = []
         self._order = itertools.count()
         self._changed = threading.Condition()
@@ -106,7 +147,7 @@ class DeadlineWatch:
                     self._changed.wait(wait_s)
                     continue
                 item = heapq.heappop(self._heap)[2]
-            item.refuse(deadline_error(item))
+            self._on_late(item)
 
 
 def deadline_error(item: PendingQuery) -> RequestError:

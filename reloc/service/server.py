@@ -16,11 +16,12 @@ from reloc.service.live.sessions import LiveSessions
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions
 from reloc.service.pending import PendingQuery
-from reloc.service.queueing import DeadlineWatch, QueryQueue
+from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError, bind_free_port, open_server_session, server_config
 from reloc.service.source import AreaSource, ServedArea
 from reloc.service.watcher import AreaWatcher
-from reloc.service.worker import WorkerPool
+from reloc.service.workers.pool import WorkerPool
+from reloc.service.workers.process import prepare_workers
 from reloc.wire.keys import Keys, client_of
 from reloc.wire.query import MESSAGE_HEADROOM, WIRE_VERSION, ErrorCode, RequestError, encode
 from reloc.wire.server import (
@@ -72,9 +73,9 @@ class Server:
         self._reloads = 0
         self._reload_error: str | None = None
         self._queue = QueryQueue(options.max_queue, options.max_queued_bytes)
-        self._watch = DeadlineWatch()
+        self._watch = DeadlineWatch(self._late)
         self._inbox = inbox
-        self._workers = WorkerPool(self._queue, self._watch, lambda: self._area, options, inbox)
+        self._workers = WorkerPool(self._queue, self._watch, options, inbox)
         self._watcher = AreaWatcher(
             source,
             served_version=area.snapshot,
@@ -106,6 +107,7 @@ class Server:
         )
         if not options.insecure:
             check_exposure(config)
+        prepare_workers()
         area = source.load()
         endpoints = tuple(bind_free_port(endpoint) for endpoint in options.listen)
         if endpoints:
@@ -126,12 +128,17 @@ class Server:
         except zenoh.ZError as error:
             session.close()
             raise ServiceStartError(f"cannot declare the keys of {database!r}: {error}") from error
+        except ServiceStartError:
+            server._watch.close()
+            session.close()
+            raise
         return server
 
     def _declare(self) -> None:
         if self._inbox is not None:
             self._inbox.start()
         self._watch.start()
+        self._workers.publish(self._area)
         self._workers.start()
         # `complete`: of several servers of one database the nearest answers, not all of them.
         for key, callback in (
@@ -166,6 +173,7 @@ class Server:
         left = self._workers.join(self._options.shutdown_grace_s)
         for item in (*self._queue.drain(), *left):
             item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server stopped before it could answer"))
+            self._workers.abandon(item)
         for queryable in self._queryables:
             queryable.undeclare()
         if self._inbox is not None:
@@ -191,6 +199,7 @@ class Server:
                 capacity=options.max_queue,
                 workers=options.workers,
                 busy=self._workers.busy,
+                ready=self._workers.ready,
             ),
             queries=self._metrics.counts(),
             latency_ms=self._metrics.latency(),
@@ -239,10 +248,17 @@ class Server:
         with query:
             query.reply(self._keys.of("maps"), encode(reply), encoding=_JSON)
 
+    # The watch over deadlines calls this.
+
+    def _late(self, item: PendingQuery) -> None:
+        item.refuse(deadline_error(item))
+        self._workers.abandon(item)
+
     # The watcher calls these.
 
     def _swap(self, area: ServedArea) -> None:
         """Serve `area` from now on; queries in hand keep the old one until they are answered."""
+        self._workers.publish(area)
         old, self._area = self._area, area
         self._reloads += 1
         self._reload_error = None

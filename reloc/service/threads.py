@@ -17,10 +17,3 @@ def capped_process(count: int) -> Iterator[None]:
             yield
     finally:
         cv2.setNumThreads(before)
-
-
-@contextmanager
-def capped_thread(count: int) -> Iterator[None]:
-    """Within the block OpenMP regions that this thread enters use at most `count` threads."""
-    with threadpool_limits(limits=count, user_api="openmp"):
-        yield

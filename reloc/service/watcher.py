@@ -52,6 +52,10 @@ class AreaWatcher:
             if version == self._served:
                 return True
             area = self._source.load()
+            if self._stop.is_set():
+                return True
+            self._on_area(area)
+            self._served = area.snapshot
         except Exception as error:
             # A store may break in many ways; the area in service is whole and stays.
             logger.exception(
@@ -60,8 +64,4 @@ class AreaWatcher:
             )
             self._on_failure(version, f"{type(error).__name__}: {error}")
             return False
-        if self._stop.is_set():
-            return True
-        self._served = area.snapshot
-        self._on_area(area)
         return True

@@ -52,7 +52,7 @@ class MapGround:
         settings, area = options.localise, self.area
         features = extract(gray, options.keyframes)
         matches = guided_matches(
-            features, area, np.arange(len(area.points), dtype=np.int32), camera, pose, settings.matching
+            features, area, area.searched_points().astype(np.int32), camera, pose, settings.matching
         )
         if len(matches) < options.min_matches:
             return Unmatched(
@@ -100,8 +100,8 @@ class MapGround:
 
     def visible(self, camera: Camera, pose: Rigid3) -> FloatArray:
         """Of points that the pose says are in the picture, seen from a side that the map knows."""
-        every = max(1, len(self.area.points) // _MOST_LOOKED_AT)
-        rows = visible_points(self.area, np.arange(0, len(self.area.points), every), camera, pose)
+        rows = self.area.searched_points()
+        rows = visible_points(self.area, rows[:: max(1, len(rows) // _MOST_LOOKED_AT)], camera, pose)
         rows = rows[:: max(1, len(rows) // _MOST_SHOWN)]
         pixels = camera.project(pose.act(self.area.points[rows]))
         return pixels[np.isfinite(pixels).all(axis=1)]

@@ -7,10 +7,13 @@ from reloc.wire.track import LiveStatus
 
 
 class QueueStatus(Answer):
+    """`ready`: workers whose process is up and not beyond its query's deadline; null from older servers."""
+
     length: Count
     capacity: Count
     workers: Count
     busy: Count
+    ready: Count | None = None
 
 
 class Latency(Answer):

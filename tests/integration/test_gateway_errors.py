@@ -1,7 +1,9 @@
 """Every way to fail: status, code, headers, and nothing of our insides."""
 
+import os
 import threading
 import time
+from collections.abc import Callable
 
 import pytest
 import requests
@@ -11,7 +13,7 @@ from reloc.gateway.failures import STATUS_OF
 from reloc.service.options import ServeOptions
 from reloc.wire.query import ErrorCode
 from tests.support.gateway import geopose_request, running_gateway
-from tests.support.service import Gate, ScriptedLocaliser, photo, running_server
+from tests.support.service import Gate, MemorySource, ScriptedLocaliser, area_of, photo, running_server
 
 UNUSED_PORT = "tcp/127.0.0.1:9"  # the discard service; nobody listens
 
@@ -247,6 +249,7 @@ def test_a_busy_server_is_503_with_retry_after():
     with (
         running_server(ScriptedLocaliser(1, held), options) as server,
         running_gateway(server.endpoints[0]) as gateway,
+        running_gateway(server.endpoints[0], timeout_s=1.0) as hasty,
     ):
         waiting = [in_background(lambda: gateway.post("/geopose", json=geopose_request(photo())))]
         assert gate.entered.acquire(timeout=20.0)  # one in work
@@ -255,7 +258,7 @@ def test_a_busy_server_is_503_with_retry_after():
         while server.status().queue.length < 1:  # one waits
             assert time.monotonic() < end
             time.sleep(0.01)
-        response = gateway.post("/geopose", json=geopose_request(photo()))
+        response = hasty.post("/geopose", json=geopose_request(photo()))
         gate.open()
         for thread, _ in waiting:
             thread.join(20.0)
@@ -316,3 +319,36 @@ def test_a_defect_of_the_gateway_tells_nothing(gateway, monkeypatch):
     assert "secret" not in response.text
     monkeypatch.undo()
     assert gateway.post("/geopose", json=geopose_request(photo())).status_code == 200
+
+
+class Poison(ScriptedLocaliser):
+    """Ends each worker process that opens it."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os._exit, (3,)
+
+
+def test_a_server_without_a_worker_is_not_healthy_until_it_has_one():
+    source = MemorySource(area_of(ScriptedLocaliser(1)))
+    options = ServeOptions(workers=1, poll_interval_s=0.05)
+    with (
+        running_server(source, options) as server,
+        running_gateway(server.endpoints[0]) as gateway,
+    ):
+        assert gateway.get("/health").status_code == 200
+        source.publish(area_of(Poison(2)))
+        until(lambda: server.status().snapshot == 2)
+        response = gateway.post("/geopose", json=geopose_request(photo()))
+        assert (response.status_code, response.json()["code"]) == (502, "INTERNAL")
+        until(lambda: gateway.get("/health").status_code == 503)
+        assert gateway.get("/health").json()["code"] == "NOT_READY"
+        source.publish(area_of(ScriptedLocaliser(3)))
+        until(lambda: gateway.get("/health").status_code == 200)
+        assert gateway.post("/geopose", json=geopose_request(photo())).status_code == 200
+
+
+def until(holds: Callable[[], bool]) -> None:
+    end = time.monotonic() + 30.0
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)

@@ -8,6 +8,7 @@ import time
 
 import pytest
 
+from reloc.gateway import serve
 from tests.support.gateway import geopose_request, running_gateway
 from tests.support.service import ScriptedLocaliser, photo, running_server
 
@@ -141,13 +142,50 @@ def test_a_client_that_goes_costs_nothing(gateway):
     with connected(gateway) as link:
         link.sendall(head("/geopose", "Content-Length: 100000") + b"{")
         end = time.monotonic() + 10.0
-        while not gateway.state.intake.in_flight:
+        while not gateway.state.intake.buffered_bytes:
             assert time.monotonic() < end
             time.sleep(0.01)
     end = time.monotonic() + 10.0
     while 'status="499"' not in gateway.get("/metrics").text:
         assert time.monotonic() < end
         time.sleep(0.05)
+
+
+def test_bodies_that_drip_take_no_place_of_others(gateway):
+    """As many as photos may be in hand, and more."""
+    links = [connected(gateway) for _ in range(20)]
+    for link in links:
+        link.sendall(head("/geopose", "Content-Length: 100000") + b" ")
+    end = time.monotonic() + 10.0
+    while gateway.state.intake.buffered_bytes < len(links):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert gateway.post("/geopose", json=geopose_request(photo())).status_code == 200
+    for link in links:
+        link.close()
+
+
+@pytest.mark.parametrize("before", [b"", head("/none", "Content-Length: 0")], ids=["first", "kept"])
+def test_a_head_that_drips_is_given_up(monkeypatch, before):
+    """Of a new connection, and of one that is kept after an answer."""
+    monkeypatch.setattr(serve, "_LOOK_S", 0.05)
+    monkeypatch.setattr(serve, "_KEEP_ALIVE_S", 1)
+    end = time.monotonic() + 20.0
+    with running_gateway("tcp/127.0.0.1:1") as unserved, connected(unserved) as link:
+        link.sendall(before)
+        if before:
+            assert answer(link)[0] == 404
+        link.settimeout(0.1)
+        while time.monotonic() < end:
+            try:
+                link.sendall(b"P")
+                if link.recv(100) == b"":
+                    break
+            except TimeoutError:
+                continue
+            except OSError:
+                break
+    assert time.monotonic() < end, "the connection stayed open"
 
 
 def test_bodies_together_do_not_fill_the_memory():

@@ -15,6 +15,7 @@ from featuredb.features.extractor import ExtractorOptions
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
+from featuredb.index import descriptor_index
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
@@ -23,7 +24,7 @@ from featuredb.store import Database
 from reloc.localise import search
 from reloc.localise.candidates import IndexedArea
 from reloc.localise.localise import localise
-from reloc.localise.options import LocaliseOptions
+from reloc.localise.options import CandidateOptions, LocaliseOptions
 from reloc.localise.pose import PoseHypothesis
 from reloc.localise.result import LocaliseRequest, LocaliseResult
 from reloc.localiser import Localiser
@@ -439,6 +440,39 @@ def test_a_database_serves_its_active_maps_only(
     upright = LocaliseOptions(extractor=ExtractorOptions(upright=True))
     with pytest.raises(IncompatibleExtractorError, match="start the server"):
         Localiser.open(database, upright, previous=third).localise(photo, KNOWN)
+
+
+def test_naming_maps_of_an_area_builds_nothing_and_leaves_the_others_out(
+    tmp_path: Path, field_map: FeatureMap, photo: NDArray[np.uint8], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also with voting over an index of many lists, and for the lenses that maps lend."""
+    database = Database.create(tmp_path / "db")
+    beside = moved(field_map, "beside", 100.0)
+    loose = moved(field_map, "loose", 9000.0).with_status("quarantined")
+    by_gps = replace(loose, placement=replace(loose.placement, method="gps"))
+    for feature_map in (field_map, replace(beside, camera_keys=("its own",)), by_gps):
+        database.commit_map(feature_map)
+    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", 1000)
+    options = LocaliseOptions(candidates=CandidateOptions(single_cluster_points=1))
+    localiser = Localiser.open(database, options)
+    (both,) = localiser.areas
+    assert localiser.localise(photo, KNOWN).reason == "AMBIGUOUS"
+    assert localiser.localise(photo, replace(KNOWN, map_ids=("loose",))).pose is not None
+
+    def built(*_: object) -> None:
+        raise AssertionError("something was built for a query")
+
+    monkeypatch.setattr("reloc.localiser.build_area", built)
+    monkeypatch.setattr("reloc.localiser.build_index", built)
+    for named, east_m in (("field", 0.0), ("beside", 100.0), ("loose", 9000.0)):
+        pose = localiser.localise(photo, replace(KNOWN, map_ids=(named,))).pose
+        assert pose is not None
+        assert pose.map_ids == (named,)
+        assert pose.utm[0] == pytest.approx(EASTING + east_m + POSE.center[0], abs=0.1)
+    (one,) = localiser.areas_of(("field",))
+    assert both.area.camera_for_key("its own") is not None
+    assert one.area.camera_for_key("its own") is None
+    assert set(one.area.point_map[one.area.searched_points()]) == {0}
 
 
 def test_a_map_in_quarantine_that_positions_placed_answers_where_it_is_named(

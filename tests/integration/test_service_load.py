@@ -12,7 +12,9 @@ from featuredb.features.decode import DecodeLimits
 from reloc.client import NO_SERVER, Client
 from reloc.service.logs import JsonLinesFormatter
 from reloc.service.options import ServeOptions
-from reloc.wire.query import ErrorCode
+from reloc.service.session import ServiceStartError
+from reloc.service.workers import process
+from reloc.wire.query import ErrorCode, LocaliseReply
 from tests.support.service import (
     Gate,
     MemorySource,
@@ -41,6 +43,46 @@ def outcome(client: Client, **kwargs) -> str:
         return error.code
 
 
+def asked_once(client: Client) -> str:
+    """As `outcome`, of a client that does not ask again where the server is busy."""
+    try:
+        return client._ask(client._keys.localise(client.name), LocaliseReply, 10.0, payload=photo()).status
+    except ServiceError as error:
+        return error.code
+
+
+def test_a_busy_server_is_asked_again_while_there_is_time():
+    gate = Gate()
+    with (
+        running_server(gated(1, gate), ServeOptions(workers=1, max_queue=1)) as server,
+        client_of(server) as client,
+        ThreadPoolExecutor(3) as pool,
+    ):
+        first = pool.submit(outcome, client)
+        assert gate.entered.acquire(timeout=10)
+        second = pool.submit(outcome, client)
+        while client.status().queue.length < 1:
+            pass
+        third = pool.submit(outcome, client)
+        while client.status().queries.errors.get("BUSY", 0) < 2:
+            assert not third.done()
+        assert outcome(client, timeout_s=0.3) == "BUSY"
+        gate.open()
+        assert [f.result(timeout=10) for f in (first, second, third)] == ["not_localised"] * 3
+
+
+def test_a_server_whose_workers_cannot_be_started_does_not_start(monkeypatch):
+    def start(self):
+        raise EOFError
+
+    monkeypatch.setattr(process._CONTEXT.Process, "start", start)
+    with (
+        pytest.raises(ServiceStartError, match="no worker process comes up"),
+        running_server(ScriptedLocaliser(1)),
+    ):
+        pass
+
+
 def test_a_full_queue_says_busy_at_once_and_answers_the_others():
     gate = Gate()
     options = ServeOptions(workers=1, max_queue=2)
@@ -49,9 +91,9 @@ def test_a_full_queue_says_busy_at_once_and_answers_the_others():
         client_of(server) as client,
         ThreadPoolExecutor(8) as pool,
     ):
-        first = pool.submit(outcome, client)
+        first = pool.submit(asked_once, client)
         assert gate.entered.acquire(timeout=10)  # the worker has it; the queue is empty
-        later = [pool.submit(outcome, client) for _ in range(5)]
+        later = [pool.submit(asked_once, client) for _ in range(5)]
         busy = _first_done(later, 3)
         assert [f.result() for f in busy] == ["BUSY"] * 3
         assert client.status().queue.length == 2
@@ -90,9 +132,9 @@ def test_the_queue_is_bounded_in_bytes_too():
         client_of(server) as client,
         ThreadPoolExecutor(8) as pool,
     ):
-        first = pool.submit(outcome, client)
+        first = pool.submit(asked_once, client)
         assert gate.entered.acquire(timeout=10)
-        later = [pool.submit(outcome, client) for _ in range(3)]
+        later = [pool.submit(asked_once, client) for _ in range(3)]
         assert [f.result() for f in _first_done(later, 2)] == ["BUSY", "BUSY"]
         gate.open()
         assert first.result(timeout=10) == "not_localised"

@@ -2,11 +2,8 @@
 
 import io
 import json
-import os
 import re
 import signal
-import subprocess
-import sys
 import threading
 import time
 from importlib.metadata import EntryPoint
@@ -41,6 +38,7 @@ from tests.support.planar_map import (
     render,
     view,
 )
+from tests.support.serve_process import ServeProcess
 
 pytestmark = pytest.mark.slow
 
@@ -87,47 +85,6 @@ def parse(*argv: str):
 def run(*argv: str) -> int:
     args = parse(*argv)
     return run_command(args.run, args)
-
-
-_PROGRAM = """
-import sys
-from importlib.metadata import EntryPoint
-from featuredb.cli.main import build_parser, run_command
-entry = EntryPoint(name="reloc", value="reloc.cli.commands:register", group="featuredb.commands")
-args = build_parser([entry]).parse_args(sys.argv[1:])
-sys.exit(run_command(args.run, args))
-"""
-
-
-class ServeProcess:
-    """`featuredb serve` as a process of its own on a free port."""
-
-    def __init__(self, *argv: object) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", _PROGRAM, "serve", *map(str, argv), "--listen", "tcp/127.0.0.1:0"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )
-        self.errors: list[str] = []
-        # Read both pipes to their ends, so that the server never waits for us.
-        self._reader = threading.Thread(target=lambda: self.errors.extend(self.process.stderr))
-        self._reader.start()
-        self.announced = self.process.stdout.readline()
-        assert " on tcp/" in self.announced, (self.announced, self.stop())
-        self.endpoint = self.announced.split(" on ")[1].split(";")[0]
-
-    def stop(self, number: int = signal.SIGTERM) -> int:
-        self.process.send_signal(number)
-        code = self.process.wait(30)
-        self._reader.join(10)
-        self.process.stdout.close()
-        self.process.stderr.close()
-        return code
-
-    def log(self) -> list[dict]:
-        return [json.loads(line) for line in self.errors if line.startswith("{")]
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,12 @@
 """A real server on loopback with a localiser whose behaviour the test controls."""
 
 import io
+import multiprocessing
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
+from multiprocessing import connection as mp
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,6 +107,29 @@ class ScriptedLocaliser:
         self.requests: list[LocaliseRequest] = []
         self.grays: list[NDArray[np.uint8]] = []
         self._answer = answer
+        self._listener: mp.Listener | None = None
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """In a worker process it stands for this one, which is asked over a socket."""
+        if self._listener is None:
+            self._listener = mp.Listener(authkey=multiprocessing.current_process().authkey)
+            threading.Thread(target=self._serve, args=(self._listener,), daemon=True).start()
+        authkey = bytes(multiprocessing.current_process().authkey)
+        return _Remote, (self._listener.address, authkey, self.snapshot)
+
+    def _serve(self, listener: mp.Listener) -> None:
+        while True:
+            connection = listener.accept()
+            threading.Thread(target=self._serve_one, args=(connection,), daemon=True).start()
+
+    def _serve_one(self, connection: mp.Connection) -> None:
+        with connection:
+            try:
+                answer: object = self.localise(*connection.recv())
+            except Exception as error:  # noqa: BLE001  # raised in the worker
+                answer = error
+            with suppress(OSError):  # the worker may have been killed meanwhile
+                connection.send(answer)
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         self.requests.append(request)
@@ -114,6 +139,24 @@ class ScriptedLocaliser:
         height, width = gray.shape
         camera = request.camera or Camera.from_focal(width, height, 1.2 * width)
         return localised(self.snapshot, camera, want_inliers=request.want_inliers)
+
+
+class _Remote:
+    """A `ScriptedLocaliser` of the test's process, in a worker."""
+
+    areas: tuple[IndexedArea, ...] = ()
+    options = LocaliseOptions()
+
+    def __init__(self, address: str, authkey: bytes, snapshot: int) -> None:
+        self.snapshot, self._address, self._authkey = snapshot, address, authkey
+
+    def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
+        with mp.Client(self._address, authkey=self._authkey) as connection:
+            connection.send((gray, request))
+            answer = connection.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
 
 class Gate:

@@ -38,6 +38,17 @@ def test_small_areas_are_searched_exactly() -> None:
     assert_exact(*nearest(query, base, 4), query, base)
 
 
+@pytest.mark.parametrize("limit", [1, 100_000])
+def test_only_the_rows_that_may_be_found_are(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(descriptor_index, "_EXHAUSTIVE_LIMIT", limit)
+    base = clustered(700)
+    among = np.arange(700) % 3 == 1
+    query = base[among][:50]
+    distance, row = build_index(base).search(query, 4, among)
+    assert (distance[:, 0] == 0.0).all()
+    assert among[row[row >= 0]].all()
+
+
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_missing_neighbours_are_padded(count: int) -> None:
     base, query = clustered(count + 1)[:count], clustered(5, seed=3)

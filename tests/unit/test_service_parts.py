@@ -2,6 +2,7 @@
 
 import threading
 import time
+from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -16,10 +17,11 @@ from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions, check_wire_name, wire_name_of
+from reloc.service.queueing import QueryQueue
 from reloc.service.session import bind_free_port
 from reloc.service.threads import capped_process
 from reloc.wire.keys import Keys
-from reloc.wire.query import ContributionReply, encode, parse_request
+from reloc.wire.query import ContributionReply, RequestError, encode, parse_request
 from tests.support.service import localised, not_localised
 
 
@@ -165,3 +167,49 @@ def test_people_read_what_a_grown_map_stands_on_and_what_became_of_their_photo()
     assert "  not taken QUEUE_FULL: 32 wait\n" in describe(
         "a.jpg", lost.model_copy(update={"contribution": full})
     )
+
+
+def waiting(asker: str, size: int = 1) -> SimpleNamespace:
+    refused: list[RequestError] = []
+    return SimpleNamespace(asker=asker, size=size, refuse=refused.append, refused=refused)
+
+
+def test_who_floods_waits_for_those_who_do_not():
+    queue = QueryQueue(100, 1000)
+    flood, honest = [waiting("flood") for _ in range(5)], waiting("honest")
+    for item in (*flood, honest):
+        queue.put(item)
+    assert queue.get() is flood[0]
+    assert queue.get() is honest, "the flood has one in hand"
+    queue.done(honest, 0.1)
+    assert queue.get() is flood[1]
+    queue.done(flood[0], 4.0)
+    queue.done(flood[1], 4.0)
+    for item in (late := [waiting("late") for _ in range(3)]):
+        queue.put(item)
+    assert queue.get() is flood[2], "whoever comes later has no more credit than those who wait"
+    queue.done(flood[2], 4.0)
+    for item in late:
+        assert queue.get() is item, "turns are by time, not by number"
+        queue.done(item, 0.1)
+    assert len(queue) == 2
+
+
+@pytest.mark.parametrize(("length", "size"), [(4, 10**6), (100, 4)])
+def test_in_a_full_queue_who_has_most_waiting_makes_room(length, size):
+    queue = QueryQueue(length, size)
+    flood = [waiting("flood") for _ in range(4)]
+    for item in flood:
+        queue.put(item)
+    with pytest.raises(RequestError, match="full"):
+        queue.put(waiting("flood"))
+    honest = [waiting("honest") for _ in range(2)]
+    for item in honest:
+        queue.put(item)
+    assert [bool(item.refused) for item in flood] == [False, False, True, True]
+    assert flood[3].refused[0].code == "BUSY"
+    with pytest.raises(RequestError, match="full"):
+        queue.put(waiting("honest"))
+    queue.close()
+    assert {id(queue.get()) for _ in range(4)} == {id(item) for item in (*flood[:2], *honest)}
+    assert queue.get() is None

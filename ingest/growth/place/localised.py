@@ -143,7 +143,7 @@ def _elsewhere(
 
 def share_shown(photo: LocalisedPhoto, area: Area) -> float:
     """Share of the parts of a photo where the area's points should be seen that hold inliers."""
-    rows = visible_points(area, np.arange(len(area.points)), photo.camera, photo.cam_from_local)
+    rows = visible_points(area, area.searched_points(), photo.camera, photo.cam_from_local)
     expected = photo.camera.project(photo.cam_from_local.act(area.points[rows]))
     return agreement(photo.pixels, expected, photo.camera.width, photo.camera.height)
 

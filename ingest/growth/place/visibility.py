@@ -48,7 +48,7 @@ def shown_parts(
         expected, seen = [np.zeros((0, 2))], [held.pixels[held.photo_of == k]]
         for area in areas:
             in_area = sim.act_on_pose(pose) @ frame.enu_from(area.frame)
-            rows = visible_points(area, np.arange(len(area.points), dtype=np.int64), camera, in_area)
+            rows = visible_points(area, area.searched_points(), camera, in_area)
             expected.append(camera.project(in_area.act(area.points[rows])))
         own = often & in_view(model.xyz, cones, camera, pose, EXPECTED_DEG)
         seen_own = model.point_of[(model.photo_of == k) & often[model.point_of]]

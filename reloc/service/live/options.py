@@ -24,7 +24,9 @@ class LiveOptions:
     max_sessions: int = 2
     idle_timeout_s: float = 5.0
     limits: DecodeLimits = field(
-        default_factory=lambda: DecodeLimits(max_bytes=8 << 20, max_pixels=16_000_000, max_side_px=8192)
+        default_factory=lambda: DecodeLimits(
+            max_bytes=8 << 20, max_pixels=16_000_000, max_scan_pixels=160_000_000, max_side_px=8192
+        )
     )
     max_side_px: int = 1280
     track: TrackOptions = field(default_factory=lambda: TrackOptions(live=True))

@@ -1,0 +1,139 @@
+"""What a worker process does: decode and localise photos, one at a time, over areas that it has mapped."""
+
+import math
+import os
+import resource
+import signal
+import traceback
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.reduction import recv_handle
+from pathlib import Path
+
+from featuredb.features.decode import DecodeLimits
+from featuredb.stage_clock import StageClock
+from reloc.service.handler import answer_query
+from reloc.service.source import LocaliserLike
+from reloc.service.threads import capped_process
+from reloc.service.workers.area_files import MappedAreas
+from reloc.wire.query import ErrorCode, ErrorReply, LocaliseWireRequest, RequestError, encode
+
+# What the first byte of an answer says of the rest.
+REPLY, REFUSAL, DEFECT = b"R", b"E", b"D"
+OUT_OF_MEMORY = 77  # exit code
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerLimits:
+    """What one query may use.
+
+    Attributes:
+        threads: of OpenCV and BLAS.
+        memory_bytes: of address space, beyond what the process has before.
+        processor_s: of all threads together.
+        decode: bytes and pixels of the image.
+    """
+
+    threads: int
+    memory_bytes: int
+    processor_s: float
+    decode: DecodeLimits
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenFiles:
+    """The files of a localiser follow, as descriptors; it answers from now on."""
+
+    keys: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ask:
+    """A query; the image's bytes follow."""
+
+    request: LocaliseWireRequest
+    request_id: str
+
+
+class _Stop:
+    """SIGTERM ends an idle process at once, and one that has a query after it."""
+
+    def __init__(self) -> None:
+        self.busy = self.wanted = False
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server
+
+    def _on_signal(self, *_: object) -> None:
+        self.wanted = True
+        if not self.busy:
+            os._exit(0)
+
+
+def answer_queries(connection: Connection, limits: WorkerLimits) -> None:
+    """Until the other end is closed: answers to `OpenFiles` (empty) and `Ask`."""
+    stop, areas = _Stop(), MappedAreas()
+    localiser: LocaliserLike | None = None
+    unlimited = resource.getrlimit(resource.RLIMIT_AS)
+    with capped_process(limits.threads):
+        while not stop.wanted:
+            try:
+                message = connection.recv()
+                stop.busy = True
+                if isinstance(message, OpenFiles):
+                    resource.setrlimit(resource.RLIMIT_AS, unlimited)
+                    localiser = _opened(connection, message, areas)
+                    answer = b""
+                else:
+                    data = connection.recv_bytes()
+                    assert localiser is not None
+                    _limit(limits)
+                    answer = _answer(message, data, localiser, limits)
+                connection.send_bytes(answer)
+            except (EOFError, OSError):
+                return
+            except MemoryError:
+                os._exit(OUT_OF_MEMORY)
+            stop.busy = False
+
+
+def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> LocaliserLike:
+    descriptors = {key: recv_handle(connection) for key in message.keys}
+    try:
+        localiser: LocaliserLike = areas.localiser(descriptors)
+        return localiser
+    finally:
+        for descriptor in descriptors.values():
+            os.close(descriptor)
+
+
+def _limit(limits: WorkerLimits) -> None:
+    """Limits of the next query, above what the process has and has used so far."""
+    times = os.times()
+    used_s = times.user + times.system
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used_s + limits.processor_s) + 1, hard))
+    statm = Path("/proc/self/statm")
+    if statm.exists():  # Linux
+        now = int(statm.read_text().split()[0]) * resource.getpagesize()
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (now + limits.memory_bytes, hard))
+
+
+def _answer(ask: Ask, data: bytes, localiser: LocaliserLike, limits: WorkerLimits) -> bytes:
+    try:
+        reply = answer_query(
+            data,
+            ask.request,
+            localiser,
+            limits=limits.decode,
+            request_id=ask.request_id,
+            clock=StageClock(),
+        )
+        return REPLY + encode(reply)
+    except RequestError as error:
+        refusal = ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=ask.request_id)
+        return REFUSAL + encode(refusal)
+    except MemoryError:
+        raise
+    except Exception:  # noqa: BLE001  # the server logs it
+        return DEFECT + traceback.format_exc().encode()

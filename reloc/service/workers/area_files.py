@@ -1,0 +1,126 @@
+"""Areas as files that worker processes map into memory: one copy for all, and a new worker has it at once.
+
+A file has no name, so that nothing is left behind; whoever has a descriptor or a mapping of it keeps it.
+"""
+
+import io
+import itertools
+import mmap
+import pickle
+import tempfile
+import weakref
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import IO, Any
+
+from reloc.localise.candidates import IndexedArea
+from reloc.localiser import OnDemand
+from reloc.service.source import LocaliserLike
+
+_ALIGNMENT = 64
+_LENGTH_BYTES = 8
+
+
+class AreaFile:
+    """A file without a name in any folder, closed with its last user.
+
+    Attributes:
+        key: names it, once and for all. file: open.
+    """
+
+    def __init__(self, key: int) -> None:
+        self.key = key
+        self.file: IO[bytes] = tempfile.TemporaryFile(prefix="featuredb-area-")  # noqa: SIM115  # see above
+        weakref.finalize(self, self.file.close)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocaliserFiles:
+    """A localiser as files: those of its areas, then the one that refers to them."""
+
+    files: tuple[AreaFile, ...]
+
+
+class AreaFiles:
+    """Writes localisers; areas that one has taken over from another are not written again."""
+
+    def __init__(self) -> None:
+        self._keys = itertools.count()
+        self._written: weakref.WeakKeyDictionary[object, AreaFile] = weakref.WeakKeyDictionary()
+
+    def of(self, localiser: LocaliserLike) -> LocaliserFiles:
+        """The files of a localiser."""
+        parts: list[AreaFile] = []
+
+        def key_of(part: object) -> int:
+            if part not in self._written:
+                self._written[part] = self._file(part, None)
+            parts.append(self._written[part])
+            return parts[-1].key
+
+        whole = self._file(localiser, key_of)
+        return LocaliserFiles(files=(*parts, whole))
+
+    def _file(self, value: object, key_of: Callable[[object], int] | None) -> AreaFile:
+        made = AreaFile(next(self._keys))
+        _write(value, made.file, key_of)
+        return made
+
+
+class MappedAreas:
+    """The other side: localisers out of the files, mapped."""
+
+    def __init__(self) -> None:
+        self._parts: dict[int, object] = {}
+
+    def localiser(self, descriptors: Mapping[int, int]) -> Any:
+        """The localiser of some files, by key in the order of `LocaliserFiles`; known ones are kept."""
+        *parts, whole = descriptors
+        self._parts = {key: self._parts.get(key) or _read(descriptors[key], {}) for key in parts}
+        return _read(descriptors[whole], self._parts)
+
+
+class _Pickler(pickle.Pickler):
+    def __init__(
+        self, file: IO[bytes], buffers: list[pickle.PickleBuffer], key_of: Callable[[object], int]
+    ) -> None:
+        super().__init__(file, protocol=5, buffer_callback=buffers.append)
+        self._key_of = key_of
+
+    def persistent_id(self, obj: object) -> int | None:
+        return self._key_of(obj) if isinstance(obj, IndexedArea | OnDemand) else None
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, file: IO[bytes], buffers: list[memoryview], parts: Mapping[int, object]) -> None:
+        super().__init__(file, buffers=buffers)
+        self._parts = parts
+
+    def persistent_load(self, pid: int) -> object:
+        return self._parts[pid]
+
+
+def _write(value: object, file: IO[bytes], key_of: Callable[[object], int] | None) -> None:
+    """Arrays as they are, then the rest pickled, then where each of them lies."""
+    stream, buffers = io.BytesIO(), list[pickle.PickleBuffer]()
+    if key_of is None:
+        pickle.Pickler(stream, protocol=5, buffer_callback=buffers.append).dump(value)
+    else:
+        _Pickler(stream, buffers, key_of).dump(value)
+    places = []
+    for content in (*(buffer.raw() for buffer in buffers), stream.getbuffer()):
+        file.write(bytes(-file.tell() % _ALIGNMENT))
+        places.append((file.tell(), content.nbytes))
+        file.write(content)
+    table = pickle.dumps(places)
+    file.write(table + len(table).to_bytes(_LENGTH_BYTES, "little"))
+    file.flush()
+
+
+def _read(descriptor: int, parts: Mapping[int, object]) -> Any:
+    # Private, so that nobody can change the others' copy.
+    content = memoryview(mmap.mmap(descriptor, 0, access=mmap.ACCESS_COPY))
+    length = int.from_bytes(content[-_LENGTH_BYTES:], "little")
+    places = pickle.loads(content[-_LENGTH_BYTES - length : -_LENGTH_BYTES])
+    *buffers, stream = [content[start : start + size] for start, size in places]
+    return _Unpickler(io.BytesIO(stream), buffers, parts).load()

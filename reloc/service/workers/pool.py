@@ -1,0 +1,277 @@
+"""A thread and a process for each worker: what the one takes from the queue, the other localises."""
+
+import logging
+import math
+import threading
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
+
+from featuredb.stage_clock import StageClock
+from featuredb.store.candidates.states import ANONYMOUS, candidate_id_of
+from reloc.service.contributions.database_inbox import contribution_of
+from reloc.service.contributions.inbox import Inbox, InboxRefusal
+from reloc.service.options import ServeOptions
+from reloc.service.pending import PendingQuery
+from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
+from reloc.service.session import ServiceStartError
+from reloc.service.source import ServedArea
+from reloc.service.workers.answering import Ask, WorkerLimits
+from reloc.service.workers.area_files import AreaFiles
+from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.wire.query import (
+    ContributionReply,
+    ErrorCode,
+    LocaliseReply,
+    LocaliseWireRequest,
+    RequestError,
+    parse_request,
+)
+
+logger = logging.getLogger(__name__)
+
+_RETRY_S, _MAX_RETRY_S = 0.1, 10.0  # between starts of a process that does not come up
+
+
+class WorkerPool:
+    """Takes queries from the queue and answers each from the area in service at that moment.
+
+    A process that is still at a query when its time is over, or that ends before its answer, is replaced.
+    """
+
+    def __init__(
+        self,
+        queue: QueryQueue,
+        watch: DeadlineWatch,
+        options: ServeOptions,
+        inbox: Inbox | None = None,
+    ) -> None:
+        self._queue = queue
+        self._watch = watch
+        self._options = options
+        self._inbox = inbox
+        self._limits = WorkerLimits(
+            threads=options.threads_per_worker,
+            memory_bytes=options.query_memory_bytes,
+            processor_s=options.threads_per_worker * options.work_s,
+            decode=options.limits,
+        )
+        self._files = AreaFiles()
+        # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
+        self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
+        self._busy: dict[PendingQuery, WorkerProcess | None] = {}
+        self._up: set[WorkerProcess] = set()
+        self._failed: dict[str, str] = {}  # why a worker's latest process did not come up, by its thread
+        self._changed = threading.Condition()
+        self._closing = threading.Event()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"localise-{i}", daemon=True)
+            for i in range(options.workers)
+        ]
+
+    @property
+    def busy(self) -> int:
+        return len(self._busy)
+
+    @property
+    def ready(self) -> int:
+        """Workers whose process is up, and not beyond its query's deadline."""
+        return len(self._up)
+
+    def publish(self, area: ServedArea) -> None:
+        """Answer from this area, beginning with the next query of each worker."""
+        self._published = self._files.of(area.localiser)
+
+    def start(self) -> None:
+        """Start the workers; returns when one of them is ready.
+
+        Raises:
+            ServiceStartError: none of the processes comes up.
+        """
+        for thread in self._threads:
+            thread.start()
+        with self._changed:
+            self._changed.wait_for(lambda: self._up or len(self._failed) == len(self._threads))
+            if not self._up:
+                self._closing.set()
+                self._queue.close()
+                raise ServiceStartError(f"no worker process comes up: {next(iter(self._failed.values()))}")
+
+    def abandon(self, item: PendingQuery) -> None:
+        """End the process that has this query in hand, if one has."""
+        with self._changed:
+            process = self._busy.get(item)
+            if process is not None:
+                self._up.discard(process)
+                process.kill()
+
+    def join(self, timeout_s: float) -> list[PendingQuery]:
+        """Wait for the workers to finish the closed queue; returns what they still have in hand."""
+        end = time.perf_counter() + timeout_s
+        self._closing.set()
+        for thread in self._threads:
+            thread.join(max(0.0, end - time.perf_counter()))
+        self._namer.shutdown(wait=False, cancel_futures=False)
+        with self._changed:
+            return list(self._busy)
+
+    def _run(self) -> None:
+        process = self._replaced(None)
+        while (item := self._queue.get()) is not None:
+            process = self._replaced(process)
+            with self._changed:
+                self._busy[item] = process
+            start = time.perf_counter()
+            try:
+                if process is None:
+                    item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping"))
+                elif not item.answered:
+                    self._answer(item, process)
+            finally:
+                with self._changed:
+                    del self._busy[item]
+                self._queue.done(item, time.perf_counter() - start)
+            process = self._replaced(process)
+        if process is not None:
+            self._gone(process)
+
+    def _replaced(self, process: WorkerProcess | None) -> WorkerProcess | None:
+        """The process while it lives, else a new one that is up; None where none comes up before the end."""
+        wait_s = _RETRY_S
+        while process is None or not process.is_alive():
+            if process is not None:
+                self._gone(process)
+                process = None
+            try:
+                process = WorkerProcess(self._limits)
+                process.open(self._published)
+            except WorkerEndedError as error:
+                if process is not None:
+                    self._gone(process)
+                process = None
+                logger.exception("a worker does not come up", extra={"fields": {"event": "worker_failed"}})
+                with self._changed:
+                    self._failed[threading.current_thread().name] = str(error)
+                    self._changed.notify_all()
+                if self._closing.wait(wait_s):
+                    return None
+                wait_s = min(2 * wait_s, _MAX_RETRY_S)
+            else:
+                with self._changed:
+                    self._up.add(process)
+                    self._changed.notify_all()
+        return process
+
+    def _gone(self, process: WorkerProcess) -> None:
+        with self._changed:
+            self._up.discard(process)
+        process.close()
+
+    def _answer(self, item: PendingQuery, process: WorkerProcess) -> None:
+        try:
+            self._localise(item, process)
+        except RequestError as error:
+            item.request_id = error.request_id or item.request_id
+            item.refuse(error)
+        except WorkerEndedError as error:
+            with self._changed:
+                self._up.discard(process)
+            item.refuse(_ended_error(error, self._limits, item))
+        except Exception as error:
+            trace = {"trace": str(error)} if isinstance(error, WorkerDefectError) else {}
+            logger.exception(
+                "query failed",
+                extra={"fields": {"event": "internal", "request_id": item.request_id, **trace}},
+            )
+            item.refuse(
+                RequestError(
+                    ErrorCode.INTERNAL,
+                    f"the server failed on this query; its log says why under request id {item.request_id}",
+                )
+            )
+
+    def _localise(self, item: PendingQuery, process: WorkerProcess) -> None:
+        clock = StageClock(start=item.received)
+        clock.lap("queue")
+        request = parse_request(item.attachment())
+        item.request_id = request.request_id or item.request_id
+        if request.contribute and self._inbox is None:
+            raise RequestError(
+                ErrorCode.UNSUPPORTED,
+                "contribute: this server takes no contributions; leave it out, or start the server with "
+                "--contributions on",
+            )
+        wished_s = (request.options.deadline_ms or math.inf) / 1e3
+        end = min(item.received + wished_s, time.perf_counter() + self._options.work_s)
+        if end < item.deadline:
+            item.deadline = end
+            self._watch.add(item)
+        _check_deadline(item)
+        data = item.payload()
+        clock.lap("request")
+        if item.answered:
+            return
+        name = self._namer.submit(candidate_id_of, data) if request.contribute else None
+        process.open(self._published)
+        reply = process.ask(Ask(request=request, request_id=item.request_id), data)
+        clock.lap("worker", reply.timings_ms)
+        reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
+        _check_deadline(item)
+        if name is not None and self._inbox is not None:
+            _answer_and_keep(item, data, request, reply, clock, self._inbox, name)
+        else:
+            item.answer(reply)
+
+
+def _ended_error(ended: WorkerEndedError, limits: WorkerLimits, item: PendingQuery) -> RequestError:
+    if ended.out_of_memory:
+        return RequestError(
+            ErrorCode.TOO_LARGE,
+            f"the query needs more than the {limits.memory_bytes >> 20} MiB of memory that it may; "
+            "send a smaller picture",
+        )
+    return RequestError(
+        ErrorCode.INTERNAL,
+        f"{ended} on this query, which concerns no other; the server's log has it under request id "
+        f"{item.request_id}",
+    )
+
+
+def _answer_and_keep(
+    item: PendingQuery,
+    data: bytes,
+    request: LocaliseWireRequest,
+    reply: LocaliseReply,
+    clock: StageClock,
+    inbox: Inbox,
+    name: "Future[str]",
+) -> None:
+    """Answer, and hand the photo to the inbox if it has a place; what is said in the answer is then done."""
+    received_at = datetime.now(UTC)
+    owner = item.identity or ANONYMOUS  # never what the request claims
+    place = inbox.reserve(owner, len(data))
+    if isinstance(place, InboxRefusal):
+        said = ContributionReply(accepted=False, candidate_id=None, reason=place.reason, detail=place.detail)
+        item.answer(_with_contribution(reply, said, clock))
+        return
+    answered = False
+    try:
+        said = ContributionReply(
+            accepted=True, candidate_id=name.result(), reason=None, detail="queued for the inbox"
+        )
+        answered = item.answer(_with_contribution(reply, said, clock))
+    finally:
+        if not answered:
+            place.cancel()
+    if answered:
+        place.submit(lambda: contribution_of(data, request, reply, received_at, owner))
+
+
+def _with_contribution(reply: LocaliseReply, said: ContributionReply, clock: StageClock) -> LocaliseReply:
+    clock.lap("contribution")
+    return reply.model_copy(update={"contribution": said, "timings_ms": clock.milliseconds()})
+
+
+def _check_deadline(item: PendingQuery) -> None:
+    if time.perf_counter() >= item.deadline:
+        raise deadline_error(item)

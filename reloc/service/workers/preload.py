@@ -1,0 +1,8 @@
+"""Imported by the process that workers are forked from, so that each of them has everything at once."""
+
+import importlib
+import signal
+
+# Who stops a server may tell its whole group; this process ends with the server, which needs it until then.
+signal.signal(signal.SIGTERM, signal.SIG_IGN)
+importlib.import_module("reloc.service.workers.answering")

@@ -1,0 +1,144 @@
+"""The server's end of one worker process."""
+
+import multiprocessing
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.reduction import send_handle
+from types import ModuleType
+
+from reloc.service.workers.answering import (
+    DEFECT,
+    OUT_OF_MEMORY,
+    REFUSAL,
+    Ask,
+    OpenFiles,
+    WorkerLimits,
+    answer_queries,
+)
+from reloc.service.workers.area_files import LocaliserFiles
+from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError
+
+# Forked from a process that has imported everything and runs no threads: a new one is there in milliseconds.
+_CONTEXT = multiprocessing.get_context("forkserver")
+_STARTING = threading.Lock()
+_JOIN_S = 5.0  # for one that has ended or is killed
+
+
+def prepare_workers() -> None:
+    """Let the process begin from which workers are forked: its imports take seconds."""
+    from multiprocessing.forkserver import ensure_running
+
+    _CONTEXT.set_forkserver_preload(["reloc.service.workers.preload"])
+    ensure_running()
+
+
+@contextmanager
+def _without_script() -> Iterator[None]:
+    """Within the block a new process does not run the script of the program again to import it."""
+    with _STARTING:
+        own = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = own
+
+
+class WorkerEndedError(Exception):
+    """The process has ended before it answered.
+
+    Attributes:
+        out_of_memory: the query needed more than its limit.
+    """
+
+    def __init__(self, code: int | None) -> None:
+        how = signal.Signals(-code).name if code is not None and code < 0 else f"exit code {code}"
+        super().__init__(f"the worker process ended with {how}")
+        self.out_of_memory = code == OUT_OF_MEMORY
+
+
+class WorkerDefectError(Exception):
+    """The query met a defect; the message is the traceback in the worker."""
+
+
+class WorkerProcess:
+    """A process that answers one query at a time; of one thread, but for `kill`."""
+
+    def __init__(self, limits: WorkerLimits) -> None:
+        """Raises WorkerEndedError where no process can be started."""
+        self._connection, theirs = _CONTEXT.Pipe()
+        self._open: LocaliserFiles | None = None
+        self._process = _CONTEXT.Process(
+            target=answer_queries, args=(theirs, limits), name="localise", daemon=True
+        )
+        try:
+            with _without_script():
+                self._process.start()
+        except (EOFError, OSError) as error:  # no memory, or whom it is forked from has ended
+            self._connection.close()
+            raise WorkerEndedError(None) from error
+        finally:
+            theirs.close()
+
+    def is_alive(self) -> bool:
+        """Between queries: then there is nothing to be read but the end."""
+        return not self._connection.poll() and self._process.is_alive()
+
+    def kill(self) -> None:
+        """From any thread: whoever waits for an answer gets WorkerEndedError."""
+        self._process.kill()
+
+    def close(self) -> None:
+        """End it; the owner's last call."""
+        self._process.kill()
+        self._process.join(_JOIN_S)
+        self._connection.close()
+
+    def open(self, files: LocaliserFiles) -> None:
+        """Answer from this localiser; does nothing where it does already.
+
+        Raises:
+            WorkerEndedError: the process has ended.
+        """
+        if files is self._open:
+            return
+        try:
+            self._connection.send(OpenFiles(keys=tuple(file.key for file in files.files)))
+            for file in files.files:
+                send_handle(self._connection, file.file.fileno(), self._process.pid)
+            self._connection.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise self._ended() from error
+        self._open = files
+
+    def ask(self, ask: Ask, data: bytes) -> LocaliseReply:
+        """Localise.
+
+        Args:
+            data: the image file.
+
+        Raises:
+            RequestError: why there is no answer.
+            WorkerEndedError: the process has ended.
+            WorkerDefectError: a defect.
+        """
+        try:
+            self._connection.send(ask)
+            self._connection.send_bytes(data)
+            answer = self._connection.recv_bytes()
+        except (EOFError, OSError) as error:
+            raise self._ended() from error
+        kind, content = answer[:1], answer[1:]
+        if kind == DEFECT:
+            raise WorkerDefectError(content.decode())
+        if kind == REFUSAL:
+            refusal = ErrorReply.model_validate_json(content)
+            raise RequestError(ErrorCode(refusal.code), refusal.message)
+        return LocaliseReply.model_validate_json(content)
+
+    def _ended(self) -> WorkerEndedError:
+        self._process.join(_JOIN_S)
+        return WorkerEndedError(self._process.exitcode)
