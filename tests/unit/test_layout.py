@@ -2,6 +2,7 @@
 
 import ast
 from collections import Counter, defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,6 +32,31 @@ def test_folders_hold_few_modules() -> None:
     counts = Counter(_path(m.parent) for m in _modules(*PACKAGES) if m.name != "__init__.py")
     full = {folder: count for folder, count in counts.items() if count > MAX_MODULES}
     assert not full, f"folders of more than {MAX_MODULES} modules, divide them: {full}"
+
+
+def test_a_module_gives_a_name_to_one_thing() -> None:
+    """A second constant or function of one name silently takes the place of the first."""
+    twice = {
+        f"{_path(module)}: {name}": count
+        for module in _modules(*PACKAGES, "tools")
+        for name, count in Counter(_bound(ast.parse(module.read_text()))).items()
+        if count > 1
+    }
+    assert not twice, f"names that a module gives to several things: {twice}"
+
+
+def _bound(module: ast.Module) -> Iterator[str]:
+    """Names of functions, classes and values, in the order of the module; of an overload the last alone."""
+    for node in module.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            if "overload" not in [ast.unparse(d) for d in node.decorator_list]:
+                yield node.name
+        elif isinstance(node, ast.Assign | ast.AnnAssign):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            for target in targets:
+                for part in ast.walk(target):
+                    if isinstance(part, ast.Name) and isinstance(part.ctx, ast.Store):
+                        yield part.id
 
 
 def _modules(*folders: str) -> list[Path]:

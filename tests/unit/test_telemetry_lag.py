@@ -5,7 +5,7 @@ import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.video.telemetry.values import Telemetry
-from ingest.video.clocks import estimate_lag
+from ingest.video.lag import estimate_lag
 from ingest.video.motion import Motion
 
 _RATE_HZ, _SECONDS = 30.0, 30.0
