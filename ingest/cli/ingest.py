@@ -191,8 +191,6 @@ def _add_running(parser: argparse.ArgumentParser) -> None:
 
 def run_photos(args: argparse.Namespace) -> int:
     """Ingest, print what happened; 0 if a map is in the database, 1 if none could be made."""
-    from ingest.cli.ingest import ingest_folder
-
     return ingest_folder(args, args.folder)
 
 

@@ -27,6 +27,8 @@ from ingest.video.positions import angles_at, digest_of_telemetry, lateness, pos
 from ingest.workspace import write_json
 
 _DONE = "film.json"
+# Raised when a film gives other stills: with the constants of `motion`, `burnt_in`, `clocks`, `lag`, `match`.
+_VERSION = "1"
 _MOTION_SIDE_PX = 640  # frames are made so small to measure their motion
 
 
@@ -99,7 +101,9 @@ def make_stills(
     options = options or StillsOptions()
     content = _digest_of(film)
     folder = (
-        root / "stills" / digest(content, options_fingerprint(options), digest_of_telemetry(telemetry))[:16]
+        root
+        / "stills"
+        / digest(_VERSION, content, options_fingerprint(options), digest_of_telemetry(telemetry))[:16]
     )
     known = _known(folder)
     if known is not None:

@@ -124,7 +124,8 @@ def place_of(feature_map: FeatureMap) -> str:
 def family(maps: Mapping[str, PlacedMap], edges: Iterable[tuple[str, str]], start: Iterable[str]) -> set[str]:
     """Maps that are connected with those of `start` by edges, those among them."""
     nodes = list(maps)
-    group_of = dict(zip(nodes, tied_together(nodes, [e for e in edges if set(e) <= set(maps)]), strict=True))
+    among = [(a, b) for a, b in edges if a in maps and b in maps]
+    group_of = dict(zip(nodes, tied_together(nodes, among), strict=True))
     groups = {group_of[m] for m in start if m in maps}
     return {m for m in nodes if group_of[m] in groups}
 

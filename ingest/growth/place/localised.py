@@ -188,8 +188,7 @@ def _match_each_map(features: Features, area: Area, pose: PoseHypothesis) -> Mat
     Two maps of one place have the same points twice; each may have its match. Maps with fewer matches
     within the tolerance than a pose needs are left out: chance alone gives a few.
     """
-    everything = np.arange(len(area.points), dtype=np.int64)
-    visible = visible_points(area, everything, pose.camera, pose.cam_from_local, POSSIBLE_DEG)
+    visible = visible_points(area, area.searched_points(), pose.camera, pose.cam_from_local, POSSIBLE_DEG)
     parts = [
         Matches(feature=np.zeros(0, np.int64), point=np.zeros(0, np.int64), distance=np.zeros(0, np.float32))
     ]

@@ -12,7 +12,8 @@ from ingest.growth.place.localised import QUERY
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.workspace import read_json, write_json
 
-_VERSION = "1"  # raised when the same question gets another answer
+# Raised when the same question gets another answer: with any limit of growth (its gates, `place/`, `trust/`).
+_VERSION = "2"
 
 
 def question(
@@ -22,7 +23,7 @@ def question(
     maps = sorted(f"{m.write_id} {m.status}" for m in snapshot.maps())
     canaries = [f"{c.name} {c.created_at.isoformat()}" for c in list_canaries(database)]
     asks = options_fingerprint(options, QUERY)
-    return digest(_VERSION, asks, *maps, "|", *canaries, "|", *sorted(photos))
+    return digest(asks, *maps, "|", *canaries, "|", *sorted(photos))
 
 
 def recall(work: Path | None, map_id: str, asked: str) -> tuple[str, str, tuple[Gate, ...]] | None:
@@ -31,7 +32,7 @@ def recall(work: Path | None, map_id: str, asked: str) -> tuple[str, str, tuple[
     if file is None or not file.is_file():
         return None
     value = read_json(file)
-    if value.get("question") != asked:
+    if value.get("question") != digest(_VERSION, asked):
         return None
     return value["reason_code"], value["reason"], tuple(Gate(**gate) for gate in value["gates"])
 
@@ -44,7 +45,8 @@ def remember(
         return
     told = [{**asdict(gate), "passes": bool(gate.passes), "figure": float(gate.figure)} for gate in gates]
     write_json(
-        _file(work, map_id), {"question": asked, "reason_code": reason_code, "reason": reason, "gates": told}
+        _file(work, map_id),
+        {"question": digest(_VERSION, asked), "reason_code": reason_code, "reason": reason, "gates": told},
     )
 
 
