@@ -182,6 +182,9 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="within", least=0.95),
             Limit(figure="wrong", most=0),
             Limit(figure="negatives_answered", most=0),
+            # 68 % within two standard deviations of the count of 60.
+            Limit(figure="inside_horizontal", least=0.56, most=0.80),
+            Limit(figure="inside_orientation", least=0.56, most=0.80),
         ),
         readme=True,
         minutes=25,
@@ -211,6 +214,7 @@ SIMULATED: tuple[Row, ...] = (
             Limit(figure="cut_mean_m", most=0.10),
             Limit(figure="cut_largest_m", most=1.0),
             Limit(figure="cut_invented", most=0),
+            Limit(figure="cut_found_s", most=1.0),
         ),
         minutes=4,
     ),
