@@ -6,14 +6,20 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from featuredb.errors import IncompatibleExtractorError, MapNotFoundError, UnplacedBesideOthersError
+from featuredb.errors import (
+    FeatureDbError,
+    IncompatibleExtractorError,
+    MapNotFoundError,
+    StoreError,
+    UnplacedBesideOthersError,
+)
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.index.area import build_area
 from featuredb.index.descriptor_index import build_index
@@ -51,6 +57,14 @@ class _Given(Generic[_Value]):
         return self.value
 
 
+@dataclass(frozen=True, slots=True)
+class _Unreadable:
+    message: str
+
+    def __call__(self) -> Any:
+        raise StoreError(self.message)
+
+
 class OnDemand(Generic[_Value]):
     """An area that answers only where it is named: read when somebody first names it, and kept."""
 
@@ -67,8 +81,12 @@ class OnDemand(Generic[_Value]):
             return self._value
 
     def __reduce__(self) -> tuple[object, ...]:
-        """With its value, which is not kept for that."""
-        value = self._read() if self._value is None else self._value
+        """With its value, which is not kept for that, or with why it cannot be read."""
+        try:
+            value = self._read() if self._value is None else self._value
+        except FeatureDbError as error:
+            _LOG.warning("a map that answers only where it is named cannot be read: %s", error)
+            return OnDemand, (self.write_id, _Unreadable(str(error)))
         return OnDemand, (self.write_id, _Given(value))
 
 

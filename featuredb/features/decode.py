@@ -156,7 +156,9 @@ def _decode(data: bytes | Path, limits: DecodeLimits, flags: int) -> NDArray[np.
 def _imdecode(content: bytes, flags: int) -> NDArray[np.uint8] | None:
     try:
         pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
-    except (cv2.error, MemoryError):
+    except (cv2.error, MemoryError) as error:
+        if isinstance(error, MemoryError) or error.code == cv2.Error.StsNoMem:
+            raise ImageError("the image needs more memory than there is", "too_large") from error
         return None
     return None if pixels is None else np.asarray(pixels, dtype=np.uint8)
 

@@ -35,6 +35,7 @@ _TIMEOUT_S = 10.0  # Zenoh's own default
 # The server's deadline is this much earlier than the client's timeout, so that its word arrives in time.
 _DEADLINE_MARGIN_S = 0.2
 _FIRST_WAIT_S = 0.25  # before a busy server is asked again, as long as a query takes; then twice that
+_LEAST_LEFT_S = 0.1  # with less, a busy server is not asked again
 _ASK_AGAIN_S = 0.05  # while no server is there yet
 
 
@@ -144,7 +145,6 @@ class Client:
             InvalidValueError: arguments that no server takes.
         """
         data = image if isinstance(image, bytes) else Path(image).read_bytes()
-        deadline_s = max(timeout_s - _DEADLINE_MARGIN_S, 0.5 * timeout_s)
         try:
             request = LocaliseWireRequest(
                 request_id=request_id,
@@ -155,7 +155,7 @@ class Client:
                 licence=licence,
                 client_id=client_id,
                 options=RequestOptions(
-                    inliers=inliers, exif_prior=exif_prior, maps=maps, deadline_ms=deadline_s * 1e3
+                    inliers=inliers, exif_prior=exif_prior, maps=maps, deadline_ms=_deadline_ms(timeout_s)
                 ),
             )
         except ValidationError as error:
@@ -163,14 +163,15 @@ class Client:
         key = self._keys.localise(self.name)
         end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
         while True:
-            left_s = end - time.perf_counter()
+            left_s = max(end - time.perf_counter(), 1e-3)
+            options = request.options.model_copy(update={"deadline_ms": _deadline_ms(left_s)})
+            asked = encode(request.model_copy(update={"options": options}))
             try:
-                return self._ask(key, LocaliseReply, left_s, payload=data, attachment=encode(request))
+                return self._ask(key, LocaliseReply, left_s, payload=data, attachment=asked)
             except ServiceError as error:
-                pause_s = wait_s * random.uniform(
-                    0.5, 1.5
-                )  # so that those who were refused do not return at once
-                if error.code != ErrorCode.BUSY or time.perf_counter() + pause_s >= end:
+                # So that those who were refused do not return at once.
+                pause_s = wait_s * random.uniform(0.5, 1.5)
+                if error.code != ErrorCode.BUSY or time.perf_counter() + pause_s + _LEAST_LEFT_S >= end:
                     raise
             time.sleep(pause_s)
             wait_s *= 2
@@ -276,6 +277,11 @@ class Client:
         raise ServiceError(
             NO_SERVER, f"no server of database {self._database!r} answers any more at {self._where}"
         )
+
+
+def _deadline_ms(left_s: float) -> float:
+    """What the server is told of the time that is left."""
+    return 1e3 * max(left_s - _DEADLINE_MARGIN_S, 0.5 * left_s)
 
 
 def _name_in(config: zenoh.Config) -> str:

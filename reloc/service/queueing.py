@@ -5,7 +5,7 @@ import itertools
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from reloc.service.pending import PendingQuery
 from reloc.wire.query import ErrorCode, RequestError
@@ -34,33 +34,26 @@ class QueryQueue:
         Raises:
             RequestError: BUSY when full, SHUTTING_DOWN when closed.
         """
-        refused = []
         with self._changed:
             if self._closed:
                 raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
+            self._remove([i for waiting in self._waiting.values() for i in waiting if i.answered])
             busy = RequestError(
                 ErrorCode.BUSY,
                 f"{self._length} queries ({self._bytes} bytes) are waiting, the queue is full; "
                 "try again in a second",
             )
-            own = len(self._waiting.get(item.asker, ()))
-            placed = False
-            while self._length >= self._max_length or self._bytes + item.size > self._max_bytes:
-                most = max(self._waiting.values(), key=len, default=deque[PendingQuery]())
-                if len(most) <= own + 1:
-                    break
-                refused.append(self._taken(most.pop()))
-            else:
-                self._spent_s.setdefault(item.asker, min(self._spent_s.values(), default=0.0))
-                self._waiting.setdefault(item.asker, deque()).append(item)
-                self._length += 1
-                self._bytes += item.size
-                self._changed.notify()
-                placed = True
+            refused = self._who_makes_room(item)
+            if refused is None:
+                raise busy
+            self._remove(refused)
+            self._spent_s.setdefault(item.asker, min(self._spent_s.values(), default=0.0))
+            self._waiting.setdefault(item.asker, deque()).append(item)
+            self._length += 1
+            self._bytes += item.size
+            self._changed.notify()
         for other in refused:
             other.refuse(busy)
-        if not placed:
-            raise busy
 
     def get(self) -> PendingQuery | None:
         """The next query, blocking, to be followed by `done`; None once closed and empty."""
@@ -99,6 +92,24 @@ class QueryQueue:
 
     def __len__(self) -> int:
         return self._length
+
+    def _who_makes_room(self, item: PendingQuery) -> list[PendingQuery] | None:
+        """Those of others that go for it; None where who has most waiting has no more than its asker."""
+        waiting = {asker: list(items) for asker, items in self._waiting.items()}
+        own, length, size = len(waiting.get(item.asker, ())), self._length, self._bytes
+        going: list[PendingQuery] = []
+        while length >= self._max_length or size + item.size > self._max_bytes:
+            most = max(waiting.values(), key=len, default=[])
+            if len(most) <= own + 1:
+                return None
+            going.append(most.pop())
+            length, size = length - 1, size - going[-1].size
+        return going
+
+    def _remove(self, items: Sequence[PendingQuery]) -> None:
+        for item in items:
+            self._waiting[item.asker].remove(item)
+            self._taken(item)
 
     def _taken(self, item: PendingQuery) -> PendingQuery:
         """Account for a query that waits no more."""

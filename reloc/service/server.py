@@ -4,6 +4,7 @@ import json
 import logging
 import threading
 import time
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from typing import Self
@@ -126,20 +127,25 @@ class Server:
         try:
             server._declare()
         except zenoh.ZError as error:
-            session.close()
             raise ServiceStartError(f"cannot declare the keys of {database!r}: {error}") from error
-        except ServiceStartError:
-            server._watch.close()
-            session.close()
-            raise
         return server
 
     def _declare(self) -> None:
-        if self._inbox is not None:
-            self._inbox.start()
-        self._watch.start()
-        self._workers.publish(self._area)
-        self._workers.start()
+        """Start all parts; those that have begun end again where another one cannot."""
+        with ExitStack() as undo:
+            undo.callback(self._session.close)
+            self._watch.start()
+            undo.callback(self._watch.close)
+            if self._inbox is not None:
+                self._inbox.start()
+                undo.callback(self._inbox.close, 0.0)
+            undo.callback(self._queue.close)
+            self._workers.publish(self._area)
+            self._workers.start()
+            self._listen()
+            undo.pop_all()
+
+    def _listen(self) -> None:
         # `complete`: of several servers of one database the nearest answers, not all of them.
         for key, callback in (
             (self._keys.localise("*"), self._on_localise),

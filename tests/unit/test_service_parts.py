@@ -2,7 +2,6 @@
 
 import threading
 import time
-from types import SimpleNamespace
 
 import cv2
 import pytest
@@ -169,9 +168,17 @@ def test_people_read_what_a_grown_map_stands_on_and_what_became_of_their_photo()
     )
 
 
-def waiting(asker: str, size: int = 1) -> SimpleNamespace:
-    refused: list[RequestError] = []
-    return SimpleNamespace(asker=asker, size=size, refuse=refused.append, refused=refused)
+class Waiting:
+    """A query in the queue, no two of which are equal."""
+
+    def __init__(self, asker: str, size: int) -> None:
+        self.asker, self.size, self.answered = asker, size, False
+        self.refused: list[RequestError] = []
+        self.refuse = self.refused.append
+
+
+def waiting(asker: str, size: int = 1) -> Waiting:
+    return Waiting(asker, size)
 
 
 def test_who_floods_waits_for_those_who_do_not():
@@ -213,3 +220,23 @@ def test_in_a_full_queue_who_has_most_waiting_makes_room(length, size):
     queue.close()
     assert {id(queue.get()) for _ in range(4)} == {id(item) for item in (*flood[:2], *honest)}
     assert queue.get() is None
+
+
+def test_a_query_that_is_answered_keeps_no_place():
+    queue = QueryQueue(2, 100)
+    late = waiting("a"), waiting("a")
+    for item in late:
+        queue.put(item)
+    late[1].answered = True
+    queue.put(waiting("a"))
+    assert len(queue) == 2
+
+
+def test_nobody_goes_for_a_query_that_does_not_fit():
+    queue = QueryQueue(10, 10)
+    others = [waiting("a", 3), waiting("a", 3), waiting("a", 3)]
+    for item in others:
+        queue.put(item)
+    with pytest.raises(RequestError):
+        queue.put(waiting("b", 9))
+    assert len(queue) == 3

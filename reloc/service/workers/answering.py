@@ -4,11 +4,14 @@ import math
 import os
 import resource
 import signal
+import sys
 import traceback
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from pathlib import Path
+
+import cv2
 
 from featuredb.features.decode import DecodeLimits
 from featuredb.stage_clock import StageClock
@@ -93,30 +96,39 @@ def answer_queries(connection: Connection, limits: WorkerLimits) -> None:
                 return
             except MemoryError:
                 os._exit(OUT_OF_MEMORY)
+            except cv2.error as error:
+                if error.code != cv2.Error.StsNoMem:
+                    raise
+                os._exit(OUT_OF_MEMORY)
             stop.busy = False
 
 
 def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> LocaliserLike:
-    descriptors = {key: recv_handle(connection) for key in message.keys}
+    """Raises SystemExit, and says why, where a file cannot be mapped."""
     try:
-        localiser: LocaliserLike = areas.localiser(descriptors)
-        return localiser
-    finally:
-        for descriptor in descriptors.values():
-            os.close(descriptor)
+        localiser: LocaliserLike = areas.localiser(message.keys, lambda: recv_handle(connection))
+    except OSError as error:
+        if isinstance(error, ConnectionError):
+            raise
+        sys.exit(f"a worker cannot map the areas: {error}")
+    return localiser
 
 
 def _limit(limits: WorkerLimits) -> None:
     """Limits of the next query, above what the process has and has used so far."""
     times = os.times()
     used_s = times.user + times.system
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    resource.setrlimit(resource.RLIMIT_CPU, (math.ceil(used_s + limits.processor_s) + 1, hard))
+    _set_limit(resource.RLIMIT_CPU, math.ceil(used_s + limits.processor_s) + 1)
     statm = Path("/proc/self/statm")
     if statm.exists():  # Linux
         now = int(statm.read_text().split()[0]) * resource.getpagesize()
-        _, hard = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (now + limits.memory_bytes, hard))
+        _set_limit(resource.RLIMIT_AS, now + limits.memory_bytes)
+
+
+def _set_limit(which: int, wanted: int) -> None:
+    """As wanted, or as the system that the server runs on allows at most."""
+    _, hard = resource.getrlimit(which)
+    resource.setrlimit(which, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
 
 
 def _answer(ask: Ask, data: bytes, localiser: LocaliserLike, limits: WorkerLimits) -> bytes:
@@ -133,7 +145,9 @@ def _answer(ask: Ask, data: bytes, localiser: LocaliserLike, limits: WorkerLimit
     except RequestError as error:
         refusal = ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=ask.request_id)
         return REFUSAL + encode(refusal)
-    except MemoryError:
-        raise
+    except (MemoryError, cv2.error) as error:
+        if isinstance(error, MemoryError) or error.code == cv2.Error.StsNoMem:
+            raise
+        return DEFECT + traceback.format_exc().encode()
     except Exception:  # noqa: BLE001  # the server logs it
         return DEFECT + traceback.format_exc().encode()

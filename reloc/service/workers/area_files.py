@@ -6,13 +6,15 @@ A file has no name, so that nothing is left behind; whoever has a descriptor or 
 import io
 import itertools
 import mmap
+import os
 import pickle
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import IO, Any
 
+from featuredb.errors import StoreError
 from reloc.localise.candidates import IndexedArea
 from reloc.localiser import OnDemand
 from reloc.service.source import LocaliserLike
@@ -49,7 +51,20 @@ class AreaFiles:
         self._written: weakref.WeakKeyDictionary[object, AreaFile] = weakref.WeakKeyDictionary()
 
     def of(self, localiser: LocaliserLike) -> LocaliserFiles:
-        """The files of a localiser."""
+        """The files of a localiser.
+
+        Raises:
+            StoreError: the folder of temporary files has no room for them.
+        """
+        try:
+            return self._files(localiser)
+        except OSError as error:
+            raise StoreError(
+                f"cannot write the maps into {tempfile.gettempdir()} for the worker processes: {error}. They "
+                "need as much room as in memory; free it, or set TMPDIR to another folder"
+            ) from error
+
+    def _files(self, localiser: LocaliserLike) -> LocaliserFiles:
         parts: list[AreaFile] = []
 
         def key_of(part: object) -> int:
@@ -73,11 +88,25 @@ class MappedAreas:
     def __init__(self) -> None:
         self._parts: dict[int, object] = {}
 
-    def localiser(self, descriptors: Mapping[int, int]) -> Any:
-        """The localiser of some files, by key in the order of `LocaliserFiles`; known ones are kept."""
-        *parts, whole = descriptors
-        self._parts = {key: self._parts.get(key) or _read(descriptors[key], {}) for key in parts}
-        return _read(descriptors[whole], self._parts)
+    def localiser(self, keys: Sequence[int], receive: Callable[[], int]) -> Any:
+        """The localiser of some files, by key in the order of `LocaliserFiles`; known ones are kept.
+
+        Args:
+            receive: the descriptor of the next file, which is closed here: one is open at a time.
+        """
+        found: dict[int, object] = {}
+        localiser: object = None
+        for key in keys:
+            descriptor = receive()
+            try:
+                if key == keys[-1]:
+                    localiser = _read(descriptor, found)
+                else:
+                    found[key] = self._parts.get(key) or _read(descriptor, {})
+            finally:
+                os.close(descriptor)
+        self._parts = found
+        return localiser
 
 
 class _Pickler(pickle.Pickler):

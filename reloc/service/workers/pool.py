@@ -118,18 +118,19 @@ class WorkerPool:
     def _run(self) -> None:
         process = self._replaced(None)
         while (item := self._queue.get()) is not None:
-            process = self._replaced(process)
-            with self._changed:
-                self._busy[item] = process
             start = time.perf_counter()
             try:
+                process = self._replaced(process)
+                with self._changed:
+                    self._busy[item] = process
+                start = time.perf_counter()
                 if process is None:
                     item.refuse(RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping"))
                 elif not item.answered:
                     self._answer(item, process)
             finally:
                 with self._changed:
-                    del self._busy[item]
+                    self._busy.pop(item, None)
                 self._queue.done(item, time.perf_counter() - start)
             process = self._replaced(process)
         if process is not None:
@@ -145,7 +146,7 @@ class WorkerPool:
             try:
                 process = WorkerProcess(self._limits)
                 process.open(self._published)
-            except WorkerEndedError as error:
+            except Exception as error:
                 if process is not None:
                     self._gone(process)
                 process = None
@@ -205,6 +206,7 @@ class WorkerPool:
         end = min(item.received + wished_s, time.perf_counter() + self._options.work_s)
         if end < item.deadline:
             item.deadline = end
+            _check_deadline(item)  # one that is over already must not end a process that has nothing in hand
             self._watch.add(item)
         _check_deadline(item)
         data = item.payload()

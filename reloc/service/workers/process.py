@@ -1,11 +1,12 @@
 """The server's end of one worker process."""
 
 import multiprocessing
+import resource
 import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing.reduction import send_handle
 from types import ModuleType
 
@@ -28,9 +29,15 @@ _JOIN_S = 5.0  # for one that has ended or is killed
 
 
 def prepare_workers() -> None:
-    """Let the process begin from which workers are forked: its imports take seconds."""
+    """Let the process begin from which workers are forked: its imports take seconds.
+
+    It and this one may have as many open files as the system allows: each area is one.
+    """
     from multiprocessing.forkserver import ensure_running
 
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     _CONTEXT.set_forkserver_preload(["reloc.service.workers.preload"])
     ensure_running()
 
@@ -69,8 +76,12 @@ class WorkerProcess:
 
     def __init__(self, limits: WorkerLimits) -> None:
         """Raises WorkerEndedError where no process can be started."""
-        self._connection, theirs = _CONTEXT.Pipe()
+        try:
+            self._connection, theirs = _CONTEXT.Pipe()
+        except OSError as error:  # too many open files
+            raise WorkerEndedError(None) from error
         self._open: LocaliserFiles | None = None
+        self._killed = False
         self._process = _CONTEXT.Process(
             target=answer_queries, args=(theirs, limits), name="localise", daemon=True
         )
@@ -84,11 +95,12 @@ class WorkerProcess:
             theirs.close()
 
     def is_alive(self) -> bool:
-        """Between queries: then there is nothing to be read but the end."""
-        return not self._connection.poll() and self._process.is_alive()
+        """Between queries: then there is nothing to be read but the end. One that was told to end is not."""
+        return not self._killed and not self._connection.poll() and self._process.is_alive()
 
     def kill(self) -> None:
         """From any thread: whoever waits for an answer gets WorkerEndedError."""
+        self._killed = True
         self._process.kill()
 
     def close(self) -> None:
