@@ -48,7 +48,7 @@ def answer_query(
         localiser: answers from one snapshot.
         limits: bytes and pixels allowed.
         request_id: goes into the reply.
-        clock: its stages so far (queue, request) become part of the reply's timings.
+        clock: its stages so far become part of the reply's timings.
 
     Raises:
         RequestError: bad image, bad request, too large, or maps of another extractor.
