@@ -10,7 +10,7 @@ import pytest
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store import Database
 from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import list_candidates
+from featuredb.store.candidates.photos import list_candidates, withdraw
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
@@ -106,6 +106,20 @@ def test_a_record_ends_with_the_maps_that_made_it(database: Database) -> None:
     assert _on_record(database) == set()
     _add(database, _grown("far", 85.0, "anna", "ben", seed=2))
     assert _promoted(database)["far"].reason_code == "ONE_SOURCE"
+
+
+def test_who_gives_a_withdrawn_photo_again_is_its_owner_and_inherits_no_record(database: Database) -> None:
+    feature_map = _grown("m", 45.0, "anna")
+    _add(database, feature_map)
+    assert promote_by_hand(database, "m", "I have seen it", force=False).promoted
+    candidates = [c.candidate_id for c in list_candidates(database)]
+    withdraw(database, candidates, "on request")
+    assert _on_record(database) == {"anna"}
+    note_contributed(database, feature_map, "ben")
+    owners = read_owners(database, database.snapshot())
+    assert {c.owner for c in list_candidates(database)} == {"ben"}
+    assert set(owners.givers.values()) == {"ben"}
+    assert owners.on_record == {"anna"}
 
 
 def test_nobody_in_particular_has_no_record(database: Database) -> None:
