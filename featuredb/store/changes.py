@@ -12,6 +12,7 @@ RETIRED = "retired"
 UNPLACED = "unplaced"
 # The reason of a map's status that came with a dataset.
 IMPORTED = "imported, and nobody here has vouched for it"
+VOUCHED = "imported, and vouched for later"
 # Columns that say where a map lies; equal ones mean that it was not placed anew.
 _PLACE = (
     "epsg",
@@ -199,6 +200,41 @@ def descendants(rows: Iterable[Row], ancestors: Iterable[str]) -> dict[str, str]
 def is_imported(status: str, reason: str) -> bool:
     """Whether a map came with a dataset, and nobody here has vouched for it by a promotion."""
     return status in (QUARANTINED, UNPLACED) and reason == IMPORTED
+
+
+def vouch_for(
+    rows: Sequence[Row], active: Collection[str], reasons: Mapping[str, str]
+) -> tuple[Change, list[str]]:
+    """Take imported maps for what their dataset says; returns the change and the ids that it is about.
+
+    Args:
+        active: ids of those that the dataset calls active. One that no chain of active parents carries stays
+            in quarantine, with the parents in the way for a reason.
+        reasons: why each other map is quarantined or without a place, by the ids of all maps of the dataset.
+    """
+    ids = [
+        r["map_id"] for r in rows if r["map_id"] in reasons and is_imported(r["status"], r["status_reason"])
+    ]
+    if not ids:
+        return Change(rows=list(rows), added=[], only_adds=True), []
+    up = {
+        r["map_id"] for r in rows if r["map_id"] in active and r["map_id"] in ids and r["status"] != UNPLACED
+    }
+    standing = anchored(
+        [{**r, "status": ACTIVE} if r["map_id"] in up else r for r in rows], statuses=(ACTIVE,)
+    )
+
+    def vouched(row: Row) -> Row:
+        if row["map_id"] not in up:
+            return {**row, "status_reason": reasons[row["map_id"]]}
+        if row["map_id"] in standing:
+            return {**row, "status": ACTIVE, "status_reason": VOUCHED}
+        lacking = ", ".join(p for p in row["parents"] if p not in standing)
+        return {**row, "status_reason": f"what placed it is not active: {lacking}"}
+
+    return Change(
+        rows=[vouched(r) if r["map_id"] in ids else r for r in rows], added=[], only_adds=False
+    ), ids
 
 
 def _still_imported(row: Row, before: Row | None) -> Row:

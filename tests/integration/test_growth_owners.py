@@ -1,7 +1,7 @@
 """Whose word counts: owners by identity, what makes their record, and how a community begins."""
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +10,11 @@ import pytest
 from featuredb.maps.feature_map import FeatureMap, MapMethod, MapStatus
 from featuredb.store import Database
 from featuredb.store.candidates.owners import read_owners
-from featuredb.store.candidates.photos import list_candidates
+from featuredb.store.candidates.photos import list_candidates, withdraw
 from featuredb.store.candidates.states import ANONYMOUS, OPERATOR
 from featuredb.store.changes import IMPORTED
 from featuredb.store.verify import verify
+from ingest.growth.trust.canaries import CanaryCheck, CanaryRun
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.growth.trust.promotion import Promotion, promote_by_hand, promote_confirmed
 from reloc.localiser import Localiser
@@ -98,6 +99,29 @@ def test_newcomers_beside_an_anchor_add_what_both_show(database: Database) -> No
     assert -10.1 < east["west"].min() < -9.0  # the anchor begins at -10 m, her map at -20 m
 
 
+@pytest.mark.parametrize("refused", ["near", "wall"])
+def test_a_map_that_canaries_refuse_makes_no_record(
+    database: Database, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
+    """Its photos and those of a map that they alone confirm were given by the same two."""
+    _add(database, _grown("far", 85.0, "anna", "ben"))
+    _add(database, _grown("near", 45.0, "anna", "ben", seed=2))
+    _add(database, _grown("wall", -5.0, "eve", seed=3))
+
+    def canaries(_: Database, before: Localiser, after: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
+        wrong = "wrong" if refused in {m.map_id for m in maps} else ""
+        return CanaryRun(
+            checks=(CanaryCheck(name="c", before="found", after="found", regression=wrong),), note=""
+        )
+
+    monkeypatch.setattr("ingest.growth.trust.promotion.run_canaries", canaries)
+    found = _promoted(database)
+    stays = {"near", "far"} if refused == "near" else {"wall"}
+    assert {m for m, p in found.items() if not p.promoted} == stays
+    assert found[refused].reason_code == "CANARY"
+    assert refused == "wall" or found["far"].reason_code == "ONE_SOURCE"
+
+
 def test_a_record_ends_with_the_maps_that_made_it(database: Database) -> None:
     _add(database, _grown("near", 45.0, "anna", "ben"))
     assert _promoted(database)["near"].promoted
@@ -106,6 +130,20 @@ def test_a_record_ends_with_the_maps_that_made_it(database: Database) -> None:
     assert _on_record(database) == set()
     _add(database, _grown("far", 85.0, "anna", "ben", seed=2))
     assert _promoted(database)["far"].reason_code == "ONE_SOURCE"
+
+
+def test_who_gives_a_withdrawn_photo_again_is_its_owner_and_inherits_no_record(database: Database) -> None:
+    feature_map = _grown("m", 45.0, "anna")
+    _add(database, feature_map)
+    assert promote_by_hand(database, "m", "I have seen it", force=False).promoted
+    candidates = [c.candidate_id for c in list_candidates(database)]
+    withdraw(database, candidates, "on request")
+    assert _on_record(database) == {"anna"}
+    note_contributed(database, feature_map, "ben")
+    owners = read_owners(database, database.snapshot())
+    assert {c.owner for c in list_candidates(database)} == {"ben"}
+    assert set(owners.givers.values()) == {"ben"}
+    assert owners.on_record == {"anna"}
 
 
 def test_nobody_in_particular_has_no_record(database: Database) -> None:

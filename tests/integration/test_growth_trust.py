@@ -12,6 +12,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import move_map
 from featuredb.store import Database
+from featuredb.store.changes import IMPORTED
 from ingest.growth.graph.map_graph import placed_maps
 from ingest.growth.graph.replacing import replace_descendants
 from ingest.growth.map_images import features_and_points
@@ -311,6 +312,43 @@ def test_an_anchor_that_contradicts_by_far_moves_nothing(tmp_path: Path) -> None
     assert done is not None
     assert done.reason == "CONTRADICTION"
     assert "m4 - B" in done.message
+    assert database.poll_version() == before
+
+
+def test_what_was_imported_moves_nothing(tmp_path: Path) -> None:
+    """A dataset's anchor and edge, forged to be surer than all else, would pull at the database's anchor."""
+    database = _database(tmp_path, _ANCHOR)
+    sure = np.diag(np.repeat([1e-9, 1e-5], [4, 3]))
+    forger = strip_map("X", 20.0, owners=["survey"], move=east(1.0), covariance=sure, seed=5)
+    forger = replace(forger, status="quarantined")
+    forged = strip_map("y", 30.0, owners=["eve"], parents=[_ANCHOR, forger], seed=6)
+    database.commit_maps([forger, forged], reasons={"X": IMPORTED, "y": IMPORTED})
+    assert set(placed_maps(database.snapshot())) == {"A"}
+    for feature_map in _chain(0.06, Sim3.identity())[1:]:
+        _add(database, feature_map)
+    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
+    assert done is not None
+    assert done.reason is None
+    assert not {"X", "y"} & {m.map_id for m in done.moved}
+    assert error_m(database.snapshot().load_map("A"), 20.0) < 0.03
+
+
+def test_a_map_that_only_an_import_holds_stays_where_it_is(tmp_path: Path) -> None:
+    """Its other parent is placed anew, and hangs on the same import."""
+    imported = replace(strip_map("X", 20.0, owners=["survey"]), status="quarantined")
+    first = strip_map("m1", 45.0, owners=["anna"], parents=[imported], seed=1)
+    second = strip_map("m2", 60.0, owners=["ben"], parents=[first], seed=2)
+    database = _database(tmp_path)
+    database.commit_maps([imported], reasons={"X": IMPORTED})
+    for feature_map in (first, second):
+        _add(database, feature_map)
+    database.commit_map(
+        move_map(first, east(0.1), FRAME, covariance=first.placement.covariance), replaces="m1"
+    )
+    before = database.poll_version()
+    done = replace_descendants(database, tmp_path / "work", budget_m=_BUDGET_M)
+    assert done is not None
+    assert done.reason == "NO_ANCHOR"
     assert database.poll_version() == before
 
 

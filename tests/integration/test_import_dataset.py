@@ -220,6 +220,36 @@ def test_nothing_of_it_answers_before_somebody_vouches_for_it(
     assert {m.map_id for m in target.snapshot().maps() if m.status == "active"} == {"fiji"}
 
 
+def test_who_vouches_later_vouches_for_all_maps(tmp_path: Path, target: Database) -> None:
+    """Those without a place and in quarantine, too; one whose parent somebody here holds back waits."""
+    source = Database.create(tmp_path / "source.db")
+    source.commit_maps([random_unplaced_map(1), random_map(2), random_map(3), random_map(4)])
+    source.commit_map(random_map(5, parents=("map-2",)))
+    source.set_status(["map-3"], "quarantined", "one owner only")
+    source.set_status(["map-4"], "quarantined", IMPORTED)  # from elsewhere, there
+    export(source, tmp_path / "out", Selection(statuses=("active", "quarantined", "unplaced")))
+    import_dataset(target, tmp_path / "out")
+    reasons = _reasons(target)
+    assert set(reasons.values()) == {IMPORTED}
+    target.set_status(["map-2"], "active", "known")
+    target.set_status(["map-2"], "quarantined", "it is blurred")
+    import_dataset(target, tmp_path / "out", trusted=True)
+    reasons = _reasons(target)
+    assert IMPORTED not in reasons.values()
+    assert reasons["map-3"] == "one owner only"
+    assert reasons["map-5"] == "what placed it is not active: map-2"
+    assert target.snapshot().get("map-5").status == "quarantined"
+    before = target.poll_version()
+    import_dataset(target, tmp_path / "out", trusted=True)
+    assert target.poll_version() == before
+    assert verify(target).ok
+
+
+def _reasons(database: Database) -> dict[str, str]:
+    snapshot = database.snapshot()
+    return {m.map_id: m.status_reason for m in (*snapshot.maps(), *snapshot.unplaced_maps())}
+
+
 def test_a_map_whose_parents_are_missing_waits_in_quarantine(source: Database, tmp_path: Path) -> None:
     export(source, tmp_path / "out", Selection(maps=("grandchild", "cape-town")))
     target = Database.create(tmp_path / "target.db")

@@ -38,7 +38,7 @@ def _confirm(
     options: ConfirmationOptions = _OPTIONS,
     on_record: Sequence[str] = _KNOWN,
     trusted: Sequence[str] = (),
-    against: Sequence[str] = (),
+    against: Sequence[tuple[Source, str]] = (),
 ) -> Confirmation:
     sources = sources_of(feature_map, on_record=on_record, trusted=trusted)
     return confirm(feature_map, sources, options, corroborating, against)
@@ -185,12 +185,17 @@ def test_photos_from_outside_that_contradict_count_against_pairs() -> None:
     feature_map = _owned(["anna", "ben"])
     pairs = _confirm(feature_map).gate.figure
     assert pairs == 4.0
-    assert _confirm(feature_map, against=["a", "b"]).gate.passes
-    found = _confirm(feature_map, against=["a is 5.0 m off", "b", "c"])
+    proven = [(Source(owner=OPERATOR, proven=True), "a is 5.0 m off")]
+    assert _confirm(feature_map, against=proven * 2).gate.passes
+    found = _confirm(feature_map, against=proven * 3)
     assert _reason(found) == "CONTRADICTED"
     assert "a is 5.0 m off" in found.message
+    # One owner on record may lie with all photos, and counts once; three owners count.
+    lies = [(Source(owner=name, on_record=True), "b") for name in ("carl", "eve", "dan")]
+    assert _confirm(feature_map, against=lies[:1] * 9).gate.passes
+    assert _reason(_confirm(feature_map, against=lies)) == "CONTRADICTED"
     assert _confirm(_owned(["anna"]), trusted=("anna",)).gate.passes
-    assert _reason(_confirm(_owned(["anna"]), trusted=("anna",), against=["a"])) == "CONTRADICTED"
+    assert _reason(_confirm(_owned(["anna"]), trusted=("anna",), against=proven)) == "CONTRADICTED"
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,12 @@ from featuredb.export.dataset.own_frame import load_own, own_rows
 from featuredb.export.dataset.read import Row, load_map, open_dataset
 from featuredb.maps.feature_map import MAP_STATUSES, FeatureMap
 from featuredb.maps.unplaced_map import UNPLACED_STATUSES, AnyMap
-from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, anchored, is_imported
+from featuredb.store.changes import ACTIVE, IMPORTED, RETIRED, VOUCHED, anchored, vouch_for
+from featuredb.store.commits import apply_change, read_rows
 from featuredb.store.database import Database
+from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import MapSummary, UnplacedSummary
+from featuredb.store.tables import MAPS
 
 Told = Callable[[int, int], None]
 
@@ -92,13 +95,10 @@ def import_dataset(
         if dry_run or new:
             found = load_own(folder, row, listed) if map_id in own_ids else load_map(folder, row, listed)
             if not dry_run:
-                _commit(database, found, row["status_reason"], missing.get(map_id, ()), trusted)
+                _commit(database, found, _vouched_reason(row, missing), map_id in missing, trusted)
         told(done + 1, len(rows))
-    known = {row["map_id"]: row["status"] for row in rows if row["map_id"] not in missing}
-    waiting = [m for m in live.values() if is_imported(m.status, m.status_reason)]
-    vouched = [m.map_id for m in waiting if trusted and known.get(m.map_id) == ACTIVE]
-    if vouched and not dry_run:
-        database.set_status(vouched, "active", "imported, and vouched for later")
+    if trusted and not dry_run:
+        _vouch_for(database, rows, missing)
     return Imported(
         created=tuple(created),
         present=tuple(present),
@@ -108,12 +108,29 @@ def import_dataset(
     )
 
 
-def _commit(
-    database: Database, feature_map: AnyMap, reason: str, missing: Sequence[str], trusted: bool
-) -> None:
+def _vouch_for(database: Database, rows: Sequence[Row], missing: Mapping[str, Sequence[str]]) -> None:
+    """Lift the mark of the dataset's maps that an earlier import has left in quarantine."""
+    active = {row["map_id"] for row in rows if row["status"] == ACTIVE and row["map_id"] not in missing}
+    reasons = {row["map_id"]: _vouched_reason(row, missing) for row in rows if row["status"] != RETIRED}
+
+    def attempt() -> int:
+        maps = database.table(MAPS)
+        change, changed = vouch_for(read_rows(maps), active, reasons)
+        return apply_change(maps, change, operation="vouch", maps_changed=changed, reason=VOUCHED)
+
+    retry_stale("vouch for what was imported", attempt)
+
+
+def _vouched_reason(row: Row, missing: Mapping[str, Sequence[str]]) -> str:
+    """The dataset's, but where it says that nobody has vouched for the map."""
+    if row["map_id"] in missing:
+        return f"what placed it is not here: {', '.join(missing[row['map_id']])}"
+    return VOUCHED if row["status_reason"] == IMPORTED else row["status_reason"] or ""
+
+
+def _commit(database: Database, feature_map: AnyMap, reason: str, missing: bool, trusted: bool) -> None:
     if missing and isinstance(feature_map, FeatureMap):
         feature_map = feature_map.with_status("quarantined")
-        reason = f"what placed it is not here: {', '.join(missing)}"
     if not trusted and feature_map.status != RETIRED:
         if isinstance(feature_map, FeatureMap):
             feature_map = feature_map.with_status("quarantined")

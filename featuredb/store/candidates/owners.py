@@ -1,15 +1,19 @@
 """Whose photos the maps are made of, and whose word counts: by identity, from the events of the inbox."""
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from featuredb.maps.feature_map import FeatureMap, MapImage
 from featuredb.store.candidates.events import by_candidate, read_events
-from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, CONTRIBUTED, OPERATOR, USED, owner_of
+from featuredb.store.candidates.states import ANONYMOUS, CONFIRMED, OPERATOR, USED, contributors_of
 from featuredb.store.database import Database
+from featuredb.store.encode import Row
 from featuredb.store.snapshot import Snapshot
 
-_COLUMNS = ("candidate_id", "write_id", "event_index", "event", "happened_at", "request", "map_id")
+_COLUMNS = (
+    *("candidate_id", "write_id", "event_index", "event", "happened_at", "request", "map_id"),
+    *("owner", "licence", "client_id"),
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -17,7 +21,7 @@ class Owners:
     """Owners of the images of maps, and what they are known by.
 
     Attributes:
-        givers: who gave each contributed photo first, by candidate id.
+        givers: who gave each contributed photo first since it was last withdrawn, by candidate id.
         made_of: candidate ids of the photos that each map was made of, by map id.
         anchors: ids of the active maps that measured their own place.
         on_record: owners of whom something was confirmed by more than the word of strangers: a photo in an
@@ -54,13 +58,19 @@ def read_owners(database: Database, snapshot: Snapshot) -> Owners:
     made_of: dict[str, set[str]] = {}
     on_record: set[str] = set()
     for candidate_id, events in by_candidate(read_events(database, columns=_COLUMNS)).items():
-        owner = givers[candidate_id] = owner_of(next(e for e in events if e["event"] == CONTRIBUTED))
-        used = {event["map_id"] for event in events if event["event"] == USED}
-        confirmed = {event["map_id"] for event in events if event["event"] == CONFIRMED}
-        for map_id in used:
-            made_of.setdefault(map_id, set()).add(candidate_id)
-        if used & anchors or confirmed & active.keys():
-            on_record.add(owner)
+        givers[candidate_id] = _giver(events)
+        for k, event in enumerate(events):
+            kind, map_id = event["event"], event["map_id"]
+            if kind == USED:
+                made_of.setdefault(map_id, set()).add(candidate_id)
+            # The record is of whose photo it was then: who gives a withdrawn one again has not earned it.
+            if (kind == USED and map_id in anchors) or (kind == CONFIRMED and map_id in active):
+                on_record.add(_giver(events[:k]))
     return Owners(
         givers=givers, made_of=made_of, anchors=anchors, on_record=frozenset(on_record - {ANONYMOUS})
     )
+
+
+def _giver(events: Sequence[Row]) -> str:
+    contributors = contributors_of(events)
+    return contributors[0].owner if contributors else ANONYMOUS

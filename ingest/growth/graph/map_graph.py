@@ -18,6 +18,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.move import covariance_in_frame, in_frame
 from featuredb.store import Snapshot
+from featuredb.store.changes import is_imported
 from featuredb.store.encode import Row
 from featuredb.store.tables import BOUNDS
 from ingest.growth.graph.pose_graph import GraphSolution, solve_pose_graph
@@ -67,8 +68,8 @@ class PlacedMap:
 
 
 def placed_maps(snapshot: Snapshot) -> dict[str, PlacedMap]:
-    """All maps with a place of a snapshot that are not retired, by id."""
-    placed = {m.map_id for m in snapshot.maps()}
+    """Maps with a place, by id, but retired ones and imports that nobody vouches for: edges may be forged."""
+    placed = {m.map_id for m in snapshot.maps() if not is_imported(m.status, m.status_reason)}
     return {row["map_id"]: _placed(row) for row in snapshot.rows() if row["map_id"] in placed}
 
 

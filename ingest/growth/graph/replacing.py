@@ -103,7 +103,7 @@ def replace_descendants(database: Database, work: Path, *, budget_m: float) -> R
     pairs = [(m, e.map_id) for m, placed in maps.items() for e in placed.edges if holds(maps, e)]
     pairs += [(m, e.map_id) for m, own in edges.items() for e in own]
     members = sorted(family(maps, pairs, edges))
-    frame = next(maps[m].frame for m in members if maps[m].is_anchor)
+    frame = maps[next((m for m in members if maps[m].is_anchor), members[0])].frame
     new = [in_graph(m, e, maps[m].frame, frame) for m, own in edges.items() for e in own]
     known = graph_edges(maps, members, frame)
     solution = solve_pose_graph(graph_nodes(maps, members, frame), [*known, *new])

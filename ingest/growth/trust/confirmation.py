@@ -146,7 +146,7 @@ def confirm(
     sources: Sources,
     options: ConfirmationOptions,
     corroborating: Sequence[CorroboratingImage] = (),
-    against: Sequence[str] = (),
+    against: Sequence[tuple[Source, str]] = (),
 ) -> Confirmation:
     """How far a map is confirmed by those whose word counts.
 
@@ -154,7 +154,7 @@ def confirm(
     is independent of it, the map's own or one from outside.
 
     Args:
-        against: sentences on photos from outside that the map has elsewhere than they are.
+        against: photos from outside that the map has elsewhere than they are: where from, and a sentence.
     """
     everyone = [*sources.of_map(feature_map), *(w.source for w in corroborating)]
     own = len(feature_map.images)
@@ -204,13 +204,18 @@ def _pairs(agree: NDArray[np.bool_]) -> float:
     return int(np.count_nonzero(partner >= 0)) / 2.0
 
 
-def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[str]) -> Gate:
-    """Whether more pairs confirm the map than one and those that photos contradict it with."""
-    needed = len(against) + (0.0 if proven else _ONE_PAIR)
+def _gate(confirmed: int, pairs: float, proven: bool, against: Sequence[tuple[Source, str]]) -> Gate:
+    """Whether more pairs confirm the map than one and as many as contradict it.
+
+    Each proven photo contradicts it, and each other owner once, whose photos may all lie.
+    """
+    contradicting = sum(s.proven for s, _ in against) + len({s.owner for s, _ in against if not s.proven})
+    needed = contradicting + (0.0 if proven else _ONE_PAIR)
     if against and (proven or pairs > _ONE_PAIR):
         reason = "CONTRADICTED"
         message = (
-            f"{len(against)} photos from outside contradict it, {pairs:g} pairs confirm it: {against[0]}"
+            f"{len(against)} photos from outside contradict it and count as {contradicting}, {pairs:g} pairs "
+            f"confirm it: {against[0][1]}"
         )
     elif pairs:
         reason = "FEW_PAIRS"

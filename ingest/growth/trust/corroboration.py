@@ -57,10 +57,10 @@ class NewPhotos:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Corroboration:
-    """Photos from outside that see the map's points, and sentences on those that contradict it."""
+    """Photos from outside that see the map's points; sources of those that contradict it, with sentences."""
 
     corroborating: tuple[CorroboratingImage, ...]
-    contradictions: tuple[str, ...]
+    contradictions: tuple[tuple[Source, str], ...]
 
 
 def corroborate(
@@ -84,7 +84,7 @@ def corroborate(
     own = set(sources.of_map(feature_map))
     names = {image.sha256 for image in feature_map.images}
     corroborating: list[CorroboratingImage] = []
-    against: list[str] = []
+    against: list[tuple[Source, str]] = []
     for other, image, source in _images_around(feature_map, others, own, sources):
         found = localise_image(other, image, 0, [indexed])
         if found is None or image.sha256 in names:
@@ -110,7 +110,7 @@ def _hear_new(
     sources: Sources,
     threads: int,
     corroborating: list[CorroboratingImage],
-    against: list[str],
+    against: list[tuple[Source, str]],
 ) -> None:
     source_of = {
         row: sources.of_owner(new.photos[row].contributor or OPERATOR)
@@ -144,11 +144,11 @@ def _sort_in(
     apart_m: float,
     variance: float,
     corroborating: list[CorroboratingImage],
-    against: list[str],
+    against: list[tuple[Source, str]],
 ) -> None:
     """A photo that the map has where it is known to be speaks for it, another one against it."""
     if apart_m > max(_LEAST_M, SIGMAS * float(np.sqrt(variance))):
-        against.append(f"{name} is {apart_m:.2f} m from where the map has it")
+        against.append((source, f"{name} is {apart_m:.2f} m from where the map has it"))
         return
     corroborating.append(
         CorroboratingImage(

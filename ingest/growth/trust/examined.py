@@ -13,7 +13,7 @@ from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.workspace import read_json, write_json
 
 # Raised when the same question gets another answer: with any limit of growth (its gates, `place/`, `trust/`).
-_VERSION = "2"
+_VERSION = "3"
 
 
 def question(

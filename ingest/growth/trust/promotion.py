@@ -1,7 +1,7 @@
 """Quarantined maps are promoted once independent sources confirm them and no canary regresses."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -108,8 +108,16 @@ def promote_confirmed(
         else:
             outcomes.append(_stays(summary.map_id, one.gate.reason, one.gate.message, (one.gate,)))
             remember(work, summary.map_id, asked, one.gate.reason, one.gate.message, (one.gate,))
+
+    def by_itself(was: ExaminedMap) -> ExaminedMap | Confirmation:
+        summary = snapshot.get(was.feature_map.map_id)
+        as_is = replace(sources, owners=read_owners(database, database.snapshot()))
+        (one,) = _examined([summary], snapshot, as_is, confirmation, new, threads)
+        there = replace(summary, write_id=was.write_id, descriptors=_descriptors(was.feature_map))
+        return _committed(database, there, one) if isinstance(one, ExaminedMap) else one
+
     if ready:
-        decided = _promote(database, localiser, ready)
+        decided = _promote(database, localiser, ready, by_itself)
         now = database.snapshot()
         sources = replace(sources, owners=read_owners(database, now))
         after = _question(database, now, sources, new, confirmation)
@@ -242,26 +250,46 @@ def _others(map_id: str, snapshot: Snapshot) -> list[FeatureMap]:
 
 def _committed(database: Database, summary: MapSummary, found: ExaminedMap) -> ExaminedMap:
     """The map with the descriptors that it will answer with, still in quarantine; the same place."""
-    if int(found.feature_map.observations.has_descriptor.sum()) == summary.descriptors:
-        return found
+    if _descriptors(found.feature_map) == summary.descriptors:
+        return replace(found, write_id=summary.write_id)
     result = database.commit_map(
         found.feature_map, replaces=summary.map_id, based_on=summary.write_id, moves=False
     )
     return replace(found, write_id=result.write_id)
 
 
-def _promote(database: Database, before: Localiser, ready: Sequence[ExaminedMap]) -> list[Promotion]:
-    """Ask the canaries: of all of them together, and one by one where that shows a regression."""
+def _descriptors(feature_map: FeatureMap) -> int:
+    return int(feature_map.observations.has_descriptor.sum())
+
+
+def _promote(
+    database: Database,
+    before: Localiser,
+    ready: Sequence[ExaminedMap],
+    by_itself: Callable[[ExaminedMap], ExaminedMap | Confirmation],
+) -> list[Promotion]:
+    """Ask the canaries: of all of them together, and one by one where that shows a regression.
+
+    Then a map is examined anew, by the records that promoted maps have made: one that is refused makes none.
+    """
     together = _tried(database, before, [found.feature_map for found in ready])
     if not together.regressions or len(ready) == 1:
         return _decide(database, before, ready, together)
-    outcomes: list[Promotion] = []
-    for found in ready:
+    outcomes: dict[str, Promotion] = {}
+    waiting, asked = list(ready), 0
+    while asked < len(waiting):  # a promoted map has made records for those that were asked before it
+        map_id = waiting[asked].feature_map.map_id
+        found = by_itself(waiting[asked])
+        if not isinstance(found, ExaminedMap):
+            outcomes[map_id] = _stays(map_id, found.gate.reason, found.gate.message, (found.gate,))
+            asked += 1
+            continue
         run = _tried(database, before, [found.feature_map])
-        outcomes += _decide(database, before, [found], run)
-        if outcomes[-1].promoted:
-            before = Localiser.open(database, previous=before)
-    return outcomes
+        (outcomes[map_id],) = _decide(database, before, [found], run)
+        del waiting[asked]
+        if outcomes[map_id].promoted:
+            before, asked = Localiser.open(database, previous=before), 0
+    return list(outcomes.values())
 
 
 def _tried(database: Database, before: Localiser, maps: Sequence[FeatureMap]) -> CanaryRun:
