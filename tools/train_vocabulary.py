@@ -1,4 +1,4 @@
-"""Train a vocabulary of visual words, once, for retrieval of similar photos.
+"""Train, once, visual words for retrieval of similar photos, or the centres of inverted lists.
 
     featuredb simworld world --size full
     uv run python tools/train_vocabulary.py world/drone world/street world/negatives/other_town --every 4 \\
@@ -6,6 +6,11 @@
 
 made the one that comes with featuredb: of photos that everybody can make again, by fixed seeds and on one
 thread. Others are used with `featuredb ingest photos --vocabulary FILE`.
+
+    uv run python tools/train_vocabulary.py brighton/images lewis/images seneca/images copr/images \\
+        reichstag/images sacre_coeur/mapping --lists 2048 --out featuredb/index/data/list_centers.npz
+
+made the centres of the inverted lists (`featuredb.index.descriptor_index`), of real photos of many kinds.
 """
 
 import argparse
@@ -37,6 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="of each folder's photos, each Nth")
     parser.add_argument("--words", type=int, default=128)
     parser.add_argument("--dimensions", type=int, default=32)
+    parser.add_argument("--lists", type=int, default=None, metavar="K", help="centres of K inverted lists")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args(argv)
@@ -52,8 +58,12 @@ def main(argv: Sequence[str] | None = None) -> int:
                 extract_photos(photos, workspace, options, pool)
         key = features_key(options)
         descriptors = [read_array(workspace.features(key, p.sha256), "descriptors") for p in photos]
-    vocabulary = train_vocabulary(descriptors, words=args.words, dimensions=args.dimensions)
     args.out.parent.mkdir(parents=True, exist_ok=True)
+    if args.lists is not None:
+        np.savez_compressed(args.out, centers=train_lists(descriptors, args.lists))
+        sys.stdout.write(f"{args.out}: {args.lists} lists from {len(photos)} photos\n")
+        return 0
+    vocabulary = train_vocabulary(descriptors, words=args.words, dimensions=args.dimensions)
     args.out.write_bytes(vocabulary.to_bytes())
     sys.stdout.write(
         f"{args.out}: {args.words} words of {args.dimensions} dimensions from {len(photos)} photos, "
@@ -79,17 +89,7 @@ def train_vocabulary(
     Raises:
         InvalidValueError: fewer descriptors than 40 a word, which k-means wants at least.
     """
-    generator = np.random.default_rng(seed)
-    parts = []
-    for photo in descriptors:
-        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
-        parts.append(photo[np.sort(rows)].astype(np.float32))
-    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
-    if len(samples) < 40 * words:
-        raise InvalidValueError(
-            f"train_vocabulary: expected at least {40 * words} descriptors for {words} words, found "
-            f"{len(samples)}; give more photos"
-        )
+    samples = _samples(descriptors, per_photo, words, seed)
     mean = samples.mean(axis=0, dtype=np.float64)
     _, vectors = np.linalg.eigh(np.cov((samples - mean).T))
     projection = vectors[:, ::-1][:, :dimensions]
@@ -100,6 +100,31 @@ def train_vocabulary(
         projection=projection.astype(np.float32),
         words=_kmeans(projected, words, seed, iterations=25).astype(np.float32),
     )
+
+
+def train_lists(
+    descriptors: Sequence[NDArray[np.uint8]], lists: int, per_photo: int = 1500, seed: int = 0
+) -> NDArray[np.uint8]:
+    """Centres (lists, 128) of inverted lists, rounded as descriptors are; arguments as there."""
+    centers = _kmeans(_samples(descriptors, per_photo, lists, seed), lists, seed, iterations=10)
+    return np.asarray(np.clip(np.rint(centers), 0, 255), dtype=np.uint8)
+
+
+def _samples(
+    descriptors: Sequence[NDArray[np.uint8]], per_photo: int, clusters: int, seed: int
+) -> NDArray[np.float32]:
+    generator = np.random.default_rng(seed)
+    parts = []
+    for photo in descriptors:
+        rows = generator.choice(len(photo), min(per_photo, len(photo)), replace=False)
+        parts.append(photo[np.sort(rows)].astype(np.float32))
+    samples = np.concatenate(parts) if parts else np.zeros((0, DESCRIPTOR_SIZE), np.float32)
+    if len(samples) < 40 * clusters:
+        raise InvalidValueError(
+            f"train_vocabulary: expected at least {40 * clusters} descriptors for {clusters} words or lists, "
+            f"found {len(samples)}; give more photos"
+        )
+    return samples
 
 
 def _kmeans(samples: NDArray[np.float32], clusters: int, seed: int, iterations: int) -> NDArray[np.float64]:
