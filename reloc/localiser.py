@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from featuredb.errors import (
     FeatureDbError,
@@ -335,10 +336,16 @@ def _group(maps: Sequence[MapSummary]) -> list[list[MapSummary]]:
         centers.append(frame.enu_from_utm(middle, summary.epsg))
         radii.append(0.5 * float(np.linalg.norm(corners[1] - corners[0])))
     place, radius = np.array(centers), np.array(radii)
-    gap = np.linalg.norm(place[:, None] - place[None], axis=2) - radius[:, None] - radius[None]
+    # Of two maps that are near each other, the larger one finds the other within twice its own radius.
+    found = cKDTree(place).query_ball_point(place, 2.0 * radius + _AREA_GAP_M)
+    rows = np.repeat(np.arange(len(maps)), [len(others) for others in found])
+    columns = np.concatenate(found).astype(np.int64)
+    gap = np.linalg.norm(place[rows] - place[columns], axis=1) - radius[rows] - radius[columns]
     kind = np.array([f"{m.extractor_fingerprint} {m.height_datum}" for m in maps])
-    near = (gap < _AREA_GAP_M) & (kind[:, None] == kind[None])
-    rows, columns = np.nonzero(near)
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=near.shape)
+    near = (gap < _AREA_GAP_M) & (kind[rows] == kind[columns])
+    graph = coo_array((np.ones(near.sum()), (rows[near], columns[near])), shape=(len(maps), len(maps)))
     count, label = connected_components(graph, directed=False)
-    return [[m for m, of in zip(maps, label, strict=True) if of == i] for i in range(count)]
+    groups: list[list[MapSummary]] = [[] for _ in range(count)]
+    for summary, of in zip(maps, label, strict=True):
+        groups[of].append(summary)
+    return groups

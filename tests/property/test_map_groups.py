@@ -18,7 +18,14 @@ REACH_M = 300.0 + 2 * np.sqrt(2) * HALF_M
 
 
 def summary(
-    name: str, easting: float, northing: float, *, epsg: int = 32632, kind: str = "x", datum: str = "unknown"
+    name: str,
+    easting: float,
+    northing: float,
+    *,
+    half_m: float = HALF_M,
+    epsg: int = 32632,
+    kind: str = "x",
+    datum: str = "unknown",
 ) -> MapSummary:
     return MapSummary(
         map_id=name,
@@ -31,10 +38,10 @@ def summary(
         epsg=epsg,
         height_datum=datum,
         box=UtmBox(
-            min_easting=easting - HALF_M,
-            max_easting=easting + HALF_M,
-            min_northing=northing - HALF_M,
-            max_northing=northing + HALF_M,
+            min_easting=easting - half_m,
+            max_easting=easting + half_m,
+            min_northing=northing - half_m,
+            max_northing=northing + half_m,
             min_height=100.0,
             max_height=100.0,
         ),
@@ -65,9 +72,13 @@ def closure(maps: list[MapSummary]) -> set[frozenset[str]]:
     def near(a: MapSummary, b: MapSummary) -> bool:
         assert a.box is not None
         assert b.box is not None
-        gap = np.hypot(a.box.min_easting - b.box.min_easting, a.box.min_northing - b.box.min_northing)
+        middle = [
+            (m.box.min_easting + m.box.max_easting, m.box.min_northing + m.box.max_northing) for m in (a, b)
+        ]
+        apart = 0.5 * np.hypot(middle[0][0] - middle[1][0], middle[0][1] - middle[1][1])
+        halves = sum(0.5 * (m.box.max_easting - m.box.min_easting) for m in (a, b))
         same = (a.extractor_fingerprint, a.height_datum) == (b.extractor_fingerprint, b.height_datum)
-        return bool(same and gap < REACH_M)
+        return bool(same and apart < 300.0 + np.sqrt(2) * halves)
 
     changed = True
     while changed:
@@ -91,14 +102,17 @@ def closure(maps: list[MapSummary]) -> set[frozenset[str]]:
             st.integers(0, 10),
             st.sampled_from("xy"),
             st.sampled_from(["unknown", "EGM96"]),
+            st.sampled_from([5.0, HALF_M, 800.0]),
         ),
         max_size=14,
     )
 )
-def test_groups_are_the_closure_of_nearness(places: list[tuple[int, int, str, str]]) -> None:
+def test_groups_are_the_closure_of_nearness(places: list[tuple[int, int, str, str, float]]) -> None:
     maps = [
-        summary(f"m{i}", 500_000.0 + 100.0 * e, 5_400_000.0 + 100.0 * n, kind=kind, datum=datum)
-        for i, (e, n, kind, datum) in enumerate(places)
+        summary(
+            f"m{i}", 500_000.0 + 100.0 * e, 5_400_000.0 + 100.0 * n, kind=kind, datum=datum, half_m=half_m
+        )
+        for i, (e, n, kind, datum, half_m) in enumerate(places)
     ]
     groups = _group(maps)
     assert sorted(m.map_id for g in groups for m in g) == sorted(m.map_id for m in maps)
