@@ -294,7 +294,8 @@ def _area_of_one(snapshot: Snapshot, map_id: str) -> IndexedArea:
 def _own_area(snapshot: Snapshot, map_id: str) -> _OwnArea:
     """A map without a place, and its area at the stand-in."""
     unplaced = snapshot.load_unplaced(map_id)
-    return unplaced, _indexed([at_stand_in(unplaced)])
+    indexed = _indexed([at_stand_in(unplaced)])
+    return replace(unplaced, observations=unplaced.observations.none()), indexed
 
 
 def _load(

@@ -32,7 +32,8 @@ class Area:
 
     Attributes:
         frame: local ENU frame of everything here.
-        maps: the maps, without being copied; `point_map` and `image_map` index into it.
+        maps: the maps without their observations, which take most of the memory and which no answer needs;
+            `point_map` and `image_map` index into it.
         points: (p, 3) float64, metres in `frame`.
         point_map: (p,) int32.
         point_row: (p,) int64, row in the map's MapPoints.
@@ -148,7 +149,7 @@ def build_area(maps: Sequence[FeatureMap], frame: LocalFrame | None = None) -> A
     image_reach = np.concatenate([p.image_reach for p in parts])
     return Area(
         frame=frame,
-        maps=tuple(maps),
+        maps=tuple(replace(m, observations=m.observations.none()) for m in maps),
         points=np.concatenate([p.points for p in parts]),
         point_map=_repeat([len(p.points) for p in parts]),
         point_row=np.concatenate([p.point_row for p in parts]),

@@ -7,7 +7,7 @@ local frame, points in UTM, as they are stored; `featuredb.geo.LocalFrame` goes 
 """
 
 from collections.abc import Sized
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
 from typing import Any, Protocol
 
@@ -184,6 +184,12 @@ class MapObservations:
 
     def __len__(self) -> int:
         return len(self.point_index)
+
+    def none(self) -> "MapObservations":
+        """No observations."""
+        return MapObservations(
+            **{f.name: getattr(self, f.name)[:0].copy() for f in fields(self)}  # no view of the others
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

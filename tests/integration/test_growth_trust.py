@@ -215,8 +215,8 @@ def test_an_image_need_not_show_what_a_new_map_adds_around_its_points(tmp_path: 
 def test_canaries_are_the_same_in_every_run(tmp_path: Path) -> None:
     database = _database(tmp_path, _ANCHOR, strip_map("B", 150.0, owners=["survey"], seed=3))
     localiser = Localiser.open(database)
-    chosen = own_canaries(localiser, [strip_map("m", 25.0, seed=1)])
-    again = own_canaries(Localiser.open(database), [strip_map("m", 25.0, seed=1)])
+    chosen = own_canaries(database, localiser, [strip_map("m", 25.0, seed=1)])
+    again = own_canaries(database, Localiser.open(database), [strip_map("m", 25.0, seed=1)])
     assert [(m.map_id, i.name) for m, i in chosen] == [(m.map_id, i.name) for m, i in again]
     assert [m.map_id for m, _ in chosen] == ["A"] * 8 + ["B"] * 4
     features = features_and_points(*chosen[0])[0]

@@ -93,6 +93,7 @@ def test_two_maps_of_two_frames_and_zones_lie_in_one_frame() -> None:
         **options,
     )
     area = build_area([one, two], frame=here)
+    assert [len(m.observations) for m in area.maps] == [0, 0]
     first, second = (area.point_map == i for i in (0, 1))
     assert first.sum() == second.sum() > 30
     np.testing.assert_allclose(area.points[first], area.points[second], atol=2e-4)

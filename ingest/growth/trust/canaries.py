@@ -128,7 +128,7 @@ def run_canaries(
     """
     known = list_canaries(database)
     checks = [check_known(database, canary, before, after) for canary in known]
-    own, new_ids = own_canaries(before, new_maps), tuple(m.map_id for m in new_maps)
+    own, new_ids = own_canaries(database, before, new_maps), tuple(m.map_id for m in new_maps)
     checks += [_check_own(feature_map, image, before, after, new_ids) for feature_map, image in own]
     note = f"{len(known)} known queries, {len(own)} images of the active maps"
     if not known:
@@ -183,26 +183,29 @@ def _verdict(miss: _Miss | None, metres: float, degrees: float) -> Verdict:
     return "right" if miss.metres <= metres and miss.degrees <= degrees else "moved"
 
 
-def own_canaries(before: Localiser, new_maps: Sequence[FeatureMap]) -> list[tuple[FeatureMap, MapImage]]:
+def own_canaries(
+    database: Database, before: Localiser, new_maps: Sequence[FeatureMap]
+) -> list[tuple[FeatureMap, MapImage]]:
     """Images of the active maps that can be asked: those around the new maps, some from elsewhere.
 
     The choice hangs on the images' names only, so that another run asks the same.
     """
-    near: list[tuple[str, FeatureMap, MapImage]] = []
-    far: list[tuple[str, FeatureMap, MapImage]] = []
+    near: list[tuple[str, str, MapImage]] = []
+    far: list[tuple[str, str, MapImage]] = []
     boxes = [_box(m) for m in new_maps if len(m.points)]
     for indexed in before.areas:
-        for feature_map in indexed.area.maps:
-            count = _described(feature_map)
-            for image in feature_map.images:
-                if count.get(image.image_id, 0) < LEAST_FEATURES:
-                    continue
-                key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
-                around = any(_near(feature_map, image, frame, box) for frame, box in boxes)
-                (near if around else far).append((key, feature_map, image))
+        images = [(m, image) for m in indexed.area.maps for image in m.images]
+        for (feature_map, image), described in zip(images, np.diff(indexed.area.image_start), strict=True):
+            if described < LEAST_FEATURES:
+                continue
+            key = hashlib.sha256(f"{feature_map.map_id} {image.name}".encode()).hexdigest()
+            around = any(_near(feature_map, image, frame, box) for frame, box in boxes)
+            (near if around else far).append((key, feature_map.map_id, image))
     chosen = sorted(near, key=lambda e: e[0])[:_OWN_NEAR]
     chosen += sorted(far, key=lambda e: e[0])[:_OWN_ELSEWHERE]
-    return [(feature_map, image) for _, feature_map, image in chosen]
+    snapshot = database.snapshot(before.snapshot)
+    whole = {map_id: snapshot.load_map(map_id) for map_id in sorted({map_id for _, map_id, _ in chosen})}
+    return [(whole[map_id], image) for _, map_id, image in chosen]
 
 
 def _check_own(
@@ -277,13 +280,6 @@ def _miss(pose: LocalisedPose, center: FloatArray, cam_from_local: FloatArray) -
         degrees=float(np.degrees(rotation_angle(turn))),
         sigma_m=float(np.sqrt(np.linalg.eigvalsh(pose.covariance[3:, 3:])[-1])),
     )
-
-
-def _described(feature_map: FeatureMap) -> dict[int, int]:
-    """Observations with descriptors of each image."""
-    seen = feature_map.observations
-    ids, counts = np.unique(seen.image_id[seen.has_descriptor], return_counts=True)
-    return {int(i): int(n) for i, n in zip(ids, counts, strict=True)}
 
 
 def _box(feature_map: FeatureMap) -> tuple[LocalFrame, FloatArray]:
