@@ -43,7 +43,7 @@ def answer_of(
         prior_focal_px=900.0,
     )
     uncertainty = PoseUncertainty(
-        covariance=np.zeros((6, 6)) if measured is None else measured,
+        joint=np.zeros((6, 6)) if measured is None else measured,
         residual_rms_px=0.5,
     )
     return make_answer(area, hypothesis, uncertainty, np.zeros((len(rows), 2)), rows, want_inliers=True)
