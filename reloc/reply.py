@@ -118,6 +118,9 @@ def _pose_fields(pose: LocalisedPose) -> dict[str, Any]:
             orientation_68_deg=pose.orientation_68_deg,
         ),
         "camera": _camera_used(pose.camera, pose.camera_source),
+        "view_covariance": None
+        if pose.view_covariance is None
+        else tuple(_floats(row) for row in pose.view_covariance),
         "residual_rms_px": pose.residual_rms_px,
         "maps": pose.map_ids,
         "lineage": tuple(

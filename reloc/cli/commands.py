@@ -10,6 +10,8 @@ from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
+    from featuredb.store import Database
+    from reloc.localiser import Localiser
     from reloc.wire.query import CameraRequest, LocaliseReply
 
     # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
@@ -101,7 +103,8 @@ def register(subparsers: Any) -> None:
     localise.set_defaults(run=_localise)
 
 
-def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
+def add_request_arguments(parser: argparse.ArgumentParser) -> None:
+    """What is known of a photo besides its pixels, and where to look."""
     parser.add_argument(
         "--prior",
         metavar="LAT,LON,SIGMA_M",
@@ -120,6 +123,11 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
         help="one standard deviation of each of --camera's parameters, OPENCV's or SIMPLE_RADIAL's; without "
         "it they are exact",
     )
+    parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
+
+
+def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
+    add_request_arguments(parser)
     parser.add_argument(
         "--shared-lens",
         action="store_true",
@@ -127,7 +135,6 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
         "or more, and each is then answered with it; a photo alone hardly tells its focal length from its "
         "height. Not for zoom lenses without EXIF, nor for cropped pictures",
     )
-    parser.add_argument("--map", action="append", metavar="ID", help="search only this map; may be repeated")
     parser.add_argument("--json", action="store_true", help="print one JSON reply per line")
     parser.add_argument(
         "--overlay",
@@ -206,26 +213,39 @@ def _query(args: argparse.Namespace) -> int:
 
 
 def _localise(args: argparse.Namespace) -> int:
+    from featuredb.cli.common import open_database
+    from reloc.overlay import map_points_in_view
+
+    localiser, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
+    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+
+
+def asking_here(
+    args: argparse.Namespace, database: "Callable[[], Database]", inliers: bool = False
+) -> "tuple[Localiser, Ask]":
+    """What answers in this process, to what `add_request_arguments` was told; that is checked first.
+
+    Raises:
+        InvalidValueError: the prior or the camera is none.
+    """
     import uuid
 
-    from featuredb.cli.common import open_database
     from featuredb.features.decode import DecodeLimits
     from featuredb.stage_clock import StageClock
     from reloc.cli.query_arguments import parse_camera, parse_prior
     from reloc.localiser import Localiser
-    from reloc.overlay import map_points_in_view
     from reloc.service.handler import answer_query
     from reloc.wire.query import LocaliseWireRequest, RequestOptions
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
-    localiser = Localiser.open(open_database(args))
+    localiser = Localiser.open(database())
 
     def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
         request = LocaliseWireRequest(
             prior=prior,
             camera=lens or camera,
             options=RequestOptions(
-                inliers=first or args.overlay is not None,
+                inliers=first or inliers,
                 exif_prior=args.exif_prior,
                 maps=tuple(args.map) if args.map else None,
             ),
@@ -239,7 +259,7 @@ def _localise(args: argparse.Namespace) -> int:
             clock=StageClock(),
         )
 
-    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+    return localiser, ask
 
 
 def _answer_all(

@@ -13,6 +13,7 @@ from featuredb.geometry.rotation import quaternion_from_matrix, skew
 from featuredb.geometry.sim3 import point_jacobian
 from featuredb.index.area import Area
 from featuredb.maps.feature_map import FeatureMap
+from reloc.localise.lens_prior import lens_of, opencv_by_lens
 from reloc.localise.map_shape import shape_covariance
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import Inliers, LocalisedPose
@@ -26,12 +27,15 @@ def make_answer(
     point_rows: NDArray[np.int64],
     want_inliers: bool,
     told: Camera | None = None,
+    lent: PoseUncertainty | None = None,
 ) -> LocalisedPose:
     """The pose in UTM and as a GeoPose, with covariance and radii.
 
     Args:
         pixels: (k, 2) of the inliers. point_rows: (k,) rows of the area's points.
         told: the camera that the request gives as exact, whatever the map's errors made of it.
+        lent: of a lens that the map has lent: how uncertain pose and lens are together, within what is known
+            of it.
     """
     counts = np.bincount(area.point_map[point_rows], minlength=len(area.maps))
     order = [int(i) for i in np.argsort(-counts, kind="stable") if counts[i] > 0]
@@ -39,12 +43,21 @@ def make_answer(
     center = pose.cam_from_local.center
     modes = area.modes[order[0]]
     shape = None if modes is None else shape_covariance(area, order[0], pose, point_rows, modes)
-    covariance = on_earth(area, main, center, uncertainty.covariance, point_rows, shape)
+    joint = on_earth(area, main, center, uncertainty.joint, point_rows, shape)
+    covariance = joint[:6, :6]
+    # Where the map's joint errors are not known, those of its images are not added: they move the points of
+    # the map, too, and a pixel goes on showing what it shows.
+    seen = (
+        joint
+        if shape is not None
+        else on_earth(area, main, center, (lent or uncertainty).joint, point_rows, np.zeros((6, 6)))
+    )
     grid_from_local = area.frame.grid_from_enu(center, main.epsg)
     return LocalisedPose(
         frame=area.frame,
         cam_from_local=pose.cam_from_local,
         covariance=covariance,
+        view_covariance=None if told else _of_params(pose.camera, seen),
         camera=told or pose.camera,
         camera_source=pose.camera_source,
         epsg=main.epsg,
@@ -60,6 +73,16 @@ def make_answer(
         residual_rms_px=uncertainty.residual_rms_px,
         inliers=_inliers(area, order, pixels, point_rows) if want_inliers else None,
     )
+
+
+def _of_params(camera: Camera, joint: FloatArray) -> FloatArray | None:
+    """Covariance (6 + n, 6 + n) of the pose and the camera's parameters; None where n = 0."""
+    if len(joint) == 6:
+        return None
+    by_lens = np.eye(len(joint))
+    if camera.model == "OPENCV":
+        by_lens[6:, 6:] = opencv_by_lens(lens_of(camera))
+    return np.asarray(by_lens @ joint @ by_lens.T, dtype=np.float64)
 
 
 def radius_68(covariance: FloatArray) -> float:
@@ -123,16 +146,27 @@ def on_earth(
     rows: NDArray[np.int64],
     shape: FloatArray | None = None,
 ) -> FloatArray:
-    """Measured covariance (6, 6) plus those of the map and its placement, true east-north-up at the camera.
+    """Measured covariance plus those of the map and its placement, true east-north-up at the camera.
 
     Args:
-        center: (3,) camera centre in the area's frame. measured: in the area's axes.
+        center: (3,) camera centre in the area's frame.
+        measured: (6 + n, 6 + n) of a pose and n parameters of its lens, in the area's axes.
         rows: of the area's points that gave the pose.
+        shape: that of the map, (6, 6) or with the lens; None: by the map's image that shares most points.
+
+    Returns:
+        Of the same parameters, those of a lens that only `shape` knows included.
     """
-    mapped = placement_covariance(area, main, center)
-    mapped += map_covariance(area, center, rows) if shape is None else shape
-    to_true = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
-    covariance = to_true @ (measured + mapped) @ to_true.T
+    parts = [
+        measured,
+        placement_covariance(area, main, center),
+        map_covariance(area, center, rows) if shape is None else shape,
+    ]
+    size = max(len(part) for part in parts)
+    total = sum(np.pad(part, (0, size - len(part))) for part in parts)
+    to_true = np.eye(size)
+    to_true[:6, :6] = np.kron(np.eye(2), area.frame.true_enu_from_enu(center))
+    covariance = to_true @ total @ to_true.T
     return np.asarray(0.5 * (covariance + covariance.T), dtype=np.float64)
 
 

@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from featuredb.errors import IncompatibleExtractorError
 from featuredb.features.extractor import extract
 from featuredb.features.features import Features
+from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.stage_clock import StageClock
 from reloc.localise.acceptance import confidence, prior_tells, verdict
 from reloc.localise.answer import make_answer
 from reloc.localise.candidates import IndexedArea
+from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty
 from reloc.localise.prior import contradicts_prior
@@ -146,12 +148,18 @@ def _decide(
         return refuse(refusal[0], refusal[1], best.evidence.inliers, rival)
     pixels, points = pairs(features, best.area, best.matches)
     rows = best.matches.point[best.rows]
-    uncertainty = pose_uncertainty(
-        pixels[best.rows], points[best.rows], best.area.point_covariance[rows], best.pose, options.pose
-    )
+    inliers = (pixels[best.rows], points[best.rows], best.area.point_covariance[rows])
+    uncertainty = pose_uncertainty(*inliers, best.pose, options.pose)
     told = request.camera if request.camera_is_exact else None
+    lent = None
+    if told is None and best.pose.lens_prior is None:
+        lent_by = LensUncertainty.of_provenance(best.main_map.provenance)
+        seen = None if lent_by is None else seen_by_a_map(best.pose.camera, lent_by)
+        if seen is not None:
+            pose = replace(best.pose, camera=seen[0], lens_prior=seen[1])
+            lent = pose_uncertainty(*inliers, pose, options.pose)
     answer = make_answer(
-        best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers, told
+        best.area, best.pose, uncertainty, pixels[best.rows], rows, request.want_inliers, told, lent
     )
     against = contradicts_prior(answer, request.prior)
     if against is not None:

@@ -21,9 +21,9 @@ _DAMPING = 1e-9
 def shape_covariance(
     area: Area, main: int, pose: PoseHypothesis, rows: NDArray[np.int64], modes: ErrorModes
 ) -> FloatArray | None:
-    """(6, 6) in the area's axes; None where the modes do not cover the images.
+    """(6 + n, 6 + n) of pose and lens, as in PoseUncertainty; None where the modes do not cover the images.
 
-    A lens of the map, which it lent, is as wrong as there and moves along.
+    A lens of the map, which it lent, is as wrong as there and moves along: then n = 8.
 
     Args:
         main: row of the map. rows: (k,) of the area's points that gave the pose.
@@ -38,10 +38,12 @@ def shape_covariance(
     by_point, by_own = jacobians(pose.camera, pose.cam_from_local, area.points[points])
     pixels = np.einsum("kij,kjr->kir", by_point, shift)
     lender = _lender(area.maps[main], pose.camera)
+    lent = np.zeros((0, shift.shape[2]))
     if lender is not None:
         _, by_lens = joint_jacobians(pose.camera, pose.cam_from_local, area.points[points])
         zoom = pose.camera.width / area.maps[main].cameras[lender].width
-        pixels += by_lens[:, :, 6:] @ _as_lens_of(pose.camera, modes.lenses[lender], zoom)
+        lent = _as_lens_of(pose.camera, modes.lenses[lender], zoom)
+        pixels += by_lens[:, :, 6:] @ lent
     normal = np.einsum("kij,kil->jl", by_own, by_own)
     if own is not None:
         normal[6:, 6:] += np.diag(own.information)
@@ -50,7 +52,9 @@ def shape_covariance(
         normal * scale[:, None] * scale + _DAMPING * np.eye(len(scale)),
         scale[:, None] * np.einsum("kij,kir->jr", by_own, pixels),
     )
-    error = (scale[:, None] * solved)[:6]
+    error = scale[:, None] * solved
+    if own is None:  # what points and lens are off by, the pose takes up: it errs the other way
+        error = np.concatenate([error, -lent])
     return np.asarray(error @ error.T)
 
 

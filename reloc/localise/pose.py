@@ -203,13 +203,19 @@ class PoseUncertainty:
     """Covariance of a pose, measurement part.
 
     Attributes:
-        covariance: (6, 6), area frame's axes: rotation of the camera (rad) before displacement of its
-            centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C).
+        joint: (6 + n, 6 + n), area frame's axes: rotation of the camera (rad) before displacement of its
+            centre (m); R_true = R(dtheta) R, C_true = C + dC for world_from_cam = (R, C). Then the
+            parameters of the lens in the order of `lens_of`, where it was estimated, too; else n = 0.
         residual_rms_px: of the inliers.
     """
 
-    covariance: FloatArray
+    joint: FloatArray
     residual_rms_px: float
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6), of the pose."""
+        return self.joint[:6, :6]
 
 
 def pose_uncertainty(
@@ -241,10 +247,10 @@ def pose_uncertainty(
         information[6:, 6:] += np.diag(lens.information)
     covariance = covariance_from_information(information)
     if lens is not None and lens.dilution > 1.0:
-        by_lens = covariance[:6, 6:] @ np.linalg.solve(covariance[6:, 6:], covariance[6:, :6])
-        covariance[:6, :6] += (lens.dilution - 1.0) * by_lens
+        by_lens = covariance[:, 6:] @ np.linalg.solve(covariance[6:, 6:], covariance[6:])
+        covariance = covariance + (lens.dilution - 1.0) * by_lens
     return PoseUncertainty(
-        covariance=covariance[:6, :6],
+        joint=covariance,
         residual_rms_px=float(np.sqrt(np.mean(np.sum(residual**2, axis=1)))),
     )
 

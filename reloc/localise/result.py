@@ -86,6 +86,9 @@ class LocalisedPose:
         covariance: (6, 6), axes true-north east-north-up at the camera: small rotation of the camera about
             those axes (rad) before displacement of the camera centre (m). R_true = R(dtheta) R,
             C_true = C + dC. Measurement noise scaled by the residuals, plus the map's own uncertainty.
+        view_covariance: (6 + n, 6 + n) of the pose, as in `covariance`, and the camera's n parameters, for
+            what pixels show: pose and lens err together, mostly so that the map's points stay where they are
+            in the picture. None where the lens is exact: then it is `covariance`.
         camera: intrinsics used, full image size.
         camera_source: request, map, exif or estimated.
         epsg: UTM zone of `utm`.
@@ -117,8 +120,13 @@ class LocalisedPose:
     lineage: tuple[dict[str, Any], ...]
     residual_rms_px: float
     inliers: Inliers | None = None
+    view_covariance: FloatArray | None = None
 
     def __post_init__(self) -> None:
+        if self.view_covariance is not None:
+            size = 6 + len(self.camera.params)
+            joint = frozen_array("LocalisedPose.view_covariance", self.view_covariance, (size, size))
+            object.__setattr__(self, "view_covariance", joint)
         for name, shape in (("covariance", (6, 6)), ("utm", (3,)), ("cam_from_utm_xyzw", (4,))):
             object.__setattr__(self, name, frozen_array(f"LocalisedPose.{name}", getattr(self, name), shape))
 

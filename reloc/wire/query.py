@@ -260,6 +260,9 @@ ReasonText = Literal[
 class LocaliseReply(Answer):
     """The answer to a localise query; the pose's fields are null when it is not localised on Earth.
 
+    `view_covariance`: of the six of `covariance` and then of `camera.params`, for what pixels show; null
+    where the lens is exact.
+
     A map without a place that the request named answers `localised_in_map`: then `in_map` has the pose in the
     map's own frame, and whatever would say where on Earth that is stays null.
     """
@@ -289,6 +292,14 @@ class LocaliseReply(Answer):
     request_id: str
     contribution: ContributionReply | None = None
     in_map: InMapPose | None = None
+    view_covariance: tuple[tuple[float, ...], ...] | None = None
+
+    @model_validator(mode="after")
+    def _size_of_view(self) -> "LocaliseReply":
+        size = 6 + (0 if self.camera is None else len(self.camera.params))
+        if self.view_covariance is not None and [len(r) for r in self.view_covariance] != [size] * size:
+            raise ValueError(f"view_covariance: expected {size} rows of {size}")
+        return self
 
     @model_validator(mode="after")
     def _pose_or_reason(self) -> "LocaliseReply":

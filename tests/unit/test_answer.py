@@ -11,6 +11,7 @@ from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from reloc.localise.answer import make_answer, radius_68
+from reloc.localise.lens_prior import lens_of, with_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import LocalisedPose
 from tests.support.scenes import EPSG, box_points, looking_at, random_descriptors, ring, scene_map
@@ -43,7 +44,7 @@ def answer_of(
         prior_focal_px=900.0,
     )
     uncertainty = PoseUncertainty(
-        covariance=np.zeros((6, 6)) if measured is None else measured,
+        joint=np.zeros((6, 6)) if measured is None else measured,
         residual_rms_px=0.5,
     )
     return make_answer(area, hypothesis, uncertainty, np.zeros((len(rows), 2)), rows, want_inliers=True)
@@ -164,3 +165,39 @@ def test_inliers_and_maps_are_named_most_first() -> None:
     assert answer.inliers.map_rows.tolist() == [1] * 5 + [0] * 9
     np.testing.assert_array_equal(answer.inliers.points_utm[0], maps[0].points.utm[area.point_row[rows[0]]])
     np.testing.assert_array_equal(answer.inliers.points_utm[-1], maps[1].points.utm[area.point_row[rows[-1]]])
+
+
+def test_what_pixels_show_has_the_covariance_of_pose_and_lens_together() -> None:
+    """By drawing poses and lenses: those answered are OPENCV's, those estimated have an aspect."""
+    rng = np.random.default_rng(5)
+    area = build_area([a_map()])
+    camera = Camera(
+        model="OPENCV", width=1000, height=800, params=(900.0, 903.0, 500.0, 400.0, 0.02, 0.01, 1e-3, 0.0)
+    )
+    hypothesis = PoseHypothesis(
+        cam_from_local=POSE,
+        camera=camera,
+        camera_source="estimated",
+        inliers=np.ones(20, dtype=bool),
+        prior_focal_px=900.0,
+    )
+    scale = np.array([1e-3] * 3 + [0.05] * 3 + [3.0, 1.0, 1.0, 1e-3, 1e-3, 1e-3, 1e-4, 1e-4])
+    root = rng.normal(size=(14, 14)) * scale[:, None]
+    rows = np.arange(20)
+    uncertainty = PoseUncertainty(joint=root @ root.T, residual_rms_px=0.5)
+    answer = make_answer(area, hypothesis, uncertainty, np.zeros((20, 2)), rows, want_inliers=False)
+    assert answer.view_covariance is not None
+    errors = rng.normal(size=(20_000, 14)) @ root.T
+    params = np.array([with_lens(camera, lens_of(camera) + e).params for e in errors[:, 6:]]) - camera.params
+    drawn = np.cov(np.column_stack([errors[:, :6], params]).T)
+    sigma = np.sqrt(np.diag(drawn))
+    # The map's placement adds to the pose alone; four standard deviations of 20,000 draws.
+    np.testing.assert_allclose(
+        (answer.view_covariance / np.outer(sigma, sigma))[:, 6:],
+        (drawn / np.outer(sigma, sigma))[:, 6:],
+        atol=0.04,
+    )
+    exact = make_answer(
+        area, hypothesis, uncertainty, np.zeros((20, 2)), rows, want_inliers=False, told=camera
+    )
+    assert exact.view_covariance is None

@@ -15,6 +15,7 @@ from featuredb.geometry.rigid3 import Rigid3
 from featuredb.index.area import Area, build_area
 from featuredb.maps.error_modes import ErrorModes, without_modes
 from featuredb.maps.subset import only_images
+from reloc.localise.lens_prior import lens_of
 from reloc.localise.map_shape import shape_covariance
 from reloc.localise.pose import PoseHypothesis
 from tests.support.scenes import box_points, looking_at, random_descriptors, ring, scene_map
@@ -95,7 +96,13 @@ def test_a_pose_is_off_as_the_map_is(lens_of_photo: str) -> None:
     covariance = shape_covariance(area, 0, pose, rows, modes)
     assert covariance is not None
     error = np.concatenate([_turn(truth.rotation.T @ found.rotation), truth.center - found.center])
-    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.abs(error) / step, rtol=0.02, atol=2e-6)
+    deviation = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(deviation[:6], np.abs(error) / step, rtol=0.02, atol=2e-6)
+    if lens_of_photo == "its own":
+        assert covariance.shape == (6, 6)
+    else:  # the lens that is answered is the map's, too: it errs together with the pose, and which way
+        lent = lens_of(right) - lens_of(wrong)
+        np.testing.assert_allclose(covariance[:6, 6:] * step**2, np.outer(error, lent), rtol=0.03, atol=1e-13)
     # Images that the modes do not know: nothing can be said. A fisheye is no lens of the map.
     fisheye = replace(_LENS, model="OPENCV_FISHEYE")
     assert shape_covariance(area, 0, replace(pose, camera=fisheye), rows, modes) is not None

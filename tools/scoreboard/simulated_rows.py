@@ -111,6 +111,24 @@ SIMULATED: tuple[Row, ...] = (
         minutes=4,
     ),
     Row(
+        name="town-located-pixels",
+        group="simulated",
+        form="full",
+        claim="places of pixels that show what stands still, on an airborne scan: from answers to held-out "
+        "photos, and from poses and lenses drawn as the answers' covariances say, which test the bounds",
+        commands=(("tools.locate_pixels", "--work", "{work}/town", "--inputs", "{cache}", *OUT),),
+        figures=same("answered_95", "drawn_edges", "drawn_edge_95"),
+        text="answers: median {answered_median_m:.3f} m, 95 % off edges within {answered_clear_95_m:.3f} m; "
+        "drawn: {drawn_68:.0%} and {drawn_95:.1%} inside 68 and 95 % bounds, {drawn_edge_95:.0%} of the "
+        "{drawn_edges:.0%} that say that they are at an edge; {refused} refused beside {located}",
+        limits=(
+            Limit(figure="answered_median_m", most=0.05),
+            Limit(figure="drawn_68", least=0.63, most=0.73),
+            Limit(figure="drawn_95", least=0.90),
+        ),
+        minutes=6,
+    ),
+    Row(
         name="lens-draws",
         group="simulated",
         form="full",

@@ -1,0 +1,201 @@
+"""MAVLink 2 for autopilots: ODOMETRY or VISION_POSITION_ESTIMATE in a local NED frame, and GPS_INPUT.
+
+Axes: north, east, down at the local frame's origin; body forward, right, down. Covariances are the upper
+triangle, row by row, of x, y, z, roll, pitch, yaw.
+"""
+
+import socket
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from featuredb.errors import InvalidValueError
+from featuredb.extras import require
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import quaternion_from_matrix
+from reloc.bridge.robot_pose import FLU_FROM_FRD, NED_FROM_ENU, RobotPose
+
+MavMessage = Literal["odometry", "vision", "gps"]
+MAV_MESSAGES: tuple[MavMessage, ...] = ("odometry", "vision", "gps")
+
+_SEA_LEVEL = ("egm96", "egm2008", "navd88")  # MAVLink's altitudes are above mean sea level
+_GPS_EPOCH_S = 315_964_800  # of Unix time
+_LEAP_S = 18  # GPS time ahead of UTC since 2017
+_WEEK_S = 604_800
+_STEEP = 1e-3  # cosine of a pitch at which roll and yaw cannot be told apart
+
+
+class MavlinkSender:
+    """Packs poses as MAVLink 2 messages.
+
+    Args:
+        origin: of the local frame; None: where the first pose is.
+        geoid_m: height of the geoid over the ellipsoid, by which ellipsoidal heights become altitudes;
+            without it, and without a datum of sea level, GPS_INPUT says to ignore its altitude.
+        system, component: ids of the sender; by default the vehicle's own, as companion computers have it.
+
+    Raises:
+        MissingExtraError: pymavlink is not installed.
+    """
+
+    def __init__(
+        self,
+        messages: Sequence[MavMessage] = ("odometry",),
+        *,
+        origin: LocalFrame | None = None,
+        geoid_m: float | None = None,
+        system: int = 1,
+        component: int = 197,  # MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY
+    ) -> None:
+        require("robots", "The MAVLink bridge", "pymavlink.dialects.v20.common")
+        from pymavlink.dialects.v20 import common
+
+        self._dialect: Any = common
+        self._link: Any = common.MAVLink(None, srcSystem=system, srcComponent=component)
+        self._messages = tuple(messages)
+        self._origin = origin
+        self._geoid_m = geoid_m
+
+    def pack(self, pose: RobotPose) -> list[bytes]:
+        """The messages of one pose, each a packet."""
+        if self._origin is None:
+            self._origin = pose.frame_here()
+        made = {"odometry": self._odometry, "vision": self._vision, "gps": self._gps}
+        packets = []
+        for name in self._messages:
+            packets.append(bytes(made[name](pose).pack(self._link)))
+            self._link.seq = (self._link.seq + 1) % 256
+        return packets
+
+    def _odometry(self, pose: RobotPose) -> Any:
+        place, turn, covariance = self._local(pose)
+        x, y, z, w = (float(q) for q in quaternion_from_matrix(turn))
+        unknown = [float("nan")] * 21
+        return self._dialect.MAVLink_odometry_message(
+            time_usec=round(pose.time_s * 1e6),
+            frame_id=self._dialect.MAV_FRAME_LOCAL_NED,
+            child_frame_id=self._dialect.MAV_FRAME_BODY_FRD,
+            **dict(zip("xyz", place.tolist(), strict=True)),
+            q=[w, x, y, z],
+            **dict.fromkeys(("vx", "vy", "vz", "rollspeed", "pitchspeed", "yawspeed"), float("nan")),
+            pose_covariance=_upper(covariance),
+            velocity_covariance=unknown,
+            reset_counter=0,
+            estimator_type=self._dialect.MAV_ESTIMATOR_TYPE_VISION,
+            quality=0,
+        )
+
+    def _vision(self, pose: RobotPose) -> Any:
+        place, turn, covariance = self._local(pose)
+        roll, pitch, yaw = roll_pitch_yaw(turn)
+        return self._dialect.MAVLink_vision_position_estimate_message(
+            usec=round(pose.time_s * 1e6),
+            **dict(zip("xyz", place.tolist(), strict=True)),
+            roll=roll,
+            pitch=pitch,
+            yaw=yaw,
+            covariance=_upper(covariance),
+            reset_counter=0,
+        )
+
+    def _gps(self, pose: RobotPose) -> Any:
+        flags = self._dialect
+        ignored = (
+            flags.GPS_INPUT_IGNORE_FLAG_HDOP
+            | flags.GPS_INPUT_IGNORE_FLAG_VDOP
+            | flags.GPS_INPUT_IGNORE_FLAG_VEL_HORIZ
+            | flags.GPS_INPUT_IGNORE_FLAG_VEL_VERT
+            | flags.GPS_INPUT_IGNORE_FLAG_SPEED_ACCURACY
+        )
+        altitude = altitude_m(pose, self._geoid_m)
+        if altitude is None:
+            ignored |= flags.GPS_INPUT_IGNORE_FLAG_ALT | flags.GPS_INPUT_IGNORE_FLAG_VERTICAL_ACCURACY
+        gps_s = pose.time_s - _GPS_EPOCH_S + _LEAP_S
+        _, _, yaw = roll_pitch_yaw(NED_FROM_ENU @ pose.true_enu_from_body @ FLU_FROM_FRD)
+        return flags.MAVLink_gps_input_message(
+            time_usec=round(pose.time_s * 1e6),
+            gps_id=0,
+            ignore_flags=ignored,
+            time_week_ms=round(gps_s % _WEEK_S * 1000.0),
+            time_week=int(gps_s // _WEEK_S),
+            fix_type=3,
+            lat=round(pose.lat * 1e7),
+            lon=round(pose.lon * 1e7),
+            alt=0.0 if altitude is None else altitude,
+            **dict.fromkeys(("hdop", "vdop", "vn", "ve", "vd", "speed_accuracy"), 0.0),
+            horiz_accuracy=float(np.sqrt(np.trace(pose.covariance[:2, :2]))),
+            vert_accuracy=float(np.sqrt(pose.covariance[2, 2])),
+            satellites_visible=0,
+            yaw=round(np.degrees(yaw) * 100.0) % 36_000 or 36_000,  # 0 would be "not known"
+        )
+
+    def _local(self, pose: RobotPose) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Position, FRD body to NED, and covariance of x, y, z, roll, pitch, yaw."""
+        assert self._origin is not None
+        place, turn, covariance = pose.in_frame(self._origin)
+        ned_from_frd = NED_FROM_ENU @ turn @ FLU_FROM_FRD
+        to_angles = np.eye(6)
+        to_angles[3:, 3:] = _angles_by_rotation(ned_from_frd)
+        by_enu = to_angles @ np.kron(np.eye(2), NED_FROM_ENU)
+        told = by_enu @ covariance @ by_enu.T
+        return NED_FROM_ENU @ place, ned_from_frd, told
+
+
+class UdpLink:
+    """Sends packets to `udpout:HOST:PORT`; a context manager.
+
+    Raises:
+        InvalidValueError: not such an address.
+    """
+
+    def __init__(self, address: str) -> None:
+        kind, _, rest = address.partition(":")
+        host, _, port = rest.rpartition(":")
+        if kind != "udpout" or not host or not port.isdigit() or not 0 < int(port) < 65536:
+            raise InvalidValueError(f"--to: expected udpout:HOST:PORT, found {address!r}")
+        self._to = (host, int(port))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+    def send(self, packet: bytes) -> None:
+        self._socket.sendto(packet, self._to)
+
+    def __enter__(self) -> "UdpLink":
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        self._socket.close()
+
+
+def altitude_m(pose: RobotPose, geoid_m: float | None) -> float | None:
+    """Height above mean sea level, or None where the datum does not tell it."""
+    if pose.height_datum in _SEA_LEVEL:
+        return pose.height_m
+    if pose.height_datum == "ellipsoidal" and geoid_m is not None:
+        return pose.height_m - geoid_m
+    return None
+
+
+def roll_pitch_yaw(rotation: FloatArray) -> tuple[float, float, float]:
+    """Angles in rad of Rz(yaw) Ry(pitch) Rx(roll) (3, 3)."""
+    pitch = float(np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0)))
+    if np.cos(pitch) < _STEEP:  # only one turn about the vertical is left
+        return 0.0, pitch, float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
+    return (
+        float(np.arctan2(rotation[2, 1], rotation[2, 2])),
+        pitch,
+        float(np.arctan2(rotation[1, 0], rotation[0, 0])),
+    )
+
+
+def _angles_by_rotation(rotation: FloatArray) -> FloatArray:
+    """(3, 3) derivatives of roll, pitch, yaw by a small rotation about the fixed axes."""
+    _, pitch, yaw = roll_pitch_yaw(rotation)
+    cos, sin = max(float(np.cos(pitch)), _STEEP), float(np.sin(pitch))
+    c, s = float(np.cos(yaw)), float(np.sin(yaw))
+    return np.array([[c / cos, s / cos, 0.0], [-s, c, 0.0], [c * sin / cos, s * sin / cos, 1.0]])
+
+
+def _upper(covariance: FloatArray) -> list[float]:
+    return [float(v) for v in covariance[np.triu_indices(6)]]

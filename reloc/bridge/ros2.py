@@ -1,0 +1,151 @@
+"""ROS 2 messages of a pose, in CDR, written into an MCAP file: no ROS installation is needed.
+
+`/featuredb/pose` PoseWithCovarianceStamped in the frame `map` (east, north, up at the origin, REP 103 and
+105), `/featuredb/fix` NavSatFix, and `/tf`, `map` to `base_link`. Bodies are forward, left, up.
+"""
+
+import struct
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from featuredb.extras import require
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rotation import quaternion_from_matrix
+from reloc.bridge.robot_pose import RobotPose
+
+_MAP, _BODY = "map", "base_link"
+_COVARIANCE_KNOWN, _STATUS_FIX, _NO_SERVICE = 3, 0, 0
+_LINE = "=" * 80 + "\nMSG: "
+_TIME = f"{_LINE}builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+_HEADER = f"{_LINE}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n{_TIME}"
+_QUATERNION = f"{_LINE}geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
+_XYZ = "float64 x\nfloat64 y\nfloat64 z\n"
+# Topic: type, definition.
+_TOPICS = {
+    "/featuredb/pose": (
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "std_msgs/Header header\ngeometry_msgs/PoseWithCovariance pose\n"
+        f"{_LINE}geometry_msgs/PoseWithCovariance\ngeometry_msgs/Pose pose\nfloat64[36] covariance\n"
+        f"{_LINE}geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+        f"{_LINE}geometry_msgs/Point\n{_XYZ}{_QUATERNION}{_HEADER}",
+    ),
+    "/featuredb/fix": (
+        "sensor_msgs/msg/NavSatFix",
+        "std_msgs/Header header\nsensor_msgs/NavSatStatus status\nfloat64 latitude\nfloat64 longitude\n"
+        "float64 altitude\nfloat64[9] position_covariance\nuint8 position_covariance_type\n"
+        f"{_LINE}sensor_msgs/NavSatStatus\nint8 status\nuint16 service\n{_HEADER}",
+    ),
+    "/tf": (
+        "tf2_msgs/msg/TFMessage",
+        "geometry_msgs/TransformStamped[] transforms\n"
+        f"{_LINE}geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\n"
+        "geometry_msgs/Transform transform\n"
+        f"{_LINE}geometry_msgs/Transform\ngeometry_msgs/Vector3 translation\n"
+        f"geometry_msgs/Quaternion rotation\n{_LINE}geometry_msgs/Vector3\n{_XYZ}{_QUATERNION}{_HEADER}",
+    ),
+}
+
+
+class McapLog:
+    """Writes the messages of poses into a file of ROS 2's profile; a context manager.
+
+    Args:
+        origin: of the frame `map`; None: where the first pose is.
+
+    Raises:
+        MissingExtraError: mcap is not installed.
+        OSError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path, *, origin: LocalFrame | None = None) -> None:
+        require("robots", "The ROS 2 bridge", "mcap.writer")
+        self._path = path
+        self._origin = origin
+
+    def __enter__(self) -> Self:
+        from mcap.writer import Writer
+
+        self._file = self._path.open("wb")
+        self._writer: Any = Writer(self._file)
+        self._writer.start(profile="ros2", library="featuredb")
+        self._channels = {
+            topic: self._writer.register_channel(
+                topic=topic,
+                message_encoding="cdr",
+                schema_id=self._writer.register_schema(
+                    name=name, encoding="ros2msg", data=definition.encode()
+                ),
+            )
+            for topic, (name, definition) in _TOPICS.items()
+        }
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        self._writer.finish()
+        self._file.close()
+
+    def write(self, pose: RobotPose) -> None:
+        """Add the three messages of a pose."""
+        if self._origin is None:
+            self._origin = pose.frame_here()
+        stamp_ns = _nanoseconds(pose.time_s)
+        for topic, data in messages(pose, self._origin).items():
+            self._writer.add_message(
+                channel_id=self._channels[topic], log_time=stamp_ns, publish_time=stamp_ns, data=data
+            )
+
+
+def messages(pose: RobotPose, origin: LocalFrame) -> dict[str, bytes]:
+    """The CDR of each topic's message.
+
+    NavSatFix wants heights above the ellipsoid; others are NaN there, which readers take for "not known".
+    """
+    place, turn, covariance = pose.in_frame(origin)
+    quaternion = quaternion_from_matrix(turn)
+    told = _Cdr().header(pose.time_s, _MAP).doubles(place).doubles(quaternion).doubles(covariance)
+    height = pose.height_m if pose.height_datum == "ellipsoidal" else float("nan")
+    fix = _Cdr().header(pose.time_s, _BODY).pack("b", _STATUS_FIX).pack("H", _NO_SERVICE)
+    fix.doubles([pose.lat, pose.lon, height]).doubles(pose.covariance[:3, :3]).pack("B", _COVARIANCE_KNOWN)
+    moved = _Cdr().pack("I", 1).header(pose.time_s, _MAP).string(_BODY).doubles(place).doubles(quaternion)
+    return {"/featuredb/pose": told.data, "/featuredb/fix": fix.data, "/tf": moved.data}
+
+
+def _nanoseconds(time_s: float) -> int:
+    return round(time_s * 1e6) * 1000  # a double has no more of today's seconds
+
+
+class _Cdr:
+    """Plain CDR (OMG, XCDR 1), little-endian: each value at a multiple of its own size behind the header."""
+
+    def __init__(self) -> None:
+        self._body = bytearray()
+
+    @property
+    def data(self) -> bytes:
+        return b"\x00\x01\x00\x00" + bytes(self._body)
+
+    def pack(self, kind: str, value: float) -> Self:
+        self._body += bytes(-len(self._body) % struct.calcsize(kind)) + struct.pack(f"<{kind}", value)
+        return self
+
+    def string(self, text: str) -> Self:
+        encoded = text.encode() + b"\x00"
+        self.pack("I", len(encoded))
+        self._body += encoded
+        return self
+
+    def doubles(self, values: FloatArray | list[float]) -> Self:
+        for value in np.ravel(values):
+            self.pack("d", float(value))
+        return self
+
+    def header(self, time_s: float, frame_id: str) -> Self:
+        nanoseconds = _nanoseconds(time_s)
+        return (
+            self.pack("i", nanoseconds // 1_000_000_000)
+            .pack("I", nanoseconds % 1_000_000_000)
+            .string(frame_id)
+        )

@@ -1,0 +1,115 @@
+"""Subcommand `bridge`; what it needs is imported when it runs."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from featuredb.errors import InvalidValueError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from featuredb.geo.local_frame import LocalFrame
+    from reloc.bridge.robot_pose import RobotPose
+
+_NO_POSE = 1  # exit code: everything worked, and no answer had a pose
+
+
+def register(subparsers: Any) -> None:
+    """Add `bridge` to the parser of `featuredb`."""
+    bridge = subparsers.add_parser(
+        "bridge",
+        help="hand answers on to robots",
+        description="Read answers from standard input, a JSON object a line, as `featuredb live --json` and "
+        "`featuredb query --json` print them, and hand them on.",
+    )
+    kinds = bridge.add_subparsers(dest="kind", required=True, metavar="KIND")
+    mavlink = kinds.add_parser("mavlink", help="MAVLink 2 to an autopilot", description="Send MAVLink 2.")
+    mavlink.add_argument("--to", required=True, metavar="udpout:HOST:PORT", help="where packets go")
+    mavlink.add_argument(
+        "--message",
+        action="append",
+        choices=("odometry", "vision", "gps"),
+        help="ODOMETRY, VISION_POSITION_ESTIMATE or GPS_INPUT; may be repeated; default odometry",
+    )
+    ros2 = kinds.add_parser("ros2", help="ROS 2 messages in an MCAP file", description="Write an MCAP file.")
+    ros2.add_argument("--out", type=Path, required=True, metavar="FILE.mcap", help="file to write")
+    nmea = kinds.add_parser("nmea", help="NMEA 0183 to standard output", description="Print GGA and GST.")
+    for kind in (mavlink, ros2):
+        kind.add_argument("--origin", metavar="LAT,LON,H", help="of the local frame; default: the first pose")
+    for kind in (mavlink, nmea):
+        kind.add_argument(
+            "--geoid", type=float, metavar="M", help="height of the geoid over the ellipsoid there"
+        )
+    for kind, run in ((mavlink, _mavlink), (ros2, _ros2), (nmea, _nmea)):
+        kind.add_argument(
+            "--mount",
+            choices=("forward", "down"),
+            default="forward",
+            help="how the camera looks from the vehicle; down: the picture's top is towards the nose; "
+            "default forward",
+        )
+        kind.set_defaults(run=run)
+
+
+def _poses(args: argparse.Namespace) -> "Iterator[RobotPose]":
+    import time
+
+    from reloc.bridge.robot_pose import read_answers
+
+    return read_answers(sys.stdin, args.mount, time.time)
+
+
+def _mavlink(args: argparse.Namespace) -> int:
+    from reloc.bridge.mavlink import MavlinkSender, UdpLink
+
+    sender = MavlinkSender(args.message or ("odometry",), origin=_origin(args.origin), geoid_m=args.geoid)
+    count = 0
+    with UdpLink(args.to) as link:
+        for pose in _poses(args):
+            for packet in sender.pack(pose):
+                link.send(packet)
+            count += 1
+    return _said(f"{count} poses sent to {args.to}", count)
+
+
+def _ros2(args: argparse.Namespace) -> int:
+    from reloc.bridge.ros2 import McapLog
+
+    count = 0
+    with McapLog(args.out, origin=_origin(args.origin)) as log:
+        for pose in _poses(args):
+            log.write(pose)
+            count += 1
+    return _said(f"wrote {args.out}: {count} poses", count)
+
+
+def _nmea(args: argparse.Namespace) -> int:
+    from reloc.bridge.nmea import sentences
+
+    count = 0
+    for pose in _poses(args):
+        sys.stdout.write("".join(sentences(pose, args.geoid)))
+        sys.stdout.flush()
+        count += 1
+    return _said(f"{count} poses", count)
+
+
+def _said(text: str, count: int) -> int:
+    sys.stderr.write(text + "\n")
+    return 0 if count else _NO_POSE
+
+
+def _origin(text: str | None) -> "LocalFrame | None":
+    from featuredb.geo.local_frame import LocalFrame
+
+    if text is None:
+        return None
+    try:
+        latitude, longitude, height = (float(part) for part in text.split(","))
+        return LocalFrame(latitude_deg=latitude, longitude_deg=longitude, height_m=height)
+    except ValueError as error:
+        raise InvalidValueError(
+            f"--origin: expected LAT,LON,H in degrees and metres such as 47.37,8.54,408, found {text!r}"
+        ) from error

@@ -1,0 +1,108 @@
+"""Boxes of detectors: COCO's JSON in, GeoJSON out."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from featuredb.errors import InvalidValueError
+from reloc.pixels.locate import PixelPlace
+
+Foot = Literal["bottom", "centre"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MarkedPixel:
+    """A pixel to locate and what is said of it: `pixel` (u, v), `properties` for GeoJSON."""
+
+    pixel: tuple[float, float]
+    properties: dict[str, Any] = field(default_factory=dict)
+
+
+def read_coco(path: Path, image: str, foot: Foot) -> list[MarkedPixel]:
+    """The foot point of each box of a photo.
+
+    Args:
+        path: COCO's annotations (an object with `images` and `annotations`) or results (a list of boxes).
+        image: the photo's file name, by which its annotations are found. Results are those whose `image_id`
+            is the name, with or without suffix; where all have one `image_id`, they are the photo's.
+        foot: bottom: the middle of a box's lower side, where what stands upright in the picture meets the
+            ground; centre: of the box, for photos straight down.
+
+    Raises:
+        InvalidValueError: the file cannot be read or is neither, or has no box of the photo.
+    """
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        boxes = _boxes_of(document, Path(image))
+        names = {c["id"]: c["name"] for c in document["categories"]} if isinstance(document, dict) else {}
+        marks = [_mark(box, foot, names) for box in boxes]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InvalidValueError(
+            f"{path}: expected boxes in COCO's JSON (annotations, or a list of results), found {error!r}"
+        ) from error
+    if not marks:
+        raise InvalidValueError(f"{path}: expected boxes of {Path(image).name}, found none")
+    return marks
+
+
+def geojson(places: Sequence[PixelPlace], marks: Sequence[MarkedPixel], photo: str) -> dict[str, Any]:
+    """A FeatureCollection of points, longitude and latitude of WGS84 and height in the answer's datum.
+
+    A pixel without a place has no geometry, and its reason among its properties.
+    """
+    features = [_feature(place, mark) for place, mark in zip(places, marks, strict=True)]
+    return {"type": "FeatureCollection", "photo": photo, "features": features}
+
+
+def as_json(place: PixelPlace) -> dict[str, Any]:
+    """All of a place but its geodetic coordinates, as JSON has it."""
+    utm, covariance = place.utm, place.covariance
+    return {
+        "pixel": list(place.pixel),
+        "reason": place.reason,
+        "detail": place.detail,
+        "surface": place.surface,
+        "epsg": place.epsg,
+        "utm": None if utm is None else [round(float(v), 4) for v in utm],
+        "height_datum": place.height_datum,
+        "covariance": None if covariance is None else covariance.tolist(),
+        "horizontal_68_m": place.horizontal_68_m,
+        "vertical_68_m": place.vertical_68_m,
+        "at_edge": place.at_edge,
+        "grazing": place.grazing,
+        "distance_m": place.distance_m,
+        "incidence_deg": place.incidence_deg,
+        "roughness_m": place.roughness_m,
+    }
+
+
+def _feature(place: PixelPlace, mark: MarkedPixel) -> dict[str, Any]:
+    geometry = None
+    if place.lat_lon_h is not None:
+        latitude, longitude, height = (float(v) for v in place.lat_lon_h)
+        geometry = {
+            "type": "Point",
+            "coordinates": [round(longitude, 9), round(latitude, 9), round(height, 4)],
+        }
+    return {"type": "Feature", "geometry": geometry, "properties": {**mark.properties, **as_json(place)}}
+
+
+def _boxes_of(document: Any, image: Path) -> list[dict[str, Any]]:
+    if isinstance(document, dict):
+        ids = {i["id"] for i in document["images"] if Path(i["file_name"]).name == image.name}
+        return [a for a in document["annotations"] if a["image_id"] in ids]
+    named = [box for box in document if str(box["image_id"]) in (image.name, image.stem)]
+    only = len({str(box["image_id"]) for box in document}) == 1
+    return named or (list(document) if only else [])
+
+
+def _mark(box: dict[str, Any], foot: Foot, names: dict[Any, str]) -> MarkedPixel:
+    x, y, width, height = (float(v) for v in box["bbox"])
+    category = box.get("category_id")
+    said: dict[str, Any] = {key: box[key] for key in ("id", "category_id", "score") if key in box}
+    if category in names:
+        said["category"] = names[category]
+    down = height if foot == "bottom" else 0.5 * height
+    return MarkedPixel(pixel=(x + 0.5 * width, y + down), properties={**said, "bbox": [x, y, width, height]})

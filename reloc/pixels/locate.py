@@ -1,0 +1,209 @@
+"""What is at a pixel: its ray against a surface, with the covariance of the place.
+
+A place X on the surface is seen at the pixel that camera and pose give it. The pose's error, the lens' and
+that of the pixel itself are one error of the pixel, and move the ray along the surface; the surface's own
+error moves the place along the ray.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from reloc.localise.answer import radius_68
+from reloc.pixels.surfaces import Met, RaySurface
+from reloc.pixels.view import AnsweredView
+
+LocateReason = Literal["NO_SURFACE", "GRAZING", "OUTSIDE"]
+LOCATE_REASONS: tuple[LocateReason, ...] = get_args(LocateReason)
+
+_REACH_SIGMAS = 2.45  # of two dimensions: holds 95 %
+_LARGEST_ALONG = 0.1  # of the distance: one deviation along the ray beyond which nothing is linear
+_GRAZING_DEG = 80.0  # off the normal: a degree of the surface moves the place by a tenth of its distance
+_LEAST_SHARE = 0.25  # of the other surfaces: twice 1 / 7.8, which reaches the bound of 95 %
+_RINGS, _SPOKES = (0.4, 0.8, 1.2, 1.6, 2.0, _REACH_SIGMAS), 12
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PixelPlace:
+    """What a pixel shows.
+
+    Attributes:
+        pixel: (u, v) of the photo's stored pixels.
+        reason: why there is no place; None where there is one.
+        detail: one sentence for people: the reason, or what makes the place doubtful.
+        at_edge: another surface lies within the pixel's error; the covariance covers both.
+        grazing: the surface is seen at more than 80 degrees off its normal.
+        surface: "scan" or "map".
+        epsg: UTM zone. utm: (3,) easting, northing, height, metres.
+        height_datum: of the height.
+        lat_lon_h: (3,) degrees, metres.
+        covariance: (3, 3) true east, north, up there, square metres.
+        distance_m: from the camera. incidence_deg: between the ray and the surface's normal.
+        roughness_m: one standard deviation of the surface along its normal.
+    """
+
+    pixel: tuple[float, float]
+    reason: LocateReason | None
+    detail: str
+    epsg: int
+    height_datum: str
+    surface: str
+    at_edge: bool = False
+    grazing: bool = False
+    utm: FloatArray | None = None
+    lat_lon_h: FloatArray | None = None
+    covariance: FloatArray | None = None
+    distance_m: float | None = None
+    incidence_deg: float | None = None
+    roughness_m: float | None = None
+
+    @property
+    def horizontal_68_m(self) -> float | None:
+        return None if self.covariance is None else radius_68(self.covariance[:2, :2])
+
+    @property
+    def vertical_68_m(self) -> float | None:
+        return None if self.covariance is None else radius_68(self.covariance[2:, 2:])
+
+
+def locate(
+    view: AnsweredView,
+    surface: RaySurface,
+    pixels: Sequence[tuple[float, float]] | FloatArray,
+    sigma_px: float = 0.0,
+) -> list[PixelPlace]:
+    """The place of each pixel, or why it has none.
+
+    Args:
+        pixels: (n, 2), the centre of the photo's top-left pixel being (0.5, 0.5).
+        sigma_px: one standard deviation of each coordinate of the pixels themselves.
+
+    Raises:
+        MissingExtraError: a scan is drawn, and numba is not installed.
+    """
+    return [_place(view, surface, np.array(pixel, dtype=np.float64), sigma_px) for pixel in pixels]
+
+
+def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px: float) -> PixelPlace:
+    def refuse(reason: LocateReason, detail: str) -> PixelPlace:
+        return PixelPlace(
+            pixel=(float(pixel[0]), float(pixel[1])),
+            reason=reason,
+            detail=detail,
+            epsg=view.epsg,
+            height_datum=view.height_datum,
+            surface=surface.kind,
+        )
+
+    ray = view.rays(pixel[None])[0]
+    if not (_inside(view.camera, pixel) and np.isfinite(ray).all()):
+        return refuse("OUTSIDE", f"the photo has {view.camera.width} x {view.camera.height} pixels")
+    # By the pose's turn alone, which is right for far things; nearer ones are asked for again.
+    viewer = view.cam_from_local.center
+    spread = _pixel_covariance(view, viewer + 1e4 * ray, sigma_px)
+    met = surface.meet(view, pixel, _REACH_SIGMAS * _longest(spread))
+    if isinstance(met, str):
+        return refuse("NO_SURFACE", met)
+    toward = float(met.patch.normal @ ray)
+    if toward > -1e-6:
+        return refuse("GRAZING", "the ray runs along the surface")
+    point = viewer + ray * float(met.patch.normal @ (met.patch.point - viewer)) / toward
+    spread = _pixel_covariance(view, point, sigma_px)
+    along = ray * met.sigma_m / toward
+    on_surface = _by_pixel(view, point, met.patch.normal)
+    covariance = on_surface @ spread @ on_surface.T + np.outer(along, along)
+    direction = ray / np.linalg.norm(ray)
+    distance = float(np.linalg.norm(point - viewer))
+    if float(np.sqrt(direction @ covariance @ direction)) > _LARGEST_ALONG * distance:
+        return refuse("GRAZING", f"the place is known to no better than a tenth of its {distance:.0f} m")
+    other = _other_surfaces(view, met, pixel, point, spread)
+    incidence = float(np.degrees(np.arccos(min(1.0, -float(met.patch.normal @ direction)))))
+    to_true = view.frame.true_enu_from_enu(point)
+    if other is not None:
+        covariance = covariance + other
+    return PixelPlace(
+        pixel=(float(pixel[0]), float(pixel[1])),
+        reason=None,
+        detail=_doubts(other is not None, incidence),
+        epsg=view.epsg,
+        height_datum=view.height_datum,
+        surface=surface.kind,
+        at_edge=other is not None,
+        grazing=incidence > _GRAZING_DEG,
+        utm=view.frame.utm_from_enu(point, view.epsg),
+        lat_lon_h=view.frame.geodetic_from_enu(point),
+        covariance=np.asarray(to_true @ covariance @ to_true.T),
+        distance_m=distance,
+        incidence_deg=incidence,
+        roughness_m=met.sigma_m,
+    )
+
+
+def _inside(camera: Camera, pixel: FloatArray) -> bool:
+    return bool((pixel >= 0).all() and (pixel <= [camera.width, camera.height]).all())
+
+
+def _pixel_covariance(view: AnsweredView, point: FloatArray, sigma_px: float) -> FloatArray:
+    """(2, 2): how far the pixel of a place may be off."""
+    _, by_view = view.pixel_derivatives(point)
+    # A floor far below what anybody sees keeps it regular.
+    return np.asarray(by_view @ view.covariance @ by_view.T + (sigma_px**2 + 1e-6) * np.eye(2))
+
+
+def _longest(covariance: FloatArray) -> float:
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
+def _by_pixel(view: AnsweredView, point: FloatArray, normal: FloatArray) -> FloatArray:
+    """(3, 2): how a place moves on its plane with its pixel."""
+    by_point, _ = view.pixel_derivatives(point)
+    _, _, axes = np.linalg.svd(normal[None])
+    plane = axes[1:].T
+    return np.asarray(plane @ np.linalg.inv(by_point @ plane))
+
+
+def _other_surfaces(
+    view: AnsweredView, met: Met, pixel: FloatArray, point: FloatArray, spread: FloatArray
+) -> FloatArray | None:
+    """(3, 3): what places beyond an edge add to the covariance; None where all around is one surface.
+
+    The second moment of what the ray meets over the pixel's error, to which the scan's own adds: it knows
+    its edges to half the distance between its points. Enough of it that the other surface lies within the
+    bound of 95 %, too, however little of the error is beyond the edge.
+    """
+    depth = float(view.cam_from_local.act(point)[2])
+    edge_px = 0.5 * met.spacing_m * view.camera.focal_px / depth
+    root = np.linalg.cholesky(spread + (edge_px / _REACH_SIGMAS) ** 2 * np.eye(2))
+    turns = 2.0 * np.pi * np.arange(_SPOKES) / _SPOKES
+    spokes = np.column_stack([np.cos(turns), np.sin(turns)])
+    offsets = np.concatenate([ring * spokes for ring in _RINGS])
+    weight = np.repeat([ring * np.exp(-0.5 * ring**2) for ring in _RINGS], _SPOKES)
+    weight /= weight.sum()
+    pixels = pixel + offsets @ root.T
+    depths = met.around(pixels)
+    rays = view.rays(pixels)
+    with np.errstate(invalid="ignore"):
+        toward = rays @ met.patch.normal
+        on_plane = (
+            rays * (met.patch.normal @ (met.patch.point - view.cam_from_local.center) / toward)[:, None]
+        )
+        places = rays * depths[:, None]
+        off = np.abs((places - on_plane) @ met.patch.normal)
+        limit = np.maximum(4.0 * met.patch.scatter_m, met.tolerance_m)
+        beyond = (off > limit) & np.isfinite(off)
+    if not beyond.any():
+        return None
+    away = (places - on_plane)[beyond]
+    share = weight[beyond] * max(1.0, _LEAST_SHARE / weight[beyond].sum())
+    return np.asarray((away * share[:, None]).T @ away)
+
+
+def _doubts(at_edge: bool, incidence_deg: float) -> str:
+    doubts = ["another surface lies within the pixel's error"] if at_edge else []
+    if incidence_deg > _GRAZING_DEG:
+        doubts.append(f"the surface is seen at {incidence_deg:.0f} degrees off its normal")
+    return "; ".join(doubts)

@@ -1,0 +1,238 @@
+"""What a ray of a photo may meet: the scan of the database, or the points of the map that answered."""
+
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.lidar.load import PlanBox, load_cloud
+from featuredb.render.cloud import PointCloud
+from featuredb.render.renderer import RenderOptions, render
+from featuredb.render.rendering import Rendering
+from featuredb.store import Database
+from featuredb.store.scans import has_scans, list_scans
+from reloc.pixels.patch import Patch, fit_patch
+from reloc.pixels.view import AnsweredView
+
+REACH_M = 1000.0  # of the scan around the camera that is looked at
+_OVERVIEW_PX = 1000  # longer side of the picture in which a pixel's distance is looked up first
+_LARGEST_HALF_PX = 120  # of the picture of a pixel's surroundings; what needs more is drawn smaller
+_SMALLEST_HALF_PX = 16
+_SPACINGS = 4.0  # around a place from which its plane is taken: some fifty points
+_NEAREST_POINTS = 12  # of a map
+_TOLERANCE_SPACINGS = 0.25  # flatter than this is flat at a scan's resolution
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Met:
+    """Where a ray meets a surface.
+
+    Attributes:
+        patch: the surface there.
+        sigma_m: one standard deviation of the surface along its normal.
+        spacing_m: distance between the points that it is known by; edges are known no better.
+        tolerance_m: what lies farther off the patch is another surface.
+        around: metres along the optical axis at pixels (k, 2) around; NaN where nothing is.
+    """
+
+    patch: Patch
+    sigma_m: float
+    spacing_m: float
+    tolerance_m: float
+    around: "DepthAround"
+
+
+class DepthAround(Protocol):
+    """Looks up the distance at other pixels."""
+
+    def __call__(self, pixels: FloatArray) -> FloatArray: ...
+
+
+class RaySurface(Protocol):
+    """Something that rays can meet; `kind` is its name in answers."""
+
+    @property
+    def kind(self) -> str: ...
+
+    def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
+        """Where the ray of a pixel (2,) meets it, or why it does not.
+
+        Args:
+            reach_px: how far around the pixel distances will be asked for.
+        """
+        ...
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class ScanSurface:
+    """A cloud in the frame of the view.
+
+    Attributes:
+        common_m: one standard deviation of what neighbouring points are off by together (their strip, the
+            datum), metres; None: half of how far they scatter.
+    """
+
+    cloud: PointCloud
+    common_m: float | None = None
+    kind: str = "scan"
+    _overview: Rendering | None = field(default=None, repr=False)
+
+    def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
+        rough = self._depth(view, pixel)
+        if rough is None:
+            return "the scan has no points there"
+        depth, spacing = rough
+        spacing_px = spacing * view.camera.focal_px / depth
+        half = max(_SPACINGS * spacing_px, reach_px + spacing_px, _SMALLEST_HALF_PX)
+        zoom = min(1.0, _LARGEST_HALF_PX / half)
+        window, corner, scale = window_camera(view.camera, pixel, half, zoom)
+        drawn = render(self.cloud, window, view.cam_from_local, RenderOptions(attributes=False))
+        around = _Window(depth=drawn.depth, corner=corner, scale=scale)
+        ray = view.rays(pixel[None])[0]
+        viewer = view.cam_from_local.center
+        nearest = around.nearest(pixel, spacing_px)
+        if nearest is None:
+            return "the scan has no points there"
+        place = viewer + ray * nearest
+        shown = self.cloud.xyz[np.unique(drawn.index[drawn.index >= 0])].astype(np.float64)
+        near = shown[np.linalg.norm(shown - place, axis=1) < _SPACINGS * spacing]
+        tolerance = _TOLERANCE_SPACINGS * spacing
+        patch = fit_patch(near, place, viewer, tolerance)
+        if patch is None:
+            return f"the {len(near)} points of the scan around lie on no surface"
+        common = 0.5 * patch.scatter_m if self.common_m is None else self.common_m
+        sigma = float(np.hypot(patch.fitted_m, common))
+        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=around)
+
+    def _depth(self, view: AnsweredView, pixel: FloatArray) -> tuple[float, float] | None:
+        """Metres along the axis and between points, of an overview that is drawn once."""
+        if self._overview is None:
+            camera = view.camera
+            shrink = min(1.0, _OVERVIEW_PX / max(camera.width, camera.height))
+            small = resampled(camera, shrink)
+            self._overview = render(self.cloud, small, view.cam_from_local, RenderOptions(attributes=False))
+        drawn = self._overview
+        at = pixel * [drawn.camera.width / view.camera.width, drawn.camera.height / view.camera.height]
+        column, row = (int(v) for v in np.minimum(at, [drawn.camera.width - 1, drawn.camera.height - 1]))
+        part = (slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3))
+        depth, index = drawn.depth[part], drawn.index[part]
+        if not np.isfinite(depth).any():
+            return None
+        own = index[index >= 0]
+        spacing = self.cloud.spacing_m
+        assert spacing is not None
+        apart = float(np.median(spacing[own])) if len(own) else float(np.median(spacing))
+        return float(np.nanmin(depth)), max(apart, 1e-3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapSurface:
+    """Points (n, 3) of a map in the frame of the view, those that the photo should show."""
+
+    points: FloatArray
+    kind: str = "map"
+
+    def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
+        pixels = view.camera.project(view.cam_from_local.act(self.points))
+        apart = np.linalg.norm(pixels - pixel, axis=1)
+        nearest = np.argsort(np.where(np.isfinite(apart), apart, np.inf), kind="stable")[:_NEAREST_POINTS]
+        near = self.points[nearest]
+        if len(near) < _NEAREST_POINTS:
+            return "the map has no points there"
+        ray = view.rays(pixel[None])[0]
+        depth = view.cam_from_local.act(near)[:, 2]
+        viewer = view.cam_from_local.center
+        place = viewer + ray * float(np.median(depth))
+        spacing = float(np.sqrt(np.pi) * np.linalg.norm(near - place, axis=1).max() / np.sqrt(len(near)))
+        around = (pixels[nearest] - pixel) / apart[nearest].max()
+        if np.linalg.norm(around.mean(axis=0)) > 0.5:  # all on one side: the plane would be a guess
+            return "the map's points lie beside the pixel"
+        tolerance = _TOLERANCE_SPACINGS * spacing
+        patch = fit_patch(near, place, viewer, tolerance)
+        if patch is None or patch.share < 0.5:
+            return "the map's points around lie on no surface"
+        # Between points so far apart the surface may do what it does at them.
+        sigma = float(np.hypot(patch.fitted_m, patch.scatter_m))
+        return Met(patch=patch, sigma_m=sigma, spacing_m=spacing, tolerance_m=tolerance, around=_Nowhere())
+
+
+class _Nowhere:
+    """A map's few points show no edges."""
+
+    def __call__(self, pixels: FloatArray) -> FloatArray:
+        return np.full(len(pixels), np.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Window:
+    """Depth (h, w) of a window; its corner (2,) in the photo, and its pixels per pixel of the photo (2,)."""
+
+    depth: NDArray[np.float32]
+    corner: FloatArray
+    scale: FloatArray
+
+    def __call__(self, pixels: FloatArray) -> FloatArray:
+        at = np.floor((pixels - self.corner) * self.scale).astype(np.int64)
+        height, width = self.depth.shape
+        inside = ((at >= 0) & (at < [width, height])).all(axis=1)
+        found = np.full(len(pixels), np.nan)
+        found[inside] = self.depth[at[inside, 1], at[inside, 0]]
+        return found
+
+    def nearest(self, pixel: FloatArray, within_px: float) -> float | None:
+        """Depth at a pixel, or in a gap between points at what is shown nearest to it."""
+        rows, columns = np.nonzero(np.isfinite(self.depth))
+        if not len(rows):
+            return None
+        away = (np.column_stack([columns, rows]) + 0.5) / self.scale + self.corner - pixel
+        apart = np.hypot(away[:, 0], away[:, 1])
+        best = int(np.argmin(apart))
+        if apart[best] > max(within_px, 1.0 / float(self.scale.min())):
+            return None
+        return float(self.depth[rows[best], columns[best]])
+
+
+def scan_surface(
+    database: Database, view: AnsweredView, box: PlanBox = (-REACH_M, -REACH_M, REACH_M, REACH_M)
+) -> ScanSurface | None:
+    """The scans around the camera whose heights are of the answer's datum; None where there are none.
+
+    Args:
+        box: in the view's frame, what is loaded.
+    """
+    if not has_scans(database):
+        return None
+    scans = [s.scan_id for s in list_scans(database) if s.height_datum == view.height_datum]
+    if not scans:
+        return None
+    cloud = load_cloud(database, view.frame, box, scan_ids=scans)
+    return ScanSurface(cloud=cloud) if len(cloud) else None
+
+
+def window_camera(
+    camera: Camera, pixel: FloatArray, half_px: float, zoom: float
+) -> tuple[Camera, FloatArray, FloatArray]:
+    """The lens for a square of the picture around a pixel.
+
+    Returns:
+        The lens; the square's corner (2,) in the picture; its pixels per pixel of the picture (2,).
+    """
+    side = max(2 * int(np.ceil(half_px * zoom)) + 1, 3)
+    small = resampled(camera, zoom)
+    scale = np.array([small.width / camera.width, small.height / camera.height])
+    corner = np.floor(pixel * scale) - side // 2
+    params = np.array(small.params)
+    first = 1 if len(small.to_pycolmap().focal_length_idxs()) == 1 else 2
+    params[first : first + 2] -= corner
+    return replace(small, width=side, height=side, params=tuple(params)), corner / scale, scale
+
+
+def resampled(camera: Camera, zoom: float) -> Camera:
+    """The lens for a smaller picture."""
+    if zoom >= 1.0:
+        return camera
+    width = max(round(camera.width * zoom), 1)
+    return camera.scaled_to(width, max(round(camera.height * width / camera.width), 1))

@@ -1,0 +1,127 @@
+"""The camera of an answer: its lens and pose in a frame of its own, with how well both are known."""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray, frozen_array
+from featuredb.geometry.camera import Camera
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import matrix_from_quaternion
+from reloc.localise.jacobians import pixel_jacobians
+from reloc.wire.query import LocaliseReply
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AnsweredView:
+    """A camera on Earth.
+
+    Attributes:
+        frame: true east, north, up at the camera's centre, or near it.
+        camera: intrinsics of the photo's stored pixels.
+        cam_from_local: `frame` to camera axes, metres.
+        covariance: (6 + n, 6 + n) of the pose as LocalisedPose has it, then of the n camera parameters; n = 0
+            where the lens is exact.
+        epsg: UTM zone of the answer. height_datum: of its heights.
+        map_ids: maps that answered.
+    """
+
+    frame: LocalFrame
+    camera: Camera
+    cam_from_local: Rigid3
+    covariance: FloatArray
+    epsg: int
+    height_datum: str
+    map_ids: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        covariance = frozen_array("AnsweredView.covariance", self.covariance, (None, None))
+        if covariance.shape not in ((6, 6), (6 + len(self.camera.params),) * 2):
+            raise InvalidValueError(
+                f"AnsweredView.covariance: expected a pose's, or with its lens, found {covariance.shape}"
+            )
+        object.__setattr__(self, "covariance", covariance)
+
+    @classmethod
+    def of_reply(cls, reply: LocaliseReply) -> Self:
+        """The camera of a localised reply.
+
+        Raises:
+            InvalidValueError: it has no pose on Earth.
+        """
+        utm, used, covariance = reply.utm, reply.camera, reply.covariance
+        if utm is None or used is None or covariance is None:
+            raise InvalidValueError(f"expected a pose on Earth, found {reply.status}: {reply.detail}")
+        return cls.at(
+            (utm.easting, utm.northing, utm.height),
+            utm.epsg,
+            utm.cam_from_utm_xyzw,
+            camera=Camera(model=used.model, width=used.width, height=used.height, params=used.params),
+            covariance=np.array(covariance if reply.view_covariance is None else reply.view_covariance),
+            height_datum=reply.height_datum or "unknown",
+            map_ids=reply.maps,
+        )
+
+    @classmethod
+    def at(
+        cls,
+        utm: ArrayLike,
+        epsg: int,
+        cam_from_utm_xyzw: ArrayLike,
+        *,
+        camera: Camera,
+        covariance: FloatArray,
+        height_datum: str,
+        map_ids: tuple[str, ...] = (),
+    ) -> Self:
+        """A camera at a UTM place (3,), with the rotation (4,) of grid axes into camera axes."""
+        easting, northing, height = np.asarray(utm, dtype=np.float64)
+        frame = LocalFrame.from_utm(float(easting), float(northing), float(height), epsg)
+        rotation = matrix_from_quaternion(cam_from_utm_xyzw) @ frame.grid_from_enu(np.zeros(3), epsg)
+        return cls(
+            frame=frame,
+            camera=camera,
+            cam_from_local=Rigid3(rotation=rotation, translation=np.zeros(3)),
+            covariance=covariance,
+            epsg=epsg,
+            height_datum=height_datum,
+            map_ids=map_ids,
+        )
+
+    def seen_in(self, frame: LocalFrame) -> "AnsweredView":
+        """The same camera with its pose in another frame nearby; the covariance keeps its axes."""
+        return replace(self, frame=frame, cam_from_local=self.cam_from_local @ self.frame.enu_from(frame))
+
+    def rays(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) in `frame`, of depth 1 along the optical axis; NaN where the lens sees nothing."""
+        xy = self.camera.unproject(pixels)
+        return np.asarray(np.column_stack([xy, np.ones(len(xy))]) @ self.cam_from_local.rotation)
+
+    def pixel_derivatives(self, point: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Of the pixel of a point (3,): by the point (2, 3), and by what `covariance` is of (2, 6 + n)."""
+        by_point, by_pose = pixel_jacobians(self.camera, self.cam_from_local, point[None])
+        if len(self.covariance) == 6:
+            return by_point[0], by_pose[0]
+        in_camera = self.cam_from_local.act(point[None])
+        by_lens = [self._by_parameter(k, in_camera) for k in range(len(self.camera.params))]
+        return by_point[0], np.column_stack([by_pose[0], *by_lens])
+
+    def _by_parameter(self, k: int, in_camera: FloatArray) -> FloatArray:
+        params = np.array(self.camera.params)
+        step = 1e-6 * max(abs(params[k]), 1.0)
+        ends = []
+        for sign in (-1.0, 1.0):
+            moved = params.copy()
+            moved[k] += sign * step
+            camera = Camera(
+                model=self.camera.model,
+                width=self.camera.width,
+                height=self.camera.height,
+                params=tuple(moved),
+            )
+            ends.append(camera.project(in_camera)[0])
+        return np.asarray((ends[1] - ends[0]) / (2.0 * step))

@@ -1,0 +1,228 @@
+"""Answers as other systems' messages, decoded by those systems' own libraries."""
+
+import io
+import json
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
+
+from featuredb.errors import InvalidValueError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.geometry.arrays import FloatArray
+from reloc.bridge.mavlink import MavlinkSender, UdpLink
+from reloc.bridge.nmea import sentences
+from reloc.bridge.robot_pose import RobotPose, read_answers
+from reloc.bridge.ros2 import McapLog, messages
+
+ORIGIN = LocalFrame(latitude_deg=-33.86, longitude_deg=151.2, height_m=20.0)
+PLACE = np.array([12.0, 345.0, 6.0])  # east, north, up of the origin
+HEADING_DEG, PITCH_DEG, ROLL_DEG = 30.0, 10.0, -5.0  # of the body: clockwise from north, nose up, right down
+TIME_S = 1_764_163_800.25
+ROOT = np.random.default_rng(0).normal(size=(6, 6)) * np.repeat([0.002, 0.1], 3)[:, None]
+GIVEN = ROOT @ ROOT.T  # rotation before displacement, east, north, up
+
+
+def body_from_angles() -> Rotation:
+    """East, north, up from forward, left, up, by the angles of aviation."""
+    ned_from_frd = Rotation.from_euler("ZYX", [HEADING_DEG, PITCH_DEG, ROLL_DEG], degrees=True).as_matrix()
+    swap = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
+    return Rotation.from_matrix(swap @ ned_from_frd @ np.diag([1.0, -1.0, -1.0]))
+
+
+def answer(turn: Rotation, datum: str = "ellipsoidal") -> dict[str, object]:
+    lat, lon, h = (float(v) for v in ORIGIN.geodetic_from_enu(PLACE))
+    x, y, z, w = turn.as_quat()
+    return {
+        "position": {"lat": lat, "lon": lon, "h": h},
+        "quaternion": {"x": x, "y": y, "z": z, "w": w},
+        "covariance": GIVEN.tolist(),
+        "height_datum": datum,
+        "received_at": "2025-11-26T13:30:00.250000+00:00",
+    }
+
+
+def pose(datum: str = "ellipsoidal", turn: Rotation | None = None, mount: str = "forward") -> RobotPose:
+    line = json.dumps(answer(turn or body_from_angles(), datum))
+    (found,) = read_answers([line, "\n"], mount, lambda: 0.0)  # type: ignore[arg-type]
+    return found
+
+
+def decoded(packet: bytes) -> object:
+    (message,) = common.MAVLink(None).parse_buffer(packet)
+    return message
+
+
+def test_odometry_is_north_east_down_with_its_covariance() -> None:
+    (packet,) = MavlinkSender(("odometry",), origin=ORIGIN).pack(pose())
+    found = decoded(packet)
+    assert found.get_type() == "ODOMETRY"
+    assert (found.frame_id, found.child_frame_id) == (common.MAV_FRAME_LOCAL_NED, common.MAV_FRAME_BODY_FRD)
+    np.testing.assert_allclose([found.x, found.y, found.z], [345.0, 12.0, -6.0], atol=1e-3)
+    w, x, y, z = found.q
+    yaw, pitch, roll = Rotation.from_quat([x, y, z, w]).as_euler("ZYX", degrees=True)
+    np.testing.assert_allclose([yaw, pitch, roll], [HEADING_DEG, PITCH_DEG, ROLL_DEG], atol=5e-3)
+    assert found.time_usec == round(TIME_S * 1e6)
+    assert np.isnan(found.vx)
+    told = np.zeros((6, 6))
+    told[np.triu_indices(6)] = found.pose_covariance
+    np.testing.assert_allclose(told[:3, :3], np.triu(_drawn()[:3, :3]), rtol=0.1, atol=2e-4)
+
+
+def _drawn() -> FloatArray:
+    """Covariance of north, east, down, roll, pitch, yaw by drawing answers."""
+    rng = np.random.default_rng(1)
+    swap, rows = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]), []
+    turn = body_from_angles()
+    for error in rng.normal(size=(4000, 6)) @ ROOT.T:
+        ned_from_frd = (
+            swap @ (Rotation.from_rotvec(error[:3]) * turn).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        )
+        yaw, pitch, roll = Rotation.from_matrix(ned_from_frd).as_euler("ZYX")
+        rows.append([*(swap @ error[3:]), roll, pitch, yaw])
+    return np.cov(np.array(rows).T)
+
+
+def test_the_vision_estimate_has_the_covariance_of_its_angles() -> None:
+    (packet,) = MavlinkSender(("vision",), origin=ORIGIN).pack(pose())
+    found = decoded(packet)
+    assert found.get_type() == "VISION_POSITION_ESTIMATE"
+    angles = np.degrees([found.roll, found.pitch, found.yaw])
+    np.testing.assert_allclose(angles, [ROLL_DEG, PITCH_DEG, HEADING_DEG], atol=5e-3)
+    told = np.zeros((6, 6))
+    told[np.triu_indices(6)] = found.covariance
+    scale = np.sqrt(np.diag(told))
+    # Four standard deviations of correlations of 4000 draws.
+    np.testing.assert_allclose(
+        told / np.outer(scale, scale), np.triu(_drawn() / np.outer(scale, scale)), atol=0.09
+    )
+
+
+@pytest.mark.parametrize(
+    ("datum", "geoid_m", "altitude"), [("egm96", None, 26.0), ("ellipsoidal", 22.5, 3.5)]
+)
+def test_gps_input_has_altitudes_of_sea_level(datum: str, geoid_m: float | None, altitude: float) -> None:
+    sender = MavlinkSender(("gps",), geoid_m=geoid_m)
+    found = decoded(sender.pack(pose(datum))[0])
+    assert found.get_type() == "GPS_INPUT"
+    lat, lon, _ = ORIGIN.geodetic_from_enu(PLACE)
+    np.testing.assert_allclose([found.lat, found.lon], [lat * 1e7, lon * 1e7], atol=0.6)
+    assert abs(found.alt - altitude) < 0.02  # the Earth is round
+    assert not found.ignore_flags & common.GPS_INPUT_IGNORE_FLAG_ALT
+    assert found.horiz_accuracy == pytest.approx(np.sqrt(GIVEN[3, 3] + GIVEN[4, 4]), rel=1e-5)
+    assert found.vert_accuracy == pytest.approx(np.sqrt(GIVEN[5, 5]), rel=1e-5)
+    assert found.yaw == pytest.approx(100 * HEADING_DEG, abs=1)
+    assert (found.time_week, found.time_week_ms) == (2394, 307_818_250)  # Wednesday, 13:30:18.25 GPS
+
+
+def test_gps_input_has_no_altitude_where_the_datum_does_not_tell_it() -> None:
+    for datum, geoid_m in (("ellipsoidal", None), ("unknown", 22.5)):
+        found = decoded(MavlinkSender(("gps",), geoid_m=geoid_m).pack(pose(datum))[0])
+        assert found.ignore_flags & common.GPS_INPUT_IGNORE_FLAG_ALT
+        assert ",,M" not in sentences(pose(datum), None)[0]
+
+
+def test_packets_arrive_at_an_autopilot_s_port() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    autopilot = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}", dialect="common")
+    sender = MavlinkSender(("odometry", "gps"))
+    with UdpLink(f"udpout:127.0.0.1:{port}") as link:
+        for packet in sender.pack(pose()) + sender.pack(pose()):
+            link.send(packet)
+    found = [autopilot.recv_match(blocking=True, timeout=5.0) for _ in range(4)]
+    autopilot.close()
+    assert [m.get_type() for m in found] == ["ODOMETRY", "GPS_INPUT"] * 2
+    assert [m.get_seq() for m in found] == [0, 1, 2, 3]
+    assert (found[0].x, found[0].y, found[0].z) == (0.0, 0.0, 0.0)  # the first pose is the origin
+    with pytest.raises(InvalidValueError, match="udpout"):
+        UdpLink("serial:/dev/ttyS0")
+
+
+def test_a_camera_that_looks_down_is_on_a_level_vehicle() -> None:
+    """The picture's top towards the nose, which heads 30 degrees east of north."""
+    heading = np.radians(HEADING_DEG)
+    ahead, up = np.array([np.sin(heading), np.cos(heading), 0.0]), np.array([0.0, 0.0, 1.0])
+    looks_down = Rotation.from_matrix(np.column_stack([-up, np.cross(up, ahead), ahead]))
+    found = decoded(MavlinkSender(("vision",)).pack(pose(turn=looks_down, mount="down"))[0])
+    np.testing.assert_allclose([found.roll, found.pitch, found.yaw], [0.0, 0.0, heading], atol=1e-5)
+
+
+def test_ros_messages_are_read_by_two_libraries(tmp_path: Path) -> None:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    made = messages(pose(), ORIGIN)
+    told = store.deserialize_cdr(made["/featuredb/pose"], "geometry_msgs/msg/PoseWithCovarianceStamped")
+    assert told.header.frame_id == "map"
+    assert (told.header.stamp.sec, told.header.stamp.nanosec) == (int(TIME_S), 250_000_000)
+    at, q = told.pose.pose.position, told.pose.pose.orientation
+    np.testing.assert_allclose([at.x, at.y, at.z], PLACE, atol=1e-6)
+    assert (Rotation.from_quat([q.x, q.y, q.z, q.w]) * body_from_angles().inv()).magnitude() < 1e-4
+    swap = [3, 4, 5, 0, 1, 2]
+    np.testing.assert_allclose(
+        told.pose.covariance.reshape(6, 6), GIVEN[np.ix_(swap, swap)], atol=1e-5
+    )  # over 345 m axes turn by 5e-5
+    fix = store.deserialize_cdr(made["/featuredb/fix"], "sensor_msgs/msg/NavSatFix")
+    np.testing.assert_allclose([fix.latitude, fix.longitude, fix.altitude], ORIGIN.geodetic_from_enu(PLACE))
+    np.testing.assert_allclose(fix.position_covariance.reshape(3, 3), GIVEN[3:, 3:])
+    assert fix.position_covariance_type == 3
+    (moved,) = store.deserialize_cdr(made["/tf"], "tf2_msgs/msg/TFMessage").transforms
+    assert (moved.header.frame_id, moved.child_frame_id) == ("map", "base_link")
+    np.testing.assert_allclose(
+        [getattr(moved.transform.translation, axis) for axis in "xyz"], PLACE, atol=1e-6
+    )
+
+    path = tmp_path / "run.mcap"
+    with McapLog(path, origin=ORIGIN) as log:
+        log.write(pose())
+        log.write(pose("unknown"))
+    read = {}
+    with path.open("rb") as file:
+        for _, channel, _, told in make_reader(
+            file, decoder_factories=[DecoderFactory()]
+        ).iter_decoded_messages():
+            read.setdefault(channel.topic, []).append(told)
+    assert {topic: len(found) for topic, found in read.items()} == dict.fromkeys(made, 2)
+    assert read["/featuredb/pose"][0].pose.pose.position.y == pytest.approx(345.0, abs=1e-6)
+    assert read["/tf"][1].transforms[0].child_frame_id == "base_link"
+    assert np.isnan(read["/featuredb/fix"][1].altitude)
+
+
+def test_nmea_says_place_and_standard_deviations() -> None:
+    gga, gst = sentences(pose("egm96"))
+    for line in (gga, gst):
+        body, _, checksum = line.strip()[1:].partition("*")
+        assert int(checksum, 16) == np.bitwise_xor.reduce(list(body.encode()))
+        assert line.endswith("\r\n")
+    cells = gga.split(",")
+    assert cells[0] == "$GPGGA"
+    assert cells[1] == "133000.25"
+    lat, lon, _ = ORIGIN.geodetic_from_enu(PLACE)
+    south, east = (
+        float(cells[2][:2]) + float(cells[2][2:]) / 60,
+        float(cells[4][:3]) + float(cells[4][3:]) / 60,
+    )
+    np.testing.assert_allclose([-south, east], [lat, lon], atol=1e-7)
+    assert (cells[3], cells[5]) == ("S", "E")
+    assert float(cells[9]) == pytest.approx(26.0, abs=0.02)
+    numbers = [float(cell) for cell in gst.partition("*")[0].split(",")[3:]]
+    east_m, north_m, up_m = np.sqrt(np.diag(GIVEN)[3:])
+    np.testing.assert_allclose(numbers[3:], [north_m, east_m, up_m], atol=1e-3)
+    turn = np.radians(numbers[2])
+    along = np.array([np.sin(turn), np.cos(turn)])  # the major axis, from north
+    assert along @ GIVEN[3:5, 3:5] @ along == pytest.approx(numbers[0] ** 2, rel=0.02)
+
+
+def test_answers_without_a_pose_are_passed_over_and_others_refused() -> None:
+    lost = json.dumps({"state": "lost", "position": None})
+    assert list(read_answers(io.StringIO(lost + "\n"), "forward", lambda: 0.0)) == []
+    for line in ("no JSON", '{"status": "localised"}'):
+        with pytest.raises(InvalidValueError, match="bridge: expected"):
+            list(read_answers([line], "forward", lambda: 0.0))

@@ -1,0 +1,82 @@
+"""GIS layers over photos: where they are drawn, what the scan hides, heights and reference systems."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.arrays import FloatArray
+from reloc.pixels.draw import draw_layer
+from reloc.pixels.layer import laid_on, read_layer
+from tests.support.scanned_map import EPSG, FRAME
+from tests.unit.test_locate_pixels import LENS, POSE, step, view_of
+
+CLOUD = step()
+
+
+def layer_file(folder: Path, geometry: dict[str, object], **more: object) -> Path:
+    feature = {"type": "Feature", "properties": {"name": "here"}, "geometry": geometry}
+    path = folder / "layer.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature], **more}))
+    return path
+
+
+def lon_lat(points: FloatArray) -> list[list[float]]:
+    return [[float(lon), float(lat)] for lat, lon, _ in FRAME.geodetic_from_enu(points)]
+
+
+def drawn(shapes: list, cloud: object = CLOUD) -> FloatArray:
+    """Pixels (n, 2), x and y, that the layer has changed in a black photo."""
+    black = np.zeros((LENS.height, LENS.width, 3), np.uint8)
+    picture = draw_layer(black, view_of(POSE), shapes, cloud)  # type: ignore[arg-type]
+    rows, columns = np.nonzero(picture.max(axis=2) > 100)
+    return np.column_stack([columns, rows]) + 0.5
+
+
+def test_a_line_without_heights_lies_on_the_scan_and_shows_where_the_camera_sees_it(tmp_path: Path) -> None:
+    ends = np.array([[-12.0, -4.0, 0.0], [0.0, 2.0, 0.0]])
+    shapes = laid_on(
+        read_layer(layer_file(tmp_path, {"type": "LineString", "coordinates": lon_lat(ends)})), FRAME, CLOUD
+    )
+    assert np.abs(shapes[0].points[:, 2]).max() < 0.1
+    expected = LENS.project(POSE.act(np.linspace(*ends, 200)))
+    found = drawn(shapes)
+    apart = np.linalg.norm(found[:, None] - expected, axis=2)
+    assert apart.min(axis=1).max() < 2.0
+    assert apart.min(axis=0).max() < 2.0  # from end to end
+
+
+def test_what_stands_before_a_line_hides_it(tmp_path: Path) -> None:
+    under = np.array([[9.0, -2.0], [9.0, 6.0]])  # beneath the slab
+    coordinates = [
+        [*place, h] for place, h in zip(lon_lat(np.column_stack([under, [0, 0]])), [520.0] * 2, strict=True)
+    ]
+    layer = read_layer(layer_file(tmp_path, {"type": "LineString", "coordinates": coordinates}))
+    shapes = laid_on(layer, FRAME, CLOUD)
+    assert abs(shapes[0].points[:, 2]).max() < 0.01  # its own heights, not the slab's
+    assert len(drawn(shapes)) == 0
+    assert len(drawn(shapes, None)) > 50
+
+
+def test_a_file_may_name_its_reference_system(tmp_path: Path) -> None:
+    place = np.array([-6.0, 1.5, 0.0])
+    lat, lon, _ = FRAME.geodetic_from_enu(place)
+    easting, northing = pyproj.Transformer.from_crs(4326, 25832, always_xy=True).transform(lon, lat)
+    crs = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+    file = layer_file(tmp_path, {"type": "Point", "coordinates": [easting, northing]}, crs=crs)
+    (shape,) = laid_on(read_layer(file), FRAME, CLOUD)
+    assert shape.is_point
+    assert shape.name == "here"
+    np.testing.assert_allclose(shape.points[0, :2], place[:2], atol=1e-3)
+    assert EPSG == 32632
+
+
+def test_layers_that_cannot_be_drawn_are_refused(tmp_path: Path) -> None:
+    flat = read_layer(layer_file(tmp_path, {"type": "Point", "coordinates": [11.5, 48.1]}))
+    with pytest.raises(InvalidValueError, match="expected heights, or a scan"):
+        laid_on(flat, FRAME, None)
+    with pytest.raises(InvalidValueError, match="Blob"):
+        read_layer(layer_file(tmp_path, {"type": "Blob", "coordinates": [11.5, 48.1]}))

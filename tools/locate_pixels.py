@@ -1,0 +1,190 @@
+"""What is at a pixel: places of the simulated town's pixels against the truth, and the bounds.
+
+    python -m tools.locate_pixels [--work DIR] [--inputs DIR] [--database DB] [--json FILE]
+
+1. A world with a scan is made, its photos become a map that is placed on the scan (tools/anchor_simworld.py).
+2. Each held-out photo is localised; pixels at random, of what stands still, are located on the scan.
+3. Bounds: poses and lenses are drawn around the truth as each answer's covariance says, and pixels located
+   from them. So the bounds are tested by themselves: one map has one error, which is in all of its answers.
+   What the scan's strips are off by is stated, as from a data sheet.
+
+Exit code 0.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import chi2
+
+from featuredb.adjust.block import whole_camera
+from featuredb.features.decode import DecodeLimits
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.rigid3 import Rigid3
+from featuredb.geometry.rotation import so3_exp
+from featuredb.simworld.camera.photograph import render_depth
+from featuredb.simworld.laser.scan_options import AirborneScanOptions
+from featuredb.simworld.town.scene import Scene, texture_index
+from featuredb.simworld.truth import TrueImage, Truth
+from featuredb.simworld.world import WorldOptions, town_of
+from featuredb.stage_clock import StageClock
+from featuredb.store import Database
+from reloc.localiser import Localiser
+from reloc.pixels.locate import PixelPlace, locate
+from reloc.pixels.surfaces import RaySurface, scan_surface
+from reloc.pixels.view import AnsweredView
+from reloc.service.handler import answer_query
+from reloc.wire.query import LocaliseWireRequest
+from tools.anchor_simworld import anchored, featuredb
+from tools.figures import add_json_option, write_figures
+from tools.worlds.scan_world import make_scan_world
+
+# In height, of one of two strips from their mean.
+_STRIPS_M = 0.5 * AirborneScanOptions().strip_shift_m / np.sqrt(2.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Miss:
+    """How far a place is off: `error_m` (3,), and its square in units of the covariance."""
+
+    error_m: FloatArray
+    squared: float
+    at_edge: bool
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    with tempfile.TemporaryDirectory() as scratch:
+        work = args.work or Path(scratch)
+        world = make_scan_world(
+            (args.inputs or work) / f"scan-world-short-{args.seed}", args.seed, "short", 0
+        )
+        path = args.database
+        if path is None:
+            featuredb("ingest", "photos", str(work / "mapped"), str(world.world.folder / "drone"), "--quiet")
+            path = anchored(work, work / "mapped", world, other=False)[0]
+        database = Database.open(path)
+        scene, truth = town_of(WorldOptions.short(args.seed)), world.world.truth
+        rng = np.random.default_rng(args.seed)
+        localiser = Localiser.open(database)
+        answered: list[Miss] = []
+        drawn: list[Miss] = []
+        refused = 0
+        for photo in truth.group("queries"):
+            data = (world.world.folder / photo.name).read_bytes()
+            view = _view(localiser, data)
+            if view is None:
+                continue
+            surface = scan_surface(database, view)
+            assert surface is not None
+            surface.common_m = _STRIPS_M
+            target = _Target(scene, truth, photo, view)
+            pixels = target.pixels(rng, args.pixels)
+            found = _misses(target, pixels, locate(view, surface, pixels))
+            answered += found
+            refused += len(pixels) - len(found)
+            for _ in range(args.draws):
+                drawn += target.drawn(rng, surface, args.pixels // 5)
+    figures = _figures("answered", answered) | _figures("drawn", drawn)
+    figures |= {"refused": refused, "located": len(answered), "draws": len(drawn)}
+    write_figures(args.json, figures)
+    sys.stdout.write("\n".join(f"{name} {value:.4g}" for name, value in figures.items()) + "\n")
+    return 0
+
+
+class _Target:
+    """A photo whose every pixel has a true place, in the frame of its answer."""
+
+    def __init__(self, scene: Scene, truth: Truth, photo: TrueImage, view: AnsweredView) -> None:
+        self.camera = photo.camera
+        self.cam_from_local = photo.cam_from_local @ truth.frame.enu_from(view.frame)
+        self.view = view
+        rendered = render_depth(scene, photo.camera, photo.cam_from_local)
+        self.depth = rendered.depth
+        cars = scene.faces.object_id[scene.faces.texture == texture_index("car")]
+        self.still = np.isfinite(self.depth) & ~np.isin(rendered.object_id, np.unique(cars))
+
+    def pixels(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Centres (count, 2) of pixels that show what stands in both, photo and scan."""
+        rows, columns = np.nonzero(self.still)
+        chosen = rng.choice(len(rows), count, replace=False)
+        return np.column_stack([columns[chosen], rows[chosen]]) + 0.5
+
+    def places(self, pixels: FloatArray) -> FloatArray:
+        """(n, 3) true places."""
+        depth = self.depth[pixels[:, 1].astype(int), pixels[:, 0].astype(int)].astype(np.float64)
+        rays = np.column_stack([self.camera.unproject(pixels), np.ones(len(pixels))])
+        return self.cam_from_local.inverse().act(rays * depth[:, None])
+
+    def drawn(self, rng: np.random.Generator, surface: RaySurface, count: int) -> list[Miss]:
+        """Misses from a pose and a lens that are off as the answer's covariance says."""
+        error = rng.multivariate_normal(np.zeros(len(self.view.covariance)), self.view.covariance)
+        local_from_cam = self.cam_from_local.inverse()
+        turned = so3_exp(error[:3]).T @ local_from_cam.rotation
+        pose = Rigid3(rotation=turned, translation=local_from_cam.translation - error[3:6]).inverse()
+        camera = whole_camera(self.camera) if len(error) > 6 else self.view.camera
+        if len(error) > 6:
+            camera = replace(camera, params=tuple(np.array(camera.params) - error[6:]))
+        view = replace(self.view, camera=camera, cam_from_local=pose)
+        pixels = self.pixels(rng, count)
+        return _misses(self, pixels, locate(view, surface, pixels))
+
+
+def _misses(target: _Target, pixels: FloatArray, found: Sequence[PixelPlace]) -> list[Miss]:
+    misses = []
+    for place, true in zip(found, target.places(pixels), strict=True):
+        if place.utm is None or place.covariance is None:
+            continue
+        error = target.view.frame.enu_from_utm(place.utm, place.epsg) - true
+        squared = float(error @ np.linalg.solve(place.covariance, error))
+        misses.append(Miss(error_m=error, squared=squared, at_edge=place.at_edge))
+    return misses
+
+
+def _figures(name: str, misses: Sequence[Miss]) -> dict[str, float]:
+    far = np.array([np.linalg.norm(miss.error_m) for miss in misses])
+    edge = np.array([miss.at_edge for miss in misses])
+    squared = np.array([miss.squared for miss in misses])
+    inside = {share: squared < chi2.ppf(share / 100, 3) for share in (68, 95)}
+    return {
+        f"{name}_median_m": float(np.median(far)),
+        f"{name}_clear_95_m": float(np.quantile(far[~edge], 0.95)),
+        f"{name}_68": float(inside[68][~edge].mean()),
+        f"{name}_95": float(inside[95][~edge].mean()),
+        f"{name}_edges": float(edge.mean()),
+        f"{name}_edge_95": float(inside[95][edge].mean()),
+    }
+
+
+def _view(localiser: Localiser, data: bytes) -> AnsweredView | None:
+    reply = answer_query(
+        data,
+        LocaliseWireRequest(),
+        localiser,
+        limits=DecodeLimits(),
+        request_id="locate",
+        clock=StageClock(),
+    )
+    return AnsweredView.of_reply(reply) if reply.status == "localised" else None
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--pixels", type=int, default=60, help="of each photo")
+    parser.add_argument("--draws", type=int, default=16, help="of a pose and a lens for each photo")
+    parser.add_argument("--work", type=Path, default=None, help="keep databases there")
+    parser.add_argument("--inputs", type=Path, default=None, help="keep the world there, not in --work")
+    parser.add_argument(
+        "--database", type=Path, default=None, help="of the world, placed on its scan already"
+    )
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
