@@ -21,11 +21,9 @@ def hill_map(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def hill_work(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A work folder of its own, with the features and matches of these photos."""
-    folder = tmp_path_factory.mktemp("work")
-    for done in ("features", "matches"):
-        shutil.copytree(hill_map(tmp_path_factory) / "db" / "_work" / done, folder / done)
-    return folder
+    """A work folder of its own with all that was done for this map."""
+    folder = tmp_path_factory.mktemp("hills") / "work"
+    return Path(shutil.copytree(hill_map(tmp_path_factory) / "db" / "_work", folder))
 
 
 def _make(folder: Path) -> None:
