@@ -11,20 +11,20 @@ import requests
 from playwright.sync_api import Browser, Page
 
 from featuredb.features.decode import INGEST_LIMITS, decode_gray
-from featuredb.features.extractor import ExtractorOptions
+from featuredb.geometry.sim3 import Sim3
 from featuredb.lidar.add import add_scan
 from featuredb.store import Database
 from ingest.anchoring import AnchorRequest
-from ingest.pipeline import IngestOptions, ingest_photos
-from ingest.reconstruction import MapMakingOptions
 from ingest.register.picks_page.server import create_app
 from ingest.register.picks_page.session import PickSession
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.viewer.server import listen, uvicorn_server
 from tests.browser.test_viewer import browser as browser
-from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos
+from tests.support.hill_map import hill_map
+from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos
 from tests.support.hill_scan import write_hill_scan
+from tests.support.maps import without_place
 
 pytestmark = pytest.mark.slow
 OFFSET = np.array([1.5, -1.0, 8.0])
@@ -33,15 +33,16 @@ SPOTS = [(0.2, 0.2), (0.8, 0.22), (0.78, 0.8), (0.22, 0.78), (0.5, 0.4), (0.45, 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> PickSession:
-    root = tmp_path_factory.mktemp("picks")
-    write_hill_photos(root / "photos", with_gps=False)
+    made, root = hill_map(tmp_path_factory), tmp_path_factory.mktemp("picks")
+    (summary,) = Database.open(made / "db").snapshot().maps()
+    placed = Database.open(made / "db").snapshot().load_map(summary.map_id)
+    turn = Sim3.exp(np.array([0.3, 0.2, -0.1, 2.0, 5.0, -9.0, 4.0]))
     database = Database.create(root / "db")
-    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1000)))
-    ingest_photos(database, root / "photos", options)
+    database.commit_map(without_place(placed, turn))
     add_scan(database, [write_hill_scan(root / "s.laz", offset_m=tuple(OFFSET), texture_seed=1)])
     snapshot = database.snapshot()
     (summary,) = snapshot.unplaced_maps()
-    request = AnchorRequest(map_id=summary.map_id, photos=root / "photos", out=root / "out")
+    request = AnchorRequest(map_id=summary.map_id, photos=made / "photos", out=root / "out")
     return PickSession(database, request, snapshot.load_any(summary.map_id))
 
 

@@ -3,7 +3,7 @@
 import argparse
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,6 @@ import pytest
 
 from featuredb.cli.main import main
 from featuredb.errors import ConflictError, RegistrationError
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.lidar.add import add_scan
@@ -22,13 +21,14 @@ from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.cli.anchor import summary
-from ingest.pipeline import IngestOptions, ingest_photos
-from ingest.reconstruction import MapMakingOptions
+from ingest.register.anchor import frames
 from ingest.register.anchor.anchor_map import AnchorOptions
 from schemas import load_schema
-from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos, write_hill_photos
+from tests.support.hill_map import hill_map
+from tests.support.hill_photos import CAMERA, FRAME, hill_height, hill_photos
 from tests.support.hill_scan import EPSG, write_hill_scan
 from tests.support.maps import random_map
+from tests.support.remembered import remembered
 
 # Where the scan lies from where the photos' GPS has the hills: a drone's usual error, heights most of all.
 OFFSET = np.array([1.5, -1.0, 8.0])
@@ -37,17 +37,21 @@ OFFSET = np.array([1.5, -1.0, 8.0])
 @pytest.fixture(scope="module")
 def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """Folder of photos, a database with their map and the scan, and one with another field's scan."""
-    root = tmp_path_factory.mktemp("anchor")
-    write_hill_photos(root / "photos")
-    plain = Database.create(root / "plain")
-    options = IngestOptions(workers=1, making=MapMakingOptions(extractor=ExtractorOptions(max_features=1000)))
-    report = ingest_photos(plain, root / "photos", options)
-    assert [m.status for m in report.maps] == ["committed"]
+    made, root = hill_map(tmp_path_factory), tmp_path_factory.mktemp("anchor")
+    shutil.copytree(made / "db", root / "plain", ignore=shutil.ignore_patterns("_work"))
     for name, seed in (("right", 1), ("wrong", 7)):
         shutil.copytree(root / "plain", root / name)
         scan = write_hill_scan(root / f"{name}.laz", offset_m=tuple(OFFSET), texture_seed=seed)
         add_scan(Database.open(root / name), [scan])
-    return root / "photos", root / "right", root / "wrong"
+    return made / "photos", root / "right", root / "wrong"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _frames_registered_once() -> Iterator[None]:
+    """Several tests begin with the same frame of the same map on the same scan."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(frames, "register_frame", remembered(frames.register_frame))
+        yield
 
 
 @pytest.fixture

@@ -25,7 +25,8 @@ from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from ingest.report.values import IngestReport
-from tests.support.hill_photos import FRAME, HillPhoto, write_hill_photos
+from tests.support.hill_map import MAKING, hill_map, hill_work
+from tests.support.hill_photos import FRAME, HillPhoto, hill_photos, write_hill_photos
 
 _OPTIONS = IngestOptions(
     workers=1,
@@ -170,14 +171,13 @@ def _write_table(folder: Path, photos: list[HillPhoto], path: Path, *, owner: st
 
 @pytest.mark.parametrize(("trust", "status"), [(False, "quarantined"), (True, "active")])
 def test_positions_of_a_table_place_active_maps_only_when_they_are_trusted(
-    trust: bool, status: str, work: Path, tmp_path: Path
+    trust: bool, status: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    photos = write_hill_photos(tmp_path / "photos")
     table = tmp_path / "site.csv"
-    _write_table(tmp_path / "photos", photos, table, owner="Ann")
+    _write_table(hill_map(tmp_path_factory) / "photos", hill_photos(), table, owner="Ann")
     database = Database.create(tmp_path / "db")
-    making = replace(_OPTIONS.making, clusters=ClusterOptions())
-    options = IngestOptions(workers=1, making=making, scan=ScanOptions(trust_geotags=trust), work=work)
+    work, scan = hill_work(tmp_path_factory), ScanOptions(trust_geotags=trust)
+    options = IngestOptions(workers=1, making=MAKING, scan=scan, work=work)
     report = ingest_photos(database, table, options)
     assert report.count("registered") == 9
     found = _only_map(database)

@@ -20,11 +20,11 @@ from featuredb.store.maintenance import VacuumOptions, vacuum
 from featuredb.store.tables import CANARIES, CANDIDATE_IMAGES, SPECS
 from featuredb.store.verify import verify
 from tests.support.contributions import contribution, find_candidate, load_image
-from tests.support.growth_suite import GrowthSuite
+from tests.support.growth_suite import DecisionsSuite
 from tests.support.store_suite import NOTHING_KEPT, Place
 
 
-class TestLocalInbox(GrowthSuite):
+class TestLocalInbox(DecisionsSuite):
     @pytest.fixture
     def place(self, tmp_path: Path) -> Place:
         return Place(url=str(tmp_path / "maps.db"))

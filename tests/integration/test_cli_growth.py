@@ -1,6 +1,7 @@
 """The commands `lineage` and `candidates` on a database with a family of maps and an inbox."""
 
 import json
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -30,10 +31,11 @@ def grown(seed: int, map_id: str, parents: tuple[str, ...], drift_m: float | Non
     return replace(made, placement=replace(made.placement, evidence=evidence))
 
 
-@pytest.fixture
-def db(tmp_path: Path) -> str:
+@pytest.fixture(scope="module")
+def family(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Correspondences a and z; b on a, c on b, d on c and z; q in quarantine, r retired."""
-    database = Database.create(tmp_path / "town.db")
+    folder = tmp_path_factory.mktemp("family") / "town.db"
+    database = Database.create(folder)
     database.commit_maps([random_map(1, map_id="a"), random_map(2, map_id="z")])
     database.commit_map(grown(3, "b", ("a",), 0.1))
     database.commit_map(grown(4, "c", ("b",), 0.312))
@@ -41,7 +43,13 @@ def db(tmp_path: Path) -> str:
     database.commit_maps([grown(6, "q", ("b",)), grown(7, "r", ("b",))])
     database.set_status(["q"], "quarantined", "one owner only")
     database.retire("r", "look-alike block")
-    return str(tmp_path / "town.db")
+    return folder
+
+
+@pytest.fixture
+def db(family: Path, tmp_path: Path) -> str:
+    """A copy of the family."""
+    return str(shutil.copytree(family, tmp_path / "town.db"))
 
 
 def run(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str, str]:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from featuredb.features.extractor import ExtractorOptions
+from ingest.cli import video
 from ingest.register.anchor import frames
 from tests.support.doc_commands import (
     ROOT,
@@ -51,6 +53,7 @@ PYTHON_NOT_RUN = {
 }
 # The page that makes the database; the others begin with what it leaves.
 _FIRST = "README.md"
+_FEATURES = 1500  # of a photo
 _LANGUAGES = {"sh", "python", "sql", "json", "text"}
 
 _TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in pages()}
@@ -99,9 +102,12 @@ def in_short() -> Iterator[None]:
     """Commands start no workers, which take long, and what the same photo gave before is not sought anew.
 
     README.md and docs/anchoring.md register the same frames on the same scan, with and without a person.
+    A map of few features is adjusted and compared sooner; how good it is, the demo says.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("os.cpu_count", lambda: 1)
+        patch.setitem(ExtractorOptions.__init__.__kwdefaults__, "max_features", _FEATURES)
+        patch.setattr(video, "_FEATURES", _FEATURES)
         patch.setattr(frames, "register_frame", remembered(frames.register_frame))
         yield
 

@@ -45,6 +45,7 @@ from tests.support.made_once import made_once
 
 _EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
 _AWAY_M = WEST_M + 90.0  # and there nothing of it
+_Prepared = tuple[Path, Path, GrowthReport]
 
 
 @pytest.fixture(scope="module")
@@ -66,19 +67,26 @@ def shots() -> list[Shot]:
 
 
 @pytest.fixture(scope="module")
-def given(anchored: Path, shots: list[Shot], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The anchored database with all six photos waiting, and their features and matches done."""
-    folder = tmp_path_factory.mktemp("given") / "db"
-    shutil.copytree(anchored, folder)
-    database = Database.open(folder)
-    give(database, shots)
-    scratch = folder.parent / "scratch"
-    shutil.copytree(folder, scratch)
-    grow_candidates(Database.open(scratch), growing())
-    for part in ("features", "matches", "jobs", "candidates"):
-        if (scratch / "_work" / part).is_dir():
-            shutil.copytree(scratch / "_work" / part, folder / "_work" / part, dirs_exist_ok=True)
-    return folder
+def prepared(anchored: Path, shots: list[Shot], tmp_path_factory: pytest.TempPathFactory) -> _Prepared:
+    folder = tmp_path_factory.mktemp("given")
+    shutil.copytree(anchored, folder / "given")
+    give(Database.open(folder / "given"), shots)
+    shutil.copytree(folder / "given", folder / "grown")
+    report = grow_candidates(Database.open(folder / "grown"), growing())
+    shutil.copytree(folder / "grown" / "_work", folder / "given" / "_work", dirs_exist_ok=True)
+    return folder / "given", folder / "grown", report
+
+
+@pytest.fixture
+def given(prepared: _Prepared) -> Path:
+    """The anchored database with all six photos waiting, and all work done up to their models."""
+    return prepared[0]
+
+
+@pytest.fixture
+def grown(prepared: _Prepared) -> tuple[Path, GrowthReport]:
+    """What a run has made of it."""
+    return prepared[1:]
 
 
 def _copy(folder: Path, to: Path) -> Database:
@@ -133,9 +141,8 @@ def _described(database: Database, map_id: str) -> float:
     return len(np.unique(seen.point_index[seen.has_descriptor])) / len(found.points)
 
 
-def test_two_owners_at_once_are_promoted_in_one_run(given: Path, tmp_path: Path, shots: list[Shot]) -> None:
-    database = _copy(given, tmp_path)
-    report = grow_candidates(database, growing())
+def test_two_owners_at_once_are_promoted_in_one_run(grown: tuple[Path, GrowthReport], tmp_path: Path) -> None:
+    database, report = _copy(grown[0], tmp_path), grown[1]
     assert report.count("promoted") == 6
     assert report.rounds == 2
     entry = report.maps[0]
@@ -172,9 +179,9 @@ def test_beyond_the_budget_nothing_is_taken_and_photos_wait(given: Path, tmp_pat
     assert grow_candidates(database, growing()).count("promoted") == 6
 
 
-def test_a_map_that_was_retired_does_not_come_back(given: Path, tmp_path: Path) -> None:
-    database = _copy(given, tmp_path)
-    map_id = grow_candidates(database, growing()).promoted[0]
+def test_a_map_that_was_retired_does_not_come_back(grown: tuple[Path, GrowthReport], tmp_path: Path) -> None:
+    database = _copy(grown[0], tmp_path)
+    map_id = grown[1].promoted[0]
     database.retire(map_id, "the photos are not ours")
     assert set(_states(database).values()) == {"waiting"}
     report = grow_candidates(database, growing())

@@ -7,29 +7,26 @@ import numpy as np
 import pytest
 
 from featuredb.cli.main import main
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.store import Database
 from ingest.map_builder import MapOptions
 from ingest.pipeline import IngestOptions, ingest_photos
 from ingest.reconstruction import MapMakingOptions
 from ingest.sfm.mapper import SfmOptions
-from tests.support.hill_photos import FRAME, HillPhoto, hill_height, write_hill_photos
+from tests.support.hill_map import MAKING, hill_map, hill_work
+from tests.support.hill_photos import FRAME, HillPhoto, hill_height, hill_photos, write_hill_photos
 
-_EXTRACTOR = ExtractorOptions(max_features=1000)
-_MAKING = MapMakingOptions(extractor=_EXTRACTOR)
-_TRUTH = IngestOptions(workers=1, gps_sigma_m=(0.02, 0.02), making=_MAKING)
+_TRUTH = IngestOptions(workers=1, gps_sigma_m=(0.02, 0.02), making=MAKING)
 
 
 @pytest.fixture(scope="module")
 def hills(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[HillPhoto]]:
-    folder = tmp_path_factory.mktemp("hills")
-    return folder, write_hill_photos(folder)
+    return hill_map(tmp_path_factory) / "photos", hill_photos()
 
 
 @pytest.fixture(scope="module")
 def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where features and matches are kept for the next test with the same photos."""
-    return tmp_path_factory.mktemp("work")
+    return hill_work(tmp_path_factory)
 
 
 def test_map_agrees_with_the_truth(hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path) -> None:
@@ -63,7 +60,7 @@ def test_only_long_tracks_carry_descriptors(
         workers=1,
         gps_sigma_m=(0.02, 0.02),
         work=work,
-        making=MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(min_track_length=4)),
+        making=MapMakingOptions(extractor=MAKING.extractor, maps=MapOptions(min_track_length=4)),
     )
     database = Database.create(tmp_path / "db")
     report = ingest_photos(database, hills[0], options)
@@ -84,7 +81,7 @@ def test_only_long_tracks_carry_descriptors(
 def test_photos_without_gps_become_a_map_without_a_place(tmp_path: Path) -> None:
     write_hill_photos(tmp_path / "photos", columns=2, rows=2, with_gps=False)
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=MAKING))
     assert [(m.status, m.reason_code, m.photos) for m in report.maps] == [("unplaced", "TOO_FEW", 4)]
     assert {(p.status, p.reason_code) for p in report.photos} == {("unplaced", "too_few")}
     snapshot = database.snapshot()
@@ -97,7 +94,7 @@ def test_photos_without_gps_become_a_map_without_a_place(tmp_path: Path) -> None
     centers = np.array([image.cam_from_local.center for image in unplaced.images])
     distances = np.linalg.norm(unplaced.points.xyz[seen.point_index] - centers[seen.image_id], axis=1)
     assert np.median(distances) == pytest.approx(50.0, rel=0.02)
-    again = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    again = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=MAKING))
     assert [m.map_id for m in again.maps] == [summary.map_id]
     assert len(database.snapshot().unplaced_maps()) == 1
 
@@ -160,7 +157,7 @@ def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
     for seed in (1, 2, 3):
         write_hill_photos(tmp_path / "photos", columns=1, rows=1, texture_seed=seed, prefix=f"p{seed}")
     database = Database.create(tmp_path / "db")
-    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=_MAKING))
+    report = ingest_photos(database, tmp_path / "photos", IngestOptions(workers=1, making=MAKING))
     assert report.maps == ()
     assert report.verified_pairs == 0
     assert {p.reason_code for p in report.photos} == {"no_matches"}
@@ -170,7 +167,7 @@ def test_unrelated_photos_give_no_map_and_say_why(tmp_path: Path) -> None:
 def test_a_kept_focal_length_is_that_of_exif(
     hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
 ) -> None:
-    making = MapMakingOptions(extractor=_EXTRACTOR, sfm=SfmOptions(refine_focal=False))
+    making = MapMakingOptions(extractor=MAKING.extractor, sfm=SfmOptions(refine_focal=False))
     database = Database.create(tmp_path / "db")
     report = ingest_photos(database, hills[0], replace(_TRUTH, making=making, work=work))
     (camera,) = report.maps[0].cameras
@@ -181,7 +178,7 @@ def test_a_kept_focal_length_is_that_of_exif(
 def test_a_map_without_a_good_point_is_refused(
     hills: tuple[Path, list[HillPhoto]], work: Path, tmp_path: Path
 ) -> None:
-    making = MapMakingOptions(extractor=_EXTRACTOR, maps=MapOptions(max_sigma_over_distance=1e-9))
+    making = MapMakingOptions(extractor=MAKING.extractor, maps=MapOptions(max_sigma_over_distance=1e-9))
     database = Database.create(tmp_path / "db")
     report = ingest_photos(database, hills[0], replace(_TRUTH, making=making, work=work))
     assert [(m.status, m.reason_code) for m in report.maps] == [("refused", "NO_POINTS")]

@@ -10,7 +10,7 @@ from ingest.reconstruction import MapMakingOptions, reconstruct_photos
 from ingest.sfm.mapper import SfmOptions
 from ingest.workspace import Workspace
 
-pytestmark = [pytest.mark.real_data, pytest.mark.slow]
+pytestmark = [pytest.mark.real_data, pytest.mark.evaluation]
 
 
 def test_strangers_photos_without_exif(shared_data: Path, tmp_path: Path) -> None:

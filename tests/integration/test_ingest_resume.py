@@ -19,6 +19,7 @@ from featuredb.store.encode import content_digest
 from featuredb.store.verify import verify
 from tests.conftest import REPOSITORY
 from tests.support.hill_photos import write_hill_photos
+from tests.support.ingest_command import run
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +37,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def whole(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The database of an ingest that nothing disturbed."""
     database = tmp_path_factory.mktemp("undisturbed") / "db"
-    assert _start(database, photos).wait(_TIMEOUT_S) == 0
+    assert run(_words(database, photos)) == 0
     return database
 
 
@@ -45,12 +46,15 @@ def undisturbed(whole: Path) -> FeatureMap:
     return _only_map(whole)
 
 
-def _start(database: Path, photos: Path, *more: str, workers: int = 2) -> "subprocess.Popen[bytes]":
+def _words(database: Path, photos: Path, *more: str, workers: int = 1) -> list[str]:
+    words = ["ingest", "photos", str(database), str(photos), "--workers", str(workers), "--quiet"]
+    return [*words, "--max-features", "800", "--gps-sigma", "0.02", *more]
+
+
+def _start(database: Path, photos: Path, workers: int = 1) -> "subprocess.Popen[bytes]":
     """The command in a process group of its own. Starting workers is most of its time."""
-    command = [sys.executable, "-m", "tests.support.ingest_command", "ingest", "photos", str(database)]
-    command += [str(photos), "--workers", str(workers), "--max-features", "800", "--gps-sigma", "0.02"]
     return subprocess.Popen(
-        [*command, "--quiet", *more],
+        [sys.executable, "-m", "tests.support.ingest_command", *_words(database, photos, workers=workers)],
         cwd=REPOSITORY,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         stdout=subprocess.DEVNULL,
@@ -132,7 +136,7 @@ def test_killed_at_a_stage(
     assert len(visible) <= (1 if committed or not killed else 0) or pattern.startswith("points/")
     if visible:
         _assert_same(_only_map(database), undisturbed)
-    assert _start(database, photos, workers=1).wait(_TIMEOUT_S) == 0
+    assert run(_words(database, photos)) == 0
     _assert_same(_only_map(database), undisturbed)
     assert verify(Database.open(database)).ok
 
@@ -144,14 +148,14 @@ def test_killed_again_and_again_at_random(
 ) -> None:
     database, random_times = tmp_path / "db", random.Random(seed)
     for _ in range(3):
-        process = _start(database, photos)
+        process = _start(database, photos, workers=2)
         try:
             process.wait(random_times.uniform(0.5, 6.0))
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
             _wait_for_workers(process.pid)
-    assert _start(database, photos, workers=1).wait(_TIMEOUT_S) == 0
+    assert run(_words(database, photos)) == 0
     _assert_same(_only_map(database), undisturbed)
     assert verify(Database.open(database)).ok
 
@@ -160,9 +164,9 @@ def test_killed_again_and_again_at_random(
 def test_stopped_after_each_stage(photos: Path, undisturbed: FeatureMap, tmp_path: Path) -> None:
     database = tmp_path / "db"
     for stage in ("scan", "extract", "match", "reconstruct", "build"):
-        assert _start(database, photos, "--stop-after", stage, workers=1).wait(_TIMEOUT_S) == 0
+        assert run(_words(database, photos, "--stop-after", stage)) == 0
         assert not Database.open(database).snapshot().maps()
-    assert _start(database, photos, workers=1).wait(_TIMEOUT_S) == 0
+    assert run(_words(database, photos)) == 0
     _assert_same(_only_map(database), undisturbed)
 
 
@@ -170,8 +174,9 @@ def test_two_ingests_at_once_both_land(photos: Path, undisturbed: FeatureMap, tm
     other = tmp_path / "other"
     write_hill_photos(other, columns=2, rows=2, texture_seed=5, east_m=300.0)
     database = tmp_path / "db"
-    processes = [_start(database, folder, workers=1) for folder in (photos, other, photos)]
-    assert [p.wait(_TIMEOUT_S) for p in processes] == [0, 0, 0]
+    processes = [_start(database, folder) for folder in (photos, other)]
+    assert run(_words(database, photos)) == 0
+    assert [p.wait(_TIMEOUT_S) for p in processes] == [0, 0]
     opened = Database.open(database)
     maps = {m.map_id: m for m in opened.snapshot().maps()}
     assert sorted(m.images for m in maps.values()) == [4, 6]

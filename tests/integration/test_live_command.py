@@ -21,7 +21,7 @@ from tests.support.live import LENS, error_m, frame, localiser
 from tests.support.planar_map import CAMERA
 from tests.support.service import running_server
 
-_FRAMES, _RATES_HZ = 60, (15.0, 5.0, 1.5)
+_FRAMES, _RATES_HZ = 40, (15.0, 5.0, 1.5)
 _LENS = f"{CAMERA.model},{CAMERA.width},{CAMERA.height},{','.join(map(str, CAMERA.params))}"
 
 

@@ -1,17 +1,20 @@
 """A bad map that got in is taken out again: every answer is, bit for bit, what it was before."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from featuredb.features.extractor import extract
 from featuredb.maps.feature_map import FeatureMap, GeoPrior
 from featuredb.store import Database
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
+from tests.support.remembered import remembered
 
 _LIE_EAST_M = 6.0  # the same field once more, so far from where it is
 pytestmark = pytest.mark.slow
@@ -74,6 +77,14 @@ def answers(localiser: Localiser, queries: list[tuple[Any, LocaliseRequest]]) ->
             told[-1]["cam_from_local"] = result.pose.cam_from_local.matrix().tobytes()
             told[-1]["covariance_bits"] = result.pose.covariance.tobytes()
     return told
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _features_found_once() -> Iterator[None]:
+    """The same photos are asked for again and again; only what is found for them may differ."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("reloc.localise.localise.extract", remembered(extract))
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -59,7 +59,9 @@ def test_photos_without_metadata_share_no_camera(shared_data: Path) -> None:
     assert {p.camera_key for p in usable} == {""}
 
 
-@pytest.mark.parametrize("name", ["brighton", "lewis", "copr"])
+@pytest.mark.parametrize(
+    "name", ["lewis", *(pytest.param(name, marks=pytest.mark.evaluation) for name in ("brighton", "copr"))]
+)
 def test_true_neighbours_are_farther_than_any_copy(shared_data: Path, name: str) -> None:
     grays = [decode_gray(path) for path in sorted((shared_data / name / "images").iterdir())[:18]]
     hashes = hash_bits([picture_hash(gray) for gray in grays])

@@ -23,7 +23,7 @@ from tools.worlds.film_world import (
 )
 from tools.worlds.flight_path import FlightPath, PathOptions
 
-_WORLD = WorldOptions.short(1)
+_WORLD = replace(WorldOptions.short(1), town_size_m=(180.0, 160.0))
 _OPTIONS = FilmOptions(
     world=_WORLD,
     path=PathOptions(half_extent_m=(30.0, 25.0)),

@@ -226,7 +226,9 @@ def test_the_command_writes_scan_and_ortho(
     monkeypatch.setattr(
         scan_world,
         "write_lidar",
-        lambda folder, world, note: write_lidar(folder, world, note, scan=SCAN, ortho=ORTHO),
+        lambda folder, world, note: write_lidar(
+            folder, world, note, scan=replace(SCAN, density_per_m2=0.2), ortho=replace(ORTHO, pixel_m=2.0)
+        ),
     )
     assert args.run(args) == 0
     said = capsys.readouterr()
@@ -234,4 +236,4 @@ def test_the_command_writes_scan_and_ortho(
         assert (tmp_path / "w" / name).stat().st_size > 0
         assert name in " ".join(said.out.split())
     with rasterio.open(tmp_path / "w" / "ortho.tif") as ortho:
-        assert ortho.res == (0.5, 0.5)
+        assert ortho.res == (2.0, 2.0)

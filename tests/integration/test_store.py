@@ -10,10 +10,10 @@ from deltalake import DeltaTable
 from featuredb.errors import DatabaseNotFoundError, StoreError
 from featuredb.store import Database
 from tests.support.maps import assert_same_map, random_map
-from tests.support.store_suite import Place, StoreSuite
+from tests.support.store_suite import ChangesSuite, Place
 
 
-class TestLocalStore(StoreSuite):
+class TestLocalStore(ChangesSuite):
     @pytest.fixture
     def place(self, tmp_path: Path) -> Place:
         return Place(url=str(tmp_path / "maps.db"))

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.growth_suite import GrowthSuite
+from tests.support.growth_suite import DecisionsSuite, GrowthSuite
 from tests.support.maps import random_map
 from tests.support.s3_server import BUCKET, ceph_gateway, missing_ceph_programs, moto_server
-from tests.support.store_suite import Place, StoreSuite
+from tests.support.store_suite import ChangesSuite, Place, StoreSuite
 
 pytestmark = [pytest.mark.s3, pytest.mark.slow]
 
@@ -42,7 +42,7 @@ def moto() -> Iterator[dict[str, str]]:
         yield options
 
 
-class TestCephStore(StoreSuite):
+class TestCephStore(ChangesSuite):
     """Ceph's Object Gateway: a production object store."""
 
     @pytest.fixture
@@ -70,3 +70,13 @@ class TestMotoInbox(GrowthSuite):
     @pytest.fixture
     def place(self, moto: dict[str, str]) -> Place:
         return _new_place(moto)
+
+
+@pytest.mark.evaluation
+class TestMotoChanges(ChangesSuite, TestMotoStore):
+    """Changes are the same code on a local disk, where each run of the tests asks."""
+
+
+@pytest.mark.evaluation
+class TestMotoDecisions(DecisionsSuite, TestMotoInbox):
+    """As `TestMotoChanges`."""

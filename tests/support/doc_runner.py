@@ -136,6 +136,7 @@ class PageRun:
                 env=self._environment(),
                 stdout=log,
                 stderr=subprocess.STDOUT,
+                preexec_fn=_on_one_core if call.program == "dask" else None,
             )
         kind = _kind(command)
         sign = _SERVING[kind] if kind is not None else None
@@ -167,6 +168,11 @@ class PageRun:
     def _environment(self) -> dict[str, str]:
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         return {**os.environ, "PATH": path, "HOME": str(self.folder / "home"), "BROWSER": "true"}
+
+
+def _on_one_core() -> None:
+    """So that Dask has one worker: each begins with seconds of imports."""
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
 def _needs_shell(text: str) -> bool:

@@ -83,45 +83,6 @@ class GrowthSuite:
         assert counts.waiting_by_owner == {"Ada": 1}
         assert counts.stored_bytes == found.size_bytes
 
-    def test_used_counts_while_the_map_lives(self, database: Database) -> None:
-        ids = contribute(database, [contribution(1), contribution(2)])
-        mark_used(database, ids, "map-1")
-        assert count_candidates(database).by_state == {"waiting": 2}, "the map is not there yet"
-        version = database.commit_map(random_map(1)).version
-        assert find_candidate(database, ids[0]).used_by == ("map-1",)
-        assert count_candidates(database).by_state == {"used": 2}
-        database.set_status(["map-1"], "quarantined", "one owner only")
-        assert count_candidates(database).by_state == {"used": 2}
-        database.retire("map-1", "wrong")
-        assert count_candidates(database).by_state == {"waiting": 2}
-        database.rollback(version)
-        assert count_candidates(database).by_state == {"used": 2}
-        database.rollback(0)
-        assert count_candidates(database).by_state == {"waiting": 2}
-        assert [c.state for c in list_candidates(database, snapshot=database.snapshot(version))] == [
-            "used"
-        ] * 2
-
-    def test_refused_reopened_and_unknown(self, database: Database) -> None:
-        (one,) = contribute(database, [contribution(1)])
-        refuse(database, {one: ("ALTERED", "its bytes were edited")})
-        found = find_candidate(database, one)
-        assert (found.state, found.reason_code, found.reason) == (
-            "refused",
-            "ALTERED",
-            "its bytes were edited",
-        )
-        reopen(database, [one], "the editor was the owner")
-        assert [c.candidate_id for c in list_candidates(database, state="waiting")] == [one]
-        before = list_candidates(database)
-        with pytest.raises(StoreError, match="expected a reason code"):
-            refuse(database, {one: (" ", "x")})
-        with pytest.raises(CandidateNotFoundError, match="0000"):
-            refuse(database, {one: ("X", "x"), "0" * 32: ("X", "x")})
-        with pytest.raises(CandidateNotFoundError):
-            mark_used(database, ["0" * 32], "map-1")
-        assert list_candidates(database) == before
-
     def test_withdrawal_removes_the_bytes_at_once(self, database: Database) -> None:
         one, other = contribute(database, [contribution(1, "Ada"), contribution(2, "Bob")])
         database.commit_map(random_map(1))
@@ -181,6 +142,49 @@ class GrowthSuite:
         assert sorted(map(len, found.values())) == [1, 3, 3, 3]
         report = verify(database)
         assert (report.ok, report.candidates) == (True, 4)
+
+
+class DecisionsSuite(GrowthSuite):
+    """What is decided about photos, known queries and maps, too: the code is the same wherever they lie."""
+
+    def test_used_counts_while_the_map_lives(self, database: Database) -> None:
+        ids = contribute(database, [contribution(1), contribution(2)])
+        mark_used(database, ids, "map-1")
+        assert count_candidates(database).by_state == {"waiting": 2}, "the map is not there yet"
+        version = database.commit_map(random_map(1)).version
+        assert find_candidate(database, ids[0]).used_by == ("map-1",)
+        assert count_candidates(database).by_state == {"used": 2}
+        database.set_status(["map-1"], "quarantined", "one owner only")
+        assert count_candidates(database).by_state == {"used": 2}
+        database.retire("map-1", "wrong")
+        assert count_candidates(database).by_state == {"waiting": 2}
+        database.rollback(version)
+        assert count_candidates(database).by_state == {"used": 2}
+        database.rollback(0)
+        assert count_candidates(database).by_state == {"waiting": 2}
+        assert [c.state for c in list_candidates(database, snapshot=database.snapshot(version))] == [
+            "used"
+        ] * 2
+
+    def test_refused_reopened_and_unknown(self, database: Database) -> None:
+        (one,) = contribute(database, [contribution(1)])
+        refuse(database, {one: ("ALTERED", "its bytes were edited")})
+        found = find_candidate(database, one)
+        assert (found.state, found.reason_code, found.reason) == (
+            "refused",
+            "ALTERED",
+            "its bytes were edited",
+        )
+        reopen(database, [one], "the editor was the owner")
+        assert [c.candidate_id for c in list_candidates(database, state="waiting")] == [one]
+        before = list_candidates(database)
+        with pytest.raises(StoreError, match="expected a reason code"):
+            refuse(database, {one: (" ", "x")})
+        with pytest.raises(CandidateNotFoundError, match="0000"):
+            refuse(database, {one: ("X", "x"), "0" * 32: ("X", "x")})
+        with pytest.raises(CandidateNotFoundError):
+            mark_used(database, ["0" * 32], "map-1")
+        assert list_candidates(database) == before
 
     def test_sql_shows_the_inbox_without_images(self, database: Database) -> None:
         query = "select count(*), count(distinct candidate_id), max(happened_at) from candidates"

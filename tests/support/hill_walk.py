@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image
 
-from featuredb.features.extractor import ExtractorOptions
 from featuredb.geometry.rigid3 import Rigid3
 from featuredb.store import Database
 from featuredb.store.candidates.photos import contribute
@@ -17,12 +16,10 @@ from ingest.growing import GrowingOptions
 from ingest.growth.run_record import GrowthOptions
 from ingest.growth.trust.confirmation import ConfirmationOptions
 from ingest.pipeline import IngestOptions, ingest_photos
-from ingest.reconstruction import MapMakingOptions
+from tests.support.hill_map import MAKING
 from tests.support.hill_photos import CAMERA, FRAME, _exif, _render
 from tests.support.planar_map import field_texture, view
 
-EXTRACTOR = ExtractorOptions(max_features=1000)
-MAKING = MapMakingOptions(extractor=EXTRACTOR)
 NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
 WEST_M = -32.0  # middle of the survey that anchors the database
 

@@ -26,15 +26,18 @@ _SIDE_M = 120.0
 _OPTIONS = ExtractorOptions(max_features=1500)
 
 
+@cache
 def field_texture(seed: int) -> NDArray[np.uint8]:
-    """Noise of several scales, (n, n) uint8; row 0 is the field's north edge, 0.08 m a texel."""
+    """Noise of several scales, (n, n) uint8, read-only; row 0 is the field's north edge, 0.08 m a texel."""
     rng = np.random.default_rng(seed)
     side = round(_SIDE_M / _TEXEL_M)
     total = np.zeros((side, side), dtype=np.float32)
     for cell, weight in ((64, 1.0), (24, 1.0), (10, 1.0), (4, 0.7)):
         coarse = rng.standard_normal((side // cell + 2,) * 2).astype(np.float32)
         total += weight * cv2.resize(coarse, (side, side), interpolation=cv2.INTER_CUBIC)
-    return np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+    texture = np.clip(128 + 45 * total, 0, 255).astype(np.uint8)
+    texture.setflags(write=False)
+    return texture
 
 
 def view(east: float, north: float, up: float, tilt_deg: float, heading_deg: float) -> Rigid3:

@@ -35,7 +35,7 @@ from tests.support.scenes import (
 
 FRAME = LocalFrame.from_utm(EASTING, NORTHING, HEIGHT, EPSG)
 FINGERPRINT = ExtractorOptions().fingerprint
-_LENGTH_M, _HALF_M, _DENSITY = 240.0, 25.0, 0.3
+_LENGTH_M, _HALF_M, _DENSITY = 240.0, 25.0, 0.18
 _RNG = np.random.default_rng(5)
 _COUNT = round(_LENGTH_M * 2 * _HALF_M * _DENSITY)
 POINTS: FloatArray = _RNG.uniform([-20.0, -_HALF_M, 0.0], [_LENGTH_M - 20.0, _HALF_M, 10.0], (_COUNT, 3))

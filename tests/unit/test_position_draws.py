@@ -10,6 +10,7 @@ from tools import position_draws
 from tools.position_draws import bounds, main
 
 
+@pytest.mark.evaluation
 def test_bounds_of_simulated_flights_are_counted(tmp_path: Path) -> None:
     main(["--work", str(tmp_path), "--draws", "1", "--chance", "3", "--json", str(tmp_path / "figures.json")])
     figures = json.loads((tmp_path / "figures.json").read_text())
