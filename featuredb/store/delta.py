@@ -259,23 +259,19 @@ class Table:
 
     def delete_rows(
         self, column: str, values: Iterable[str], metadata: Mapping[str, str] | None = None
-    ) -> int:
-        """Remove the rows with these values (ids in hexadecimal) in one commit; returns how many there were.
+    ) -> None:
+        """Remove the rows with these values (ids in hexadecimal) in one commit.
 
         Their bytes stay in files of earlier versions until a vacuum.
         """
         wanted = sorted(values)
         if not all(_HEX.fullmatch(value) for value in wanted):
             raise StoreError(f"{self.spec.name}: expected ids in hexadecimal, found {wanted[:3]}")
-        quoted = ", ".join(f"'{value}'" for value in wanted)
-        metrics = self._maintain(
-            lambda delta: delta.delete(
-                f"{column} IN ({quoted})",
-                writer_properties=writer_properties(self.spec),
-                commit_properties=CommitProperties(custom_metadata=dict(metadata or {})),
-            )
-        )
-        return int(metrics["num_deleted_rows"] or 0)
+        predicate = f"{column} IN ({', '.join(repr(value) for value in wanted)})"
+        properties = CommitProperties(custom_metadata=dict(metadata or {}))
+        none = self.spec.schema.empty_table()
+        # Not deltalake's `delete`: what it keeps has types that Arrow cannot filter, and other encodings.
+        self._maintain(lambda delta: self._write(delta, none, "overwrite", properties, predicate=predicate))
 
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""
@@ -321,12 +317,14 @@ class Table:
         mode: Literal["append", "overwrite"],
         properties: CommitProperties,
         schema_mode: Literal["overwrite"] | None = None,
+        predicate: str | None = None,
     ) -> None:
         write_deltalake(
             delta,
             rows if schema_mode else self._in_its_format(rows),
             mode=mode,
             schema_mode=schema_mode,
+            predicate=predicate,
             writer_properties=writer_properties(self.spec),
             commit_properties=properties,
             post_commithook_properties=PostCommitHookProperties(cleanup_expired_logs=False),
