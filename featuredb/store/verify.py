@@ -22,6 +22,7 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
+from featuredb.store.durable.copies import LIST, cut_off
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
@@ -105,6 +106,8 @@ def verify(database: Database) -> VerifyReport:
         StoreError: the store cannot be reached, or there is no database.
     """
     problems = list(check_logs(database))
+    if unfinished := cut_off(database.url, database.storage_options):
+        problems.insert(0, DatabaseProblem(where=LIST, what=unfinished))
     try:
         snapshot = database.snapshot()
         scans = list_scans(database)

@@ -98,10 +98,19 @@ def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
     Raises:
         StoreError: it is missing, empty or torn.
     """
+    return read_actions(entry_bytes(files, version))
+
+
+def entry_bytes(files: fs.FileSystem, version: int) -> bytes:
+    """A table's log entry, as it is written.
+
+    Raises:
+        StoreError: it is missing, empty or torn.
+    """
     problem = entry_problem(files, version)
     if problem is not None:
         raise StoreError(f"log entry {entry_name(version)}: {problem}; run `featuredb verify`")
-    return read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+    return _read(files, f"{LOG}/{entry_name(version)}")
 
 
 def entry_problem(files: fs.FileSystem, version: int) -> str | None:
