@@ -193,13 +193,13 @@ def run_compact(args: argparse.Namespace) -> int:
 
 
 def run_upgrade(args: argparse.Namespace) -> int:
+    from featuredb.store.durable.upgrade import upgrade
     from featuredb.store.tables import FORMAT_VERSION
 
-    found = open_database(args).upgrade()
-    if found == FORMAT_VERSION:
-        sys.stdout.write(f"format {found} already, nothing to do\n")
-    else:
-        sys.stdout.write(f"format {found} became {FORMAT_VERSION}; older releases cannot read it any more\n")
+    steps = upgrade(open_database(args))
+    sys.stdout.writelines(f"{step}\n" for step in steps)
+    if not steps:
+        sys.stdout.write(f"format {FORMAT_VERSION}, nothing to do\n")
     return 0
 
 

@@ -192,7 +192,9 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
             ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
-            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
+            # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
+            advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
+            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}{advice}")
     if len(tables) < len(CHILD_TABLES):
         return
     found = [
