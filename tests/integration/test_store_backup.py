@@ -154,7 +154,7 @@ def test_a_power_cut_leaves_the_backup_before_or_after(
             assert seen(restored(str(left), tmp_path / "restored.db")) in (before, after)
             whole = LIST in state and CopyPlace(str(left), None).read_list().whole  # type: ignore[union-attr]
             assert verify(Database(str(left))).ok == whole
-        if what == "backup" or not state or LIST in state:  # a restored database has no list any more
+        if what == "backup" or LIST in state or "maps" not in state:  # not where the restore was done
             run(left)
         assert seen(Database.open(left)) == after
         assert verify(Database.open(left)).ok
