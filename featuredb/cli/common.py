@@ -19,11 +19,13 @@ if TYPE_CHECKING:
 LONGEST_CELL = 72  # a wider cell makes a table unreadable; csv and json give everything
 
 
-def add_database_argument(parser: argparse.ArgumentParser) -> None:
+def add_database_argument(
+    parser: argparse.ArgumentParser,
+    metavar: str = "DB",
+    help: str = "folder or URL of the database, e.g. maps.db, s3://bucket/maps",
+) -> None:
     """Add the positional DB and the options to reach it."""
-    parser.add_argument(
-        "db", metavar="DB", help="folder or URL of the database, e.g. maps.db, s3://bucket/maps"
-    )
+    parser.add_argument("db", metavar=metavar, help=help)
     parser.add_argument(
         "--storage-option",
         metavar="KEY=VALUE",

@@ -1,6 +1,6 @@
 """The commands that keep a database: from init and maps to verify, repair and vacuum.
 
-`lineage` and `candidates` are in modules of their own and are registered here.
+`lineage`, `candidates`, `backup` and `restore` are in modules of their own and are registered here.
 """
 
 import argparse
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from featuredb.cli import candidates, lineage
+from featuredb.cli import backup, candidates, lineage
 from featuredb.cli.common import (
     add_as_of_argument,
     add_command,
@@ -63,6 +63,7 @@ def register(subparsers: Any) -> None:
     rollback.add_argument("version", type=version_or_time, metavar="VERSION", help="number or ISO 8601 time")
     lineage.register(subparsers)
     candidates.register(subparsers)
+    backup.register(subparsers)
     add_command(subparsers, "compact", run_compact, "merge small files")
     add_command(subparsers, "upgrade", run_upgrade, "bring a database of an older release to today's format")
     _register_vacuum(subparsers)
@@ -192,13 +193,13 @@ def run_compact(args: argparse.Namespace) -> int:
 
 
 def run_upgrade(args: argparse.Namespace) -> int:
+    from featuredb.store.durable.upgrade import upgrade
     from featuredb.store.tables import FORMAT_VERSION
 
-    found = open_database(args).upgrade()
-    if found == FORMAT_VERSION:
-        sys.stdout.write(f"format {found} already, nothing to do\n")
-    else:
-        sys.stdout.write(f"format {found} became {FORMAT_VERSION}; older releases cannot read it any more\n")
+    steps = upgrade(open_database(args))
+    sys.stdout.writelines(f"{step}\n" for step in steps)
+    if not steps:
+        sys.stdout.write(f"format {FORMAT_VERSION}, nothing to do\n")
     return 0
 
 

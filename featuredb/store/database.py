@@ -22,10 +22,9 @@ from featuredb.store.commits import (
     history_entry,
     new_write_id,
     read_rows,
-    upgrade_metadata,
 )
 from featuredb.store.delta import Commit, Table
-from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map, map_rows_table
+from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot
 from featuredb.store.tables import CHILD_TABLES, FORMAT_VERSION, MAPS, SPECS
@@ -310,26 +309,6 @@ class Database:
                 f"{FORMAT_VERSION}; run `featuredb upgrade {self.url}` (featuredb before it cannot read the "
                 "database any more then)"
             )
-
-    def upgrade(self) -> int:
-        """Bring the tables of maps to the newest format; returns the format that the database had.
-
-        All maps and snapshots stay as they are. `maps` comes last: until then the format is the old one.
-
-        Raises:
-            ConflictError: other writers were faster too many times.
-            StoreError: the store failed.
-        """
-        found = self.format
-        for name in CHILD_TABLES:
-            retry_stale(f"upgrade of {name}", lambda name=name: self.table(name).upgrade())  # type: ignore[misc]
-
-        def attempt() -> None:
-            maps = self.table(MAPS)
-            maps.upgrade(map_rows_table(read_rows(maps)), upgrade_metadata())
-
-        retry_stale("upgrade of maps", attempt)
-        return found
 
     def history(self) -> list[HistoryEntry]:
         """All versions, newest first."""

@@ -18,6 +18,7 @@ from typing import Any, Literal, TypeVar
 from urllib.parse import unquote
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.dataset as ds
 import pyarrow.fs as fs
 from deltalake import (
@@ -27,18 +28,19 @@ from deltalake import (
     Schema,
     write_deltalake,
 )
-from deltalake.exceptions import CommitFailedError, DeltaError, TableNotFoundError
+from deltalake.exceptions import CommitFailedError, DeltaError
 
-from featuredb.errors import ConflictError, DatabaseNotFoundError, SnapshotNotFoundError, StoreError
+from featuredb.errors import ConflictError, StoreError
 from featuredb.store.durable.ages import old_files, old_scratch_folders, remove_files
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.local import Sight, commit_locally, create_locally
-from featuredb.store.durable.log import acknowledge, check_end, damaged, log_problems
+from featuredb.store.durable.log import acknowledge, check_end
 from featuredb.store.durable.making import (
     check_format,
     create_table,
     description,
     format_of,
+    why_not_opened,
     writer_properties,
 )
 from featuredb.store.retry import ATTEMPTS, StaleVersionError, retry_stale
@@ -115,7 +117,7 @@ class Table:
         try:
             delta = DeltaTable(url, version=version, storage_options=storage_options)
         except (DeltaError, OSError) as error:
-            raise _why_not_opened(url, storage_options, version, error) from error
+            raise why_not_opened(url, storage_options, version, error) from error
         if version is None:
             check_end(url, table_files(url, storage_options, delta), int(delta.version()))
         check_format(url, spec, delta)
@@ -259,23 +261,28 @@ class Table:
 
     def delete_rows(
         self, column: str, values: Iterable[str], metadata: Mapping[str, str] | None = None
-    ) -> int:
-        """Remove the rows with these values (ids in hexadecimal) in one commit; returns how many there were.
+    ) -> None:
+        """Remove the rows with these values (ids in hexadecimal) in one commit.
 
         Their bytes stay in files of earlier versions until a vacuum.
         """
-        wanted = sorted(values)
-        if not all(_HEX.fullmatch(value) for value in wanted):
-            raise StoreError(f"{self.spec.name}: expected ids in hexadecimal, found {wanted[:3]}")
-        quoted = ", ".join(f"'{value}'" for value in wanted)
-        metrics = self._maintain(
-            lambda delta: delta.delete(
-                f"{column} IN ({quoted})",
-                writer_properties=writer_properties(self.spec),
-                commit_properties=CommitProperties(custom_metadata=dict(metadata or {})),
-            )
-        )
-        return int(metrics["num_deleted_rows"] or 0)
+        predicate = _is_in(column, values)
+        properties = CommitProperties(custom_metadata=dict(metadata or {}))
+        none = self.spec.schema.empty_table()
+        # Not deltalake's `delete`: what it keeps has types that Arrow cannot filter, and other encodings.
+        self._maintain(lambda delta: self._write(delta, none, "overwrite", properties, predicate=predicate))
+
+    def rewrite(self, rows_of: Callable[["Table"], pa.Table | None]) -> bool:
+        """Write rows anew in one commit; `rows_of` gives all rows of some write ids, or None."""
+
+        def again(delta: Any) -> bool:
+            if (rows := rows_of(self)) is None:
+                return False
+            predicate = _is_in("write_id", pc.unique(rows["write_id"]).to_pylist())
+            self._write(delta, rows, "overwrite", CommitProperties(), predicate=predicate)
+            return True
+
+        return self._maintain(again)
 
     def compact(self) -> int:
         """Merge small files of each partition; returns the number of files saved."""
@@ -321,12 +328,14 @@ class Table:
         mode: Literal["append", "overwrite"],
         properties: CommitProperties,
         schema_mode: Literal["overwrite"] | None = None,
+        predicate: str | None = None,
     ) -> None:
         write_deltalake(
             delta,
             rows if schema_mode else self._in_its_format(rows),
             mode=mode,
             schema_mode=schema_mode,
+            predicate=predicate,
             writer_properties=writer_properties(self.spec),
             commit_properties=properties,
             post_commithook_properties=PostCommitHookProperties(cleanup_expired_logs=False),
@@ -379,19 +388,9 @@ def _as_store_error(what: str) -> Iterator[None]:
         raise StoreError(f"{what}: {error}") from error
 
 
-def _why_not_opened(
-    url: str, storage_options: dict[str, str] | None, version: int | None, error: Exception
-) -> StoreError:
-    try:
-        problem = next(log_problems(table_files(url, storage_options)), None)
-    except (OSError, pa.ArrowException):
-        problem = None
-    if problem is not None:
-        return damaged(url, problem)
-    if isinstance(error, TableNotFoundError):
-        return DatabaseNotFoundError(
-            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
-        )
-    if version is not None:
-        return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
-    return StoreError(f"cannot open {url}: {error}")
+def _is_in(column: str, values: Iterable[str]) -> str:
+    """A predicate of SQL: that a column of ids in hexadecimal has one of these values."""
+    wanted = sorted(values)
+    if not all(_HEX.fullmatch(value) for value in wanted):
+        raise StoreError(f"{column}: expected ids in hexadecimal, found {wanted[:3]}")
+    return f"{column} IN ({', '.join(repr(value) for value in wanted)})"

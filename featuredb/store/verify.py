@@ -22,6 +22,7 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
 from featuredb.store.delta import Table
+from featuredb.store.durable.copies import LIST, cut_off
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.log import LOG, file_digests, log_problems
 from featuredb.store.encode import Row, content_digest
@@ -105,6 +106,8 @@ def verify(database: Database) -> VerifyReport:
         StoreError: the store cannot be reached, or there is no database.
     """
     problems = list(check_logs(database))
+    if unfinished := cut_off(database.url, database.storage_options):
+        problems.insert(0, DatabaseProblem(where=LIST, what=unfinished))
     try:
         snapshot = database.snapshot()
         scans = list_scans(database)
@@ -189,7 +192,9 @@ def check_map(snapshot: Snapshot, row: Row) -> Iterator[DatabaseProblem]:
             ]
             tables[name] = snapshot.dataset(name).to_table(columns, filter=mine)
         except (OSError, pa.ArrowException) as error:
-            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}")
+            # Types that Arrow cannot filter: older releases left them in files of which they removed rows.
+            advice = "; run `featuredb upgrade`" if isinstance(error, pa.ArrowNotImplementedError) else ""
+            yield DatabaseProblem(where=where, what=f"cannot read its {name}: {_one_line(error)}{advice}")
     if len(tables) < len(CHILD_TABLES):
         return
     found = [

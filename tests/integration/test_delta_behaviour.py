@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pyarrow as pa
+import pyarrow.dataset as ds
 import pytest
 from deltalake import CommitProperties, DeltaTable, write_deltalake
 from deltalake.exceptions import CommitFailedError
@@ -50,6 +51,23 @@ def test_with_retries_an_overwrite_does_not_notice_an_append(url: str) -> None:
     write_deltalake(DeltaTable(url), rows(1), mode="append")
     write_deltalake(stale, rows(2), mode="overwrite")
     assert values(url) == [1, 2]
+
+
+def test_a_delete_writes_types_that_cannot_be_filtered_and_an_overwrite_does_not(tmp_path: Path) -> None:
+    """The reason why rows are removed by an overwrite with a predicate."""
+    names = pa.table({"a": ["x", "y", "z"]})
+    for how in ("delete", "overwrite"):
+        url = str(tmp_path / how)
+        write_deltalake(url, names)
+        if how == "delete":
+            DeltaTable(url).delete("a IN ('x')")
+            with pytest.raises(pa.ArrowNotImplementedError, match="string_view"):
+                DeltaTable(url).to_pyarrow_dataset().to_table(filter=ds.field("a") == "y")
+        else:
+            write_deltalake(url, names.schema.empty_table(), mode="overwrite", predicate="a IN ('x')")
+            found = DeltaTable(url).to_pyarrow_dataset().to_table(filter=ds.field("a") == "y")
+            assert found.to_pydict() == {"a": ["y"]}
+            assert len(DeltaTable(url).to_pyarrow_table()) == 2
 
 
 def test_compaction_does_not_hinder_appends(url: str) -> None:

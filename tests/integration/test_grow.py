@@ -3,6 +3,7 @@
 import json
 import shutil
 import threading
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from featuredb.store import Database
 from featuredb.store.candidates.owners import read_owners
 from featuredb.store.candidates.photos import contribute, list_candidates
 from featuredb.store.candidates.states import Contribution
+from featuredb.store.verify import verify
 from ingest.growing import grow_candidates, watch_and_grow
 from ingest.growth.growth_report import GrowthReport
 from ingest.growth.trust.confirmation import ConfirmationOptions
@@ -42,6 +44,7 @@ from tests.support.hill_walk import (
     survey,
 )
 from tests.support.made_once import made_once
+from tests.support.power_cut import Disk, State, write_state
 
 _EAST_M = WEST_M + 13.0  # photos there see half of what the survey saw
 _AWAY_M = WEST_M + 90.0  # and there nothing of it
@@ -213,6 +216,51 @@ def test_a_run_that_dies_is_finished_by_the_next(
     report = grow_candidates(database, growing())
     assert len(report.promoted) == 1
     assert set(_states(database).values()) == {"used"}
+
+
+@pytest.mark.evaluation
+@pytest.mark.timeout(3600)
+def test_a_power_cut_leaves_what_was_seen(
+    given: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every write of a run what is left is what readers saw, or saw just before, and growth goes on."""
+    database = _copy(given, tmp_path)
+    Path(database.url, "_work").rename(tmp_path / "work")
+    options = replace(growing(), work=tmp_path / "work")
+
+    def look(at: Database) -> object:
+        return {m.map_id: m.status for m in at.snapshot().maps()}, _states(at)
+
+    shown = [look(database)]
+    left: list[tuple[int, State]] = []
+
+    def cut() -> None:
+        if (now := look(database)) != shown[-1]:
+            shown.append(now)
+        left.extend((len(shown) - 1, disk.surviving(names=names)) for names in (False, True))
+
+    with monkeypatch.context() as patch:
+        disk = Disk(Path(database.url), patch, cut)
+        assert len(grow_candidates(database, options).promoted) == 1
+        cut()
+    assert len(shown) == 3  # photos wait, a map is in quarantine, it is active
+    assert look(database) == shown[-1]
+    gone_on = set()
+    for i, (stage, state) in enumerate(left):
+        if any(state == other for _, other in left[:i]):
+            continue
+        place = tmp_path / "left.db"
+        write_state(state, place)
+        found = Database.open(place)
+        assert verify(found).problems == ()
+        assert look(found) in shown[max(stage - 1, 0) : stage + 1]
+        if (reached := shown.index(look(found))) not in gone_on:
+            gone_on.add(reached)
+            grow_candidates(found, options)
+            assert set(_states(found).values()) == {"used"}
+            assert {m.status for m in found.snapshot().maps()} == {"active"}
+        shutil.rmtree(place)
+    assert gone_on == set(range(len(shown)))
 
 
 def test_photos_of_elsewhere_wait_broken_ones_and_copies_are_refused(

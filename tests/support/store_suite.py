@@ -24,6 +24,7 @@ from featuredb.errors import (
 )
 from featuredb.store import Database
 from featuredb.store.delta import Table
+from featuredb.store.durable.backup import backup, restore
 from featuredb.store.maintenance import VacuumOptions, compact, vacuum
 from featuredb.store.retry import StaleVersionError
 from featuredb.store.sql import SqlSession
@@ -217,6 +218,23 @@ class StoreSuite:
         assert report.ok
         assert report.orphans == ()
         assert_same_map(database.snapshot().load_map("map-1"), random_map(2, map_id="map-1"))
+
+    def test_backup_and_restore(self, database: Database, place: Place, tmp_path: Path) -> None:
+        options = place.storage_options
+        for seed in (1, 2):
+            database.commit_map(random_map(seed))
+        there, here = f"{place.url}-backup", str(tmp_path / "backup.db")
+        files = backup(database, there, options).files
+        assert backup(database, there, options).kept == files
+        assert backup(database, here).files == files
+        for source, given in ((there, options), (here, {})):
+            target = Database(f"{place.url}-{len(source)}", options)
+            assert restore(source, target, given).files == files
+            assert verify(target).problems == ()
+            assert_same_map(target.snapshot().load_map("map-2"), random_map(2))
+            target.commit_map(random_map(3))
+            with pytest.raises(StoreError, match="overwrites nothing"):
+                restore(source, target, given)
 
     def test_sql_sees_one_snapshot(self, database: Database) -> None:
         database.commit_map(random_map(1, points=50))

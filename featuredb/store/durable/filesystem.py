@@ -24,6 +24,14 @@ def table_files(url: str, storage_options: dict[str, str] | None, opened: Any = 
     return fs.PyFileSystem(DeltaStorageHandler(url, storage_options))
 
 
+def object_writer(files: fs.PyFileSystem, path: str) -> Any:
+    """A stream of bytes to an object, which is there when the stream has been closed.
+
+    Not through Arrow, which hands deltalake's stream buffers of its own: it takes bytes alone.
+    """
+    return files.handler._handler.open_output_stream(path, None)
+
+
 @cache
 def _let_arrow_finish_at_exit() -> None:
     """Give Arrow's reading threads a moment at the interpreter's end.

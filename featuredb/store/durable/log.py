@@ -6,10 +6,11 @@ and removes the names below it; the highest name there is the last acknowledged 
 made, and those below one's own removed: concurrent writers need no lock, object stores no conditional write.
 """
 
+import hashlib
 import json
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
@@ -24,7 +25,8 @@ from featuredb.errors import StoreError
 logger = logging.getLogger(__name__)
 
 LOG, ACKNOWLEDGED, LAST_CHECKPOINT = "_delta_log", "_acknowledged", "_last_checkpoint"
-DIGEST = "featuredb.sha256"  # tag of an added file
+# Tag of an added file: of its bytes. In the line commitInfo of an entry: of its actions without this.
+DIGEST = "featuredb.sha256"
 _ENTRY = re.compile(r"(\d{20})\.json")
 _CHECKPOINT = re.compile(r"(\d{20})\.checkpoint.*\.parquet")
 _NAME = re.compile(r"\d{20}")
@@ -73,10 +75,26 @@ def read_actions(content: bytes) -> list[Action]:
         expected = (
             next((metrics[n] for n in names if n in metrics), None) if isinstance(metrics, dict) else None
         )
-        found = sum(kind in action for action in actions)
+        lines = [action[kind] for action in actions if kind in action]
+        if not all(isinstance(line, dict) and isinstance(line.get("path"), str) for line in lines):
+            raise ValueError(f"it has lines {kind!r} that name no file")
+        found = len(lines)
         if expected is not None and found != expected:
             raise ValueError(f"it is torn: expected {expected} lines {kind!r}, found {found}")
+    if info.get(DIGEST, digest := actions_digest(actions)) != digest:
+        raise ValueError("its bytes are not those that were written: hashes differ")
     return actions
+
+
+def actions_digest(actions: Iterable[Action]) -> str:
+    """SHA-256 of the actions of an entry, in hex digits, which the entry itself may say."""
+    lines = [
+        {"commitInfo": {k: v for k, v in action["commitInfo"].items() if k != DIGEST}}
+        if "commitInfo" in action
+        else action
+        for action in actions
+    ]
+    return hashlib.sha256(json.dumps(lines, sort_keys=True).encode()).hexdigest()
 
 
 def named_checkpoint(content: bytes) -> int | None:
@@ -98,10 +116,19 @@ def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
     Raises:
         StoreError: it is missing, empty or torn.
     """
+    return read_actions(entry_bytes(files, version))
+
+
+def entry_bytes(files: fs.FileSystem, version: int) -> bytes:
+    """A table's log entry, as it is written.
+
+    Raises:
+        StoreError: it is missing, empty or torn.
+    """
     problem = entry_problem(files, version)
     if problem is not None:
         raise StoreError(f"log entry {entry_name(version)}: {problem}; run `featuredb verify`")
-    return read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+    return _read(files, f"{LOG}/{entry_name(version)}")
 
 
 def entry_problem(files: fs.FileSystem, version: int) -> str | None:
@@ -213,9 +240,43 @@ def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProbl
                 yield LogProblem(info.base_name, f"it is of version {int(match[1])}, which has no entry")
                 continue
             try:
-                pq.read_table(info.path, filesystem=files)
-            except (OSError, pa.ArrowException) as error:
+                same = _says(pq.read_table(info.path, filesystem=files)) == _replayed(files, int(match[1]))
+            except StoreError:  # said of the entry
+                continue
+            except (OSError, pa.ArrowException, KeyError, ValueError, TypeError) as error:
                 yield LogProblem(info.base_name, f"it cannot be read: {' '.join(str(error).split())[:200]}")
+            else:
+                if not same:
+                    yield LogProblem(info.base_name, "it says something else than the entries")
+
+
+def _says(checkpoint: pa.Table) -> dict[str, Any]:
+    """What a checkpoint says of columns, and of each live file."""
+    (columns,) = filter(None, checkpoint["metaData"].to_pylist())
+    return _state(columns, filter(None, checkpoint["add"].to_pylist()))
+
+
+def _replayed(files: fs.FileSystem, version: int) -> dict[str, Any]:
+    """The same by the entries up to a version."""
+    columns: Action = {}
+    live: dict[str, Action] = {}
+    for actions in (read_entry(files, v) for v in range(version + 1)):
+        columns = next((a["metaData"] for a in actions if "metaData" in a), columns)
+        for path in (a["remove"]["path"] for a in actions if "remove" in a):
+            live.pop(path, None)
+        live |= {a["add"]["path"]: a["add"] for a in actions if "add" in a}
+    return _state(columns, live.values())
+
+
+def _state(columns: Action, adds: Iterable[Action]) -> dict[str, Any]:
+    """What readers go by, in one form: a checkpoint has lists of pairs where an entry has objects."""
+    names = ("description", "schemaString", "partitionColumns")
+    return {"": [columns[name] for name in names], **{add["path"]: _file(add) for add in adds}}
+
+
+def _file(add: Action) -> list[Any]:
+    stats = json.loads(add["stats"]) if add.get("stats") else None
+    return [dict(add["partitionValues"]), add["size"], stats, dict(add.get("tags") or {})]
 
 
 def _numbered(files: fs.FileSystem, folder: str, name: re.Pattern[str]) -> Iterator[tuple[int, datetime]]:

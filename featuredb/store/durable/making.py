@@ -3,9 +3,13 @@
 import json
 from typing import Any
 
+import pyarrow as pa
 from deltalake import ColumnProperties, DeltaTable, WriterProperties
+from deltalake.exceptions import TableNotFoundError
 
-from featuredb.errors import DatabaseNotFoundError, StoreError
+from featuredb.errors import DatabaseNotFoundError, SnapshotNotFoundError, StoreError
+from featuredb.store.durable.filesystem import table_files
+from featuredb.store.durable.log import damaged, log_problems
 from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
 
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
@@ -78,3 +82,35 @@ def format_of(metadata: Any) -> Any:
         return json.loads(metadata.description or "{}").get("featuredb_format")
     except (ValueError, AttributeError):
         return None
+
+
+def is_of_an_older_release(fragment: Any) -> bool:
+    """Whether a file has what is not written any more.
+
+    That is strings as views, which Arrow cannot filter, where rows beside them were removed; and statistics
+    of a column of photos, with two of them.
+    """
+    if any(t in (pa.string_view(), pa.binary_view()) for t in fragment.physical_schema.types):
+        return True
+    group = fragment.metadata.row_group(0) if fragment.metadata.num_row_groups else None
+    columns = [group.column(i) for i in range(group.num_columns)] if group is not None else []
+    return any(c.is_stats_set and c.path_in_schema == "image" for c in columns)
+
+
+def why_not_opened(
+    url: str, storage_options: dict[str, str] | None, version: int | None, error: Exception
+) -> StoreError:
+    """The error for a table that deltalake cannot open, in words."""
+    try:
+        problem = next(log_problems(table_files(url, storage_options)), None)
+    except (OSError, pa.ArrowException):
+        problem = None
+    if problem is not None:
+        return damaged(url, problem)
+    if isinstance(error, TableNotFoundError):
+        return DatabaseNotFoundError(
+            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
+        )
+    if version is not None:
+        return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
+    return StoreError(f"cannot open {url}: {error}")

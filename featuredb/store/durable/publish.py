@@ -23,6 +23,7 @@ from featuredb.store.durable.log import (
     LAST_CHECKPOINT,
     LOG,
     Action,
+    actions_digest,
     entry_name,
     named_checkpoint,
     read_actions,
@@ -124,10 +125,11 @@ def flush(path: Path) -> None:
 
 
 def _note_digests(work: Path, entry: Path, actions: list[Action], paths: list[str]) -> None:
-    """Let the entry say what bytes its files have: these have no checksums, and not all rows a digest."""
+    """Let the entry say what bytes its files have, and it itself: neither has a checksum."""
     for action in actions:
         if "add" in action and (path := unquote(action["add"]["path"])) in paths:
             action["add"]["tags"] = {**(action["add"].get("tags") or {}), DIGEST: file_sha256(work / path)}
+    next(a["commitInfo"] for a in actions if "commitInfo" in a)[DIGEST] = actions_digest(actions)
     entry.write_text("".join(json.dumps(action, separators=(",", ":")) + "\n" for action in actions))
 
 

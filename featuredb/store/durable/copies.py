@@ -1,0 +1,186 @@
+"""Files of a database copied to another place, and the list of them that says what a copy holds.
+
+The list is `backup.json` at the top of the copy. It is there before the first file, and says so until the
+last one is in its place: what was cut off is known for it, and goes on where it was.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import closing, suppress
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow.fs as fs
+
+from featuredb.errors import StoreError
+from featuredb.store.durable.filesystem import object_writer, table_files
+from featuredb.store.durable.log import ACKNOWLEDGED
+from featuredb.store.durable.publish import flush, make_folder
+from featuredb.store.tables import SPECS
+
+LIST = "backup.json"
+PART = ".part"  # end of the name of a file that is being written
+_FORMAT = 1
+_BLOCK_BYTES = 2**20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CopiedFile:
+    """Bytes of a file: how many, and their SHA-256 in hex digits."""
+
+    size_bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CopyList:
+    """What a copy of a database holds.
+
+    Attributes:
+        purpose: "backup" or "restore".
+        source: URL of what was copied.
+        began: when, UTC.
+        attempt: a name of the run that makes the copy.
+        whole: False while files come and go: `files` are then those of the last whole copy.
+        files: by path relative to the database.
+    """
+
+    purpose: str
+    source: str
+    began: datetime
+    attempt: str
+    whole: bool
+    files: Mapping[str, CopiedFile]
+
+
+class CopyPlace:
+    """A database's files, for reading and for writing so that each is whole or not there."""
+
+    def __init__(self, url: str, storage_options: dict[str, str] | None) -> None:
+        self.url = url
+        self._root = None if "://" in url else Path(url)
+        self.files = table_files(url, storage_options)
+
+    def sizes(self) -> dict[str, int]:
+        """The bytes of each file, by path; none where the place does not exist."""
+        found = self.files.get_file_info(fs.FileSelector("", recursive=True, allow_not_found=True))
+        return {info.path: info.size for info in found if info.type == fs.FileType.File}
+
+    def sha256(self, path: str) -> str:
+        """Of a file's bytes, in hex digits."""
+        digest = hashlib.sha256()
+        for block in self._blocks(path):
+            digest.update(block)
+        return digest.hexdigest()
+
+    def take(self, path: str, source: "CopyPlace", expected: str | None) -> CopiedFile:
+        """Copy a file from another place.
+
+        Args:
+            expected: SHA-256 that its bytes must have, where that is known.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            StoreError: its bytes are others; nothing of them stays.
+        """
+        digest, size = hashlib.sha256(), 0
+        try:
+            with self._writer(path) as out:
+                for block in source._blocks(path):
+                    digest.update(block)
+                    size += len(block)
+                    out.write(block)
+            if expected is not None and digest.hexdigest() != expected:
+                raise StoreError(
+                    f"{source.url}/{path}: its bytes are not those that were written; `featuredb verify "
+                    f"{source.url}` says what is damaged"
+                )
+        except BaseException:
+            with suppress(FileNotFoundError):
+                self.files.delete_file(path if self._root is None else path + PART)
+            raise
+        self._show(path)
+        return CopiedFile(size_bytes=size, sha256=digest.hexdigest())
+
+    def read_list(self) -> CopyList | None:
+        """What the copy at this place holds; None where there is none.
+
+        Raises:
+            StoreError: its list is damaged, or of a newer release.
+        """
+        try:
+            content = b"".join(self._blocks(LIST))
+        except FileNotFoundError:
+            return None
+        try:
+            found: dict[str, Any] = json.loads(content)
+            if found.pop("featuredb_backup") != _FORMAT:
+                raise StoreError(f"{self.url}/{LIST} is of a newer release: use a newer featuredb")
+            files = {path: CopiedFile(**file) for path, file in found.pop("files").items()}
+            began = datetime.fromisoformat(found.pop("began"))
+            return CopyList(**found, began=began, files=files)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise StoreError(
+                f"{self.url}/{LIST} is damaged ({error}): use another backup, or make a new one"
+            ) from error
+
+    def write_list(self, copied: CopyList) -> None:
+        """Say what the copy at this place holds."""
+        values = {**asdict(copied), "began": copied.began.isoformat()}
+        with self._writer(LIST) as out:
+            out.write(json.dumps({"featuredb_backup": _FORMAT, **values}, indent=0).encode())
+        self._show(LIST)
+        if self._root is not None:
+            flush(self._root)
+
+    def remove(self, paths: Iterable[str]) -> None:
+        """Delete files, for good."""
+        removed = list(paths)
+        for path in removed:
+            with suppress(FileNotFoundError):
+                self.files.delete_file(path)
+        self.flush_folders(removed)
+
+    def flush_folders(self, paths: Iterable[str]) -> None:
+        """Wait until the names of files are on a local disk, and those of their folders."""
+        if self._root is not None:
+            for folder in sorted({(self._root / path).parent for path in paths}):
+                if folder.exists():
+                    flush(folder)
+
+    def _blocks(self, path: str) -> Iterator[bytes]:
+        with self.files.open_input_file(path) as stream:
+            while block := stream.read(_BLOCK_BYTES):
+                yield block
+
+    def _writer(self, path: str) -> closing[Any]:
+        if self._root is None:
+            return closing(object_writer(self.files, path))
+        make_folder((self._root / path).parent)
+        return closing((self._root / (path + PART)).open("wb"))
+
+    def _show(self, path: str) -> None:
+        if self._root is not None:
+            part = self._root / (path + PART)
+            flush(part)
+            part.replace(self._root / path)
+
+
+def cut_off(url: str, storage_options: dict[str, str] | None) -> str | None:
+    """What a copy that is not whole says about itself; None where there is no such thing."""
+    found = CopyPlace(url, storage_options).read_list()
+    if found is None or found.whole:
+        return None
+    return f"a {found.purpose} from {found.source} to here was cut off, or is at work: run it again"
+
+
+def superfluous(paths: Iterable[str], files: Mapping[str, CopiedFile]) -> list[str]:
+    """Files in the tables of a copy that are no part of it."""
+    return sorted(
+        path
+        for path in paths
+        if path not in files and path.split("/")[0] in SPECS and f"/{ACKNOWLEDGED}/" not in path
+    )
