@@ -108,7 +108,12 @@ def _add_query_arguments(parser: argparse.ArgumentParser) -> None:
         help="where it may have been taken, WGS84 degrees and metres; with an equals sign where the latitude "
         "is negative: --prior=-33.86,151.21,25",
     )
-    parser.add_argument("--exif-prior", action="store_true", help="the photo's own GPS is the prior")
+    parser.add_argument(
+        "--no-exif-prior",
+        action="store_true",
+        help="leave out the position in the photo's EXIF, which settles what is ambiguous where there is no "
+        "--prior",
+    )
     parser.add_argument(
         "--camera",
         metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
@@ -194,7 +199,7 @@ def _query(args: argparse.Namespace) -> int:
                 lens or camera,
                 timeout_s=args.timeout,
                 inliers=first or args.overlay is not None,
-                exif_prior=args.exif_prior,
+                exif_prior=not args.no_exif_prior,
                 maps=tuple(args.map) if args.map else None,
                 contribute=args.contribute and not first,
                 credit=args.credit,
@@ -202,7 +207,7 @@ def _query(args: argparse.Namespace) -> int:
                 client_id=args.client_id,
             )
 
-        return _answer_all(args, ask)
+        return _answer_all(args, ask, client.database)
 
 
 def _localise(args: argparse.Namespace) -> int:
@@ -218,7 +223,8 @@ def _localise(args: argparse.Namespace) -> int:
     from reloc.wire.query import LocaliseWireRequest, RequestOptions
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
-    localiser = Localiser.open(open_database(args))
+    database = open_database(args)
+    localiser = Localiser.open(database)
 
     def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
         request = LocaliseWireRequest(
@@ -226,7 +232,7 @@ def _localise(args: argparse.Namespace) -> int:
             camera=lens or camera,
             options=RequestOptions(
                 inliers=first or args.overlay is not None,
-                exif_prior=args.exif_prior,
+                exif_prior=not args.no_exif_prior,
                 maps=tuple(args.map) if args.map else None,
             ),
         )
@@ -239,12 +245,13 @@ def _localise(args: argparse.Namespace) -> int:
             clock=StageClock(),
         )
 
-    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+    return _answer_all(args, ask, database.name, lambda reply: map_points_in_view(localiser.areas, reply))
 
 
 def _answer_all(
     args: argparse.Namespace,
     ask: "Ask",
+    database: str,
     other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
 ) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
@@ -256,7 +263,9 @@ def _answer_all(
         try:
             data = path.read_bytes()
             reply = ask(data, lenses.get(path), False)
-            sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
+            sys.stdout.write(
+                _as_json_line(path, reply, database) if args.json else describe(str(path), reply, database)
+            )
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
@@ -320,10 +329,10 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
 
 
-def _as_json_line(path: Path, reply: "LocaliseReply") -> str:
+def _as_json_line(path: Path, reply: "LocaliseReply", database: str) -> str:
     import json
 
-    return json.dumps({"image": str(path), **reply.model_dump(mode="json")}) + "\n"
+    return json.dumps({"image": str(path), "database": database, **reply.model_dump(mode="json")}) + "\n"
 
 
 def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:

@@ -133,7 +133,7 @@ class Client:
                 asked again, ever less often, while it lasts.
             request_id: appears in the reply and in the server's log.
             inliers: the reply carries pixels and UTM points of the matches that agree.
-            exif_prior: the photo's own GPS serves as prior where `prior` is None.
+            exif_prior: the position in the photo's EXIF settles what is ambiguous, where `prior` is None.
             maps: ask only these maps.
             contribute: give the photo to the database, so that its maps can grow; needs `credit` and
                 `licence`. The reply's `contribution` says whether it was taken.

@@ -207,6 +207,18 @@ class RunnerUpPose(Answer):
     lon: float
 
 
+class OwnPositionUse(Answer):
+    """What the position in the photo's EXIF did to the answer, where `options.exif_prior` asked for it.
+
+    `agrees`: the answer is the same without it. `decided`: without it there is none. `contradicted`: the
+    photo shows another place, where it is answered, or both places fit. `no_help`: not localised with it
+    either. `distance_m`: of the answer from it, horizontally.
+    """
+
+    role: Literal["agrees", "decided", "contradicted", "no_help"]
+    distance_m: NotNegative | None
+
+
 class InlierPoints(Answer):
     """Evidence, on request: k pixels of the query, the UTM points they saw, and the row in `maps` of each."""
 
@@ -289,6 +301,7 @@ class LocaliseReply(Answer):
     request_id: str
     contribution: ContributionReply | None = None
     in_map: InMapPose | None = None
+    exif_prior: OwnPositionUse | None = None
 
     @model_validator(mode="after")
     def _pose_or_reason(self) -> "LocaliseReply":

@@ -109,8 +109,8 @@ def test_schema_and_client_type_keep_it_apart_from_a_place(reply: LocaliseReply)
 
 
 def test_the_text_says_that_it_is_no_place(reply: LocaliseReply) -> None:
-    said = describe("photo.jpg", reply)
-    assert "NO PLACE ON EARTH" in said
+    said = describe("photo.jpg", reply, "town.db")
+    assert "of town.db, which has NO PLACE ON EARTH" in said
     assert "not metres" in said
     assert "UTM" not in said
     assert "WGS84" not in said
