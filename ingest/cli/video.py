@@ -73,8 +73,8 @@ def run_video(args: argparse.Namespace) -> int:
     from featuredb.cli.common import storage_options
     from featuredb.geo.heights import HEIGHT_DATUMS
     from featuredb.store import Database
+    from ingest.api.progress_bars import progress_bars
     from ingest.cli.ingest import ingest_folder
-    from ingest.cli.progress_bars import progress_bars
     from ingest.video.films import find_films, make_films
     from ingest.video.keyframes import KeyframeOptions
     from ingest.video.stills import StillsOptions

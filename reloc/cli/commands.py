@@ -211,41 +211,29 @@ def _query(args: argparse.Namespace) -> int:
 
 
 def _localise(args: argparse.Namespace) -> int:
-    import uuid
-
     from featuredb.cli.common import open_database
-    from featuredb.features.decode import DecodeLimits
-    from featuredb.stage_clock import StageClock
+    from reloc.asking import PhotoAsker
     from reloc.cli.query_arguments import parse_camera, parse_prior
-    from reloc.localiser import Localiser
     from reloc.overlay import map_points_in_view
-    from reloc.service.handler import answer_query
-    from reloc.wire.query import LocaliseWireRequest, RequestOptions
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
     database = open_database(args)
-    localiser = Localiser.open(database)
+    asker = PhotoAsker(database)
 
     def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
-        request = LocaliseWireRequest(
+        answer = asker.ask(
+            data,
             prior=prior,
             camera=lens or camera,
-            options=RequestOptions(
-                inliers=first or args.overlay is not None,
-                exif_prior=not args.no_exif_prior,
-                maps=tuple(args.map) if args.map else None,
-            ),
+            exif_prior=not args.no_exif_prior,
+            maps=tuple(args.map) if args.map else None,
+            inliers=first or args.overlay is not None,
         )
-        return answer_query(
-            data,
-            request,
-            localiser,
-            limits=DecodeLimits(),
-            request_id=uuid.uuid4().hex,
-            clock=StageClock(),
-        )
+        return answer.reply
 
-    return _answer_all(args, ask, database.name, lambda reply: map_points_in_view(localiser.areas, reply))
+    return _answer_all(
+        args, ask, database.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
+    )
 
 
 def _answer_all(
@@ -255,7 +243,7 @@ def _answer_all(
     other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
 ) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
-    from reloc.cli.wording import describe
+    from reloc.wording import describe
 
     codes = {0}
     lenses = _shared_lenses(args, ask) if args.shared_lens else {}

@@ -24,6 +24,7 @@ from reloc.wire.query import (
     PriorRequest,
     RequestOptions,
     encode,
+    explain,
 )
 from reloc.wire.server import Event, MapsReply, StatusReply
 
@@ -159,7 +160,7 @@ class Client:
                 ),
             )
         except ValidationError as error:
-            raise InvalidValueError(f"localise: {error}") from error
+            raise InvalidValueError(f"localise: {explain(error)}") from error
         key = self._keys.localise(self.name)
         end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
         while True:

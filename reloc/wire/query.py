@@ -350,7 +350,7 @@ def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attac
     try:
         return model.model_validate_json(attachment)
     except ValidationError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, _explain(error), _request_id_of(attachment)) from error
+        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_of(attachment)) from error
 
 
 def encode(message: BaseModel) -> bytes:
@@ -358,7 +358,7 @@ def encode(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
     """One line for people out of pydantic's list: field, expectation, what was found."""
     parts = []
     for item in error.errors(include_url=False)[:3]:

@@ -13,13 +13,13 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
-from reloc.cli.wording import describe
 from reloc.gateway.geopose import NotLocalisedError, response_of
 from reloc.gateway.protocol import GeoPoseReq
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
 from reloc.wire.query import LocaliseReply
+from reloc.wording import describe
 from schemas import load_schema
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 

@@ -11,7 +11,6 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from reloc.cli.wording import ADVICE, describe
 from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
 from reloc.service.metrics import ServerMetrics
@@ -21,6 +20,7 @@ from reloc.service.session import bind_free_port
 from reloc.service.threads import capped_process
 from reloc.wire.keys import Keys
 from reloc.wire.query import ContributionReply, RequestError, encode, parse_request
+from reloc.wording import ADVICE, describe
 from tests.support.service import localised, not_localised
 
 

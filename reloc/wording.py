@@ -60,17 +60,21 @@ def describe(name: str, reply: LocaliseReply, database: str) -> str:
     )
 
 
-def _looks(reply: LocaliseReply) -> str:
-    """The camera's angles; see docs/localisation.md."""
+def angles(reply: LocaliseReply) -> GeoPose:
+    """The pose of a localised reply, which tells its angles; see docs/localisation.md."""
     assert reply.position is not None
     assert reply.quaternion is not None
     q = reply.quaternion
-    pose = GeoPose(
+    return GeoPose(
         latitude_deg=reply.position.lat,
         longitude_deg=reply.position.lon,
         height_m=reply.position.h,
         quaternion_xyzw=(q.x, q.y, q.z, q.w),
     )
+
+
+def _looks(reply: LocaliseReply) -> str:
+    pose = angles(reply)
     heading, pitch, roll = pose.heading_pitch_roll_deg
     text = f"heading {heading:.2f} deg from true north, pitch {pitch:+.2f}, roll {roll:+.2f}"
     if abs(pitch) > _STEEP_DEG:
