@@ -18,6 +18,7 @@ from featuredb.cli.common import (
     hours,
     json_text,
     open_database,
+    place_for_database,
     storage_options,
     version_or_time,
     write_json,
@@ -72,6 +73,7 @@ def register(subparsers: Any) -> None:
 def run_init(args: argparse.Namespace) -> int:
     from featuredb.store import Database
 
+    place_for_database(args)
     database = Database.create(args.db, storage_options=storage_options(args))
     sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
     return 0

@@ -390,7 +390,7 @@ def _why_not_opened(
         return damaged(url, problem)
     if isinstance(error, TableNotFoundError):
         return DatabaseNotFoundError(
-            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
+            f"no featuredb table at {url}; check the path, or create the database with `featuredb init`"
         )
     if version is not None:
         return SnapshotNotFoundError(f"{url} has no version {version}: {error}")

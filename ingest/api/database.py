@@ -11,15 +11,17 @@ from featuredb.export.selection import Selection
 from featuredb.geometry.camera import Camera
 from featuredb.maps.feature_map import GeoPrior
 from featuredb.store import Database
+from featuredb.store.durable.making import check_place
 from featuredb.store.sql import SqlSession, SqlTable
 from ingest.anchoring import AnchorRequest, anchor
 from ingest.api.anchor_words import anchoring_text
 from ingest.api.ingesting import IngestChoices, ingest, ingest_options
 from ingest.api.progress_bars import progress_bars
 from ingest.api.registering import place_by_control
-from ingest.api.results import Aligned, Grown, Ingested, ListedMaps, Tracked
+from ingest.api.results import Aligned, FilmTrack, Grown, Ingested, ListedMaps
 from ingest.api.tracking import track_film
 from ingest.growing import GrowingOptions, grow_candidates
+from ingest.photos.scan import require_photos
 from ingest.register.anchor.start.first_place import StartFiles
 from ingest.track.finders import FilmBy, FilmGround
 from reloc.asking import Image, PhotoAnswer, PhotoAsker
@@ -85,6 +87,7 @@ class FeatureDatabase:
             IngestError: fewer than two usable photos. InvalidValueError: a choice that cannot be.
         """
         options = ingest_options(**choices)
+        require_photos(Path(photos))
         folder = None if report is None else Path(report)
         return Ingested(report=ingest(self.store, Path(photos), options, report=folder, quiet=quiet))
 
@@ -199,7 +202,7 @@ class FeatureDatabase:
         camera: Camera | None = None,
         prior: GeoPrior | None = None,
         options: TrackVideoOptions | None = None,
-    ) -> Tracked:
+    ) -> FilmTrack:
         """The pose of every frame of a film, or that it is lost; as `featuredb track`.
 
         Args:
@@ -220,7 +223,7 @@ class FeatureDatabase:
             scans=None if scans is None else tuple(scans),
             pose_file=_path(pose),
         )
-        return Tracked(
+        return FilmTrack(
             film=track_film(
                 self.store,
                 film,
@@ -277,8 +280,10 @@ def open_database(
     url: PathLike, *, create: bool = False, storage_options: Mapping[str, str] | None = None
 ) -> FeatureDatabase:
     """See `featuredb.open`."""
-    make = Database.create if create else Database.open
-    return FeatureDatabase(make(str(url), storage_options=storage_options))
+    if not create:
+        return FeatureDatabase(Database.open(url, storage_options=storage_options))
+    check_place(Database(str(url), storage_options).url)
+    return FeatureDatabase(Database.create(url, storage_options=storage_options))
 
 
 def _ways(control_points: object, photos: object, by_maps: bool) -> dict[str, bool]:

@@ -89,7 +89,7 @@ class Aligned:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Tracked:
+class FilmTrack:
     """The poses of a film's frames; `film.video.trajectory.points` has each with its covariance."""
 
     film: TrackedFilm

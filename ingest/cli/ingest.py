@@ -202,12 +202,15 @@ def ingest_folder(args: argparse.Namespace, folder: Path, films: Sequence["FilmO
         args: of `featuredb ingest photos` or `video`.
         films: whose keyframes the folder holds, a folder for each.
     """
-    from featuredb.cli.common import storage_options
+    from featuredb.cli.common import place_for_database, storage_options
     from featuredb.store import Database
     from ingest.api.ingesting import IngestChoices, ingest, ingest_options, summary
+    from ingest.photos.scan import require_photos
 
     choices = {name: getattr(args, name) for name in IngestChoices.__annotations__}
     options = ingest_options(films=bool(films), **choices)
+    place_for_database(args)
+    require_photos(folder)
     database = Database.create(args.db, storage_options=storage_options(args))
     report = ingest(database, folder, options, films, report=args.report, quiet=args.quiet)
     sys.stdout.write(summary(report))

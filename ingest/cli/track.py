@@ -66,6 +66,9 @@ def register(subparsers: Any) -> None:
         metavar="FILE",
         help="coarse pose of the first frame, JSON as for `featuredb anchor --pose`; a scan alone needs it",
     )
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per second of a folder without a file of times"
+    )
     parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
     parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
     parser.add_argument(
@@ -100,7 +103,9 @@ def run_track(args: argparse.Namespace) -> int:
         ),
         camera=_camera(args.camera),
         prior=_prior(args.prior),
-        options=TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end),
+        options=TrackVideoOptions(
+            max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
+        ),
     )
     sys.stdout.write(json.dumps(done.summary()) + "\n" if args.json else done.as_text())
     return exit_code(done.outputs, done.video.trajectory)

@@ -190,6 +190,7 @@ def _query(args: argparse.Namespace) -> int:
         raise InvalidValueError(
             "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
         )
+    _require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
         def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
@@ -217,6 +218,7 @@ def _localise(args: argparse.Namespace) -> int:
     from reloc.overlay import map_points_in_view
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
+    _require_an_image(args.image)
     database = open_database(args)
     asker = PhotoAsker(database)
 
@@ -234,6 +236,12 @@ def _localise(args: argparse.Namespace) -> int:
     return _answer_all(
         args, ask, database.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
     )
+
+
+def _require_an_image(paths: list[str]) -> None:
+    """Before maps are loaded, or a server is waited for."""
+    if not any(Path(path).is_file() for path in paths):
+        raise InvalidValueError(f"{', '.join(paths)}: expected a photo, found no such file; check the path")
 
 
 def _answer_all(

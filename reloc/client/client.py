@@ -244,8 +244,8 @@ class Client:
         except zenoh.ZError as error:
             raise ServiceError(
                 NO_SERVER,
-                f"nobody answers at {self._where} ({str(error).split(' at /')[0]}); is `featuredb serve` "
-                "running, and is this its --listen endpoint?",
+                f"nobody answers at {self._where}; is `featuredb serve` running, and is this its --listen "
+                "endpoint?",
             ) from error
 
     def _ask(

@@ -1,15 +1,17 @@
 """How tables are made, and what their Parquet files are written like."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 from deltalake import ColumnProperties, DeltaTable, WriterProperties
 
 from featuredb.errors import DatabaseNotFoundError, StoreError
-from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
+from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, SPECS, TableSpec
 
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
+_WORK = "_work"  # where jobs keep what is unfinished, before there are tables
 
 
 def create_table(url: str, spec: TableSpec, storage_options: dict[str, str] | None) -> None:
@@ -78,3 +80,27 @@ def format_of(metadata: Any) -> Any:
         return json.loads(metadata.description or "{}").get("featuredb_format")
     except (ValueError, AttributeError):
         return None
+
+
+def check_place(url: str) -> None:
+    """Before hours of work for a new database: is there one, or a place for one? Makes nothing.
+
+    Args:
+        url: of a `Database`.
+
+    Raises:
+        StoreError: a local path that is mistyped: in no folder, a file, or a folder of other things.
+    """
+    if "://" in url:
+        return
+    folder = Path(url)
+    if not folder.parent.is_dir():
+        raise StoreError(
+            f"{folder}: there is no folder {folder.parent} to make a database in; check the path, or make "
+            "that folder first"
+        )
+    if folder.exists() and not folder.is_dir():
+        raise StoreError(f"{folder} is a file, and a database is a folder; name another one")
+    there = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    if there and not there & {*SPECS, _WORK}:
+        raise StoreError(f"{folder} is a folder of other things, and no database; name one that is free")
