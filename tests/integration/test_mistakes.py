@@ -3,10 +3,13 @@
 Each runs as a program of its own, so that nothing that a library writes is missed.
 """
 
+import argparse
+import ast
 import re
 import socket
 import subprocess
 import sys
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import cv2
@@ -14,8 +17,9 @@ import laspy
 import numpy as np
 import pytest
 
-from featuredb.cli.main import main
+from featuredb.cli.main import COMMAND_GROUP, build_parser
 from featuredb.store import Database
+from tests.conftest import REPOSITORY
 from tests.support import planar_map as field
 
 # Command, and what its line has to say. {port} is one at which nobody listens.
@@ -129,15 +133,29 @@ def test_a_mistake_ends_in_one_line_that_says_what_to_do(folder: Path, mistake: 
     assert contents(folder) == before
 
 
-@pytest.mark.parametrize(
-    ("command", "option"),
-    [("lidar add", "--crs"), ("serve", "--listen"), ("track", "--fps"), ("live", "--fps")],
-)
-def test_the_options_that_are_advised_exist(
-    command: str, option: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*command.split(), "--help"]) == 0
-    assert option in capsys.readouterr().out
+def options_of(parser: argparse.ArgumentParser) -> set[str]:
+    """Of all its subcommands."""
+    found = set(parser._option_string_actions)
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found.update(*(options_of(sub) for sub in action.choices.values()))
+    return found
+
+
+def test_every_option_that_a_text_names_exists() -> None:
+    """Also those of help and of reports; CSS has names of that form behind brackets and semicolons."""
+    known = options_of(build_parser(entry_points(group=COMMAND_GROUP)))
+    of_others = {"--check", "--file"}  # sha256sum, projsync
+    named = [
+        (module.relative_to(REPOSITORY).as_posix(), option)
+        for package in ("featuredb", "ingest", "reloc")
+        for module in sorted((REPOSITORY / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        for option in re.findall(r"(?<![\w({;-])--[a-z][a-z-]*", node.value)
+    ]
+    assert len(named) > 300
+    assert [(module, option) for module, option in named if option not in known | of_others] == []
 
 
 def test_frames_with_a_rate_are_tracked(folder: Path, tmp_path: Path) -> None:
