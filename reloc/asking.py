@@ -21,6 +21,7 @@ from featuredb.store import Database
 from reloc.localiser import Localiser
 from reloc.overlay import draw_overlay, map_points_in_view
 from reloc.service.handler import answer_query
+from reloc.service.options import wire_name_of
 from reloc.wire.query import (
     CameraRequest,
     LocaliseReply,
@@ -102,6 +103,7 @@ class PhotoAsker:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self.name = wire_name_of(database.url)  # as a server calls it
         self._lock = threading.Lock()
         self._localiser: Localiser | None = None
 
@@ -151,7 +153,7 @@ class PhotoAsker:
         on_earth = reply.status == "localised"
         return PhotoAnswer(
             name=name or called,
-            database=self._database.name,
+            database=self.name,
             reply=reply,
             photo=photo,
             other_points_utm=map_points_in_view(localiser.areas, reply) if on_earth and inliers else None,

@@ -53,7 +53,7 @@ class FeatureDatabase:
     @property
     def name(self) -> str:
         """What it calls itself in answers."""
-        return self.store.name
+        return self._asker.name
 
     @property
     def maps(self) -> ListedMaps:

@@ -219,8 +219,7 @@ def _localise(args: argparse.Namespace) -> int:
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
     _require_an_image(args.image)
-    database = open_database(args)
-    asker = PhotoAsker(database)
+    asker = PhotoAsker(open_database(args))
 
     def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
         answer = asker.ask(
@@ -234,7 +233,7 @@ def _localise(args: argparse.Namespace) -> int:
         return answer.reply
 
     return _answer_all(
-        args, ask, database.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
+        args, ask, asker.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
     )
 
 
