@@ -240,7 +240,7 @@ class Localiser:
     def _in_own_frame(self, gray: NDArray[np.uint8], request: LocaliseRequest, map_id: str) -> LocaliseResult:
         """The pose in the own frame of a map without a place, or the reason why there is none."""
         unplaced, indexed = self._unplaced[map_id].get()
-        told = replace(request, prior=None, beyond=None, map_ids=None)
+        told = replace(request, prior=None, own_position=None, beyond=None, map_ids=None)
         return in_own_frame(localise(gray, told, [indexed], self._options, self._snapshot), unplaced)
 
     def with_lineage(self, result: LocaliseResult) -> LocaliseResult:

@@ -16,6 +16,7 @@ from reloc.wire.query import (
     InMapPose,
     Lineage,
     LocaliseReply,
+    OwnPositionUse,
     Position,
     Quaternion,
     RunnerUpPose,
@@ -27,7 +28,7 @@ def reply_from_result(
     result: LocaliseResult, *, request_id: str, timings_ms: dict[str, float]
 ) -> LocaliseReply:
     """Word a result as the wire does; `timings_ms` replaces the result's own."""
-    runner_up = result.runner_up
+    runner_up, own = result.runner_up, result.own_position
     fields: dict[str, Any] = _NO_POSE if result.pose is None else _pose_fields(result.pose)
     if result.in_map is not None:
         fields = _NO_POSE | {"in_map": _in_map(result.in_map), "maps": (result.in_map.map_id,)}
@@ -49,6 +50,7 @@ def reply_from_result(
             lon=runner_up.longitude_deg,
         ),
         snapshot=result.snapshot,
+        exif_prior=None if own is None else OwnPositionUse(role=own.role, distance_m=own.distance_m),
         timings_ms=timings_ms,
         request_id=request_id,
         body_axes=BODY_AXES,

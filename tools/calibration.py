@@ -20,7 +20,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.flight import received_positions
 from featuredb.simworld.world import World
 from ingest.register.gps import GpsOptions, place_by_gps
-from reloc.localise.answer import placement_covariance, radius_68
+from reloc.localise.answer import error_radius, placement_covariance
 from reloc.localise.result import LocalisedPose
 
 # An answer, and the true cam_from_local in the frame of the answer.
@@ -206,9 +206,9 @@ def _placed_by(feature_map: FeatureMap, local_from_sfm: Any, covariance: FloatAr
 def _calibration(rows: Sequence[tuple[FloatArray, FloatArray]], refused: int = 0) -> Calibration:
     inside = [
         (
-            np.hypot(*error[3:5]) <= radius_68(covariance[3:5, 3:5]),
-            abs(error[5]) <= radius_68(covariance[5:, 5:]),
-            np.linalg.norm(error[:3]) <= radius_68(covariance[:3, :3]),
+            np.hypot(*error[3:5]) <= error_radius(covariance[3:5, 3:5]),
+            abs(error[5]) <= error_radius(covariance[5:, 5:]),
+            np.linalg.norm(error[:3]) <= error_radius(covariance[:3, :3]),
         )
         for error, covariance in rows
     ]

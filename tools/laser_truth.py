@@ -27,7 +27,7 @@ from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
 from featuredb.maps.lens_uncertainty import LensUncertainty
 from featuredb.store import Database
-from reloc.localise.answer import placement_covariance, radius_68
+from reloc.localise.answer import error_radius, placement_covariance
 from reloc.localise.lens_prior import lens_of, seen_by_a_map
 from reloc.wire.query import CameraRequest
 from tools.figures import add_json_option, write_figures
@@ -131,8 +131,8 @@ def map_errors(maps: Sequence[FeatureMap], truth: LaserSet) -> Errors:
             own = np.zeros((6, 6)) if image.covariance is None else image.covariance
             covariance = world_from_cam @ own @ world_from_cam.T
             covariance += placement_covariance(area, one, pose.center)
-            told_m.append(radius_68(covariance[3:, 3:]))
-            told_deg.append(float(np.degrees(radius_68(covariance[:3, :3]))))
+            told_m.append(error_radius(covariance[3:, 3:]))
+            told_deg.append(float(np.degrees(error_radius(covariance[:3, :3]))))
     return pose_errors(poses, truth.poses, told_m, told_deg, len(truth.mapped))
 
 

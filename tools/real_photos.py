@@ -29,7 +29,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.simworld.scoring import PoseError, pose_difference
 from featuredb.store import Database
 from reloc.client import Client, LocaliseReply
-from reloc.localise.answer import radius_68
+from reloc.localise.answer import error_radius
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
 from reloc.wire.query import CameraRequest
@@ -195,7 +195,7 @@ def _row(name: str, reply: LocaliseReply, frame: LocalFrame, pose: Rigid3, wall_
         vertical_68_m=accuracy.vertical_68_m if accuracy else nan,
         orientation_68_deg=accuracy.orientation_68_deg if accuracy else nan,
         wall_ms=wall_ms,
-        position_68_m=nan if reply.covariance is None else radius_68(np.array(reply.covariance)[3:, 3:]),
+        position_68_m=nan if reply.covariance is None else error_radius(np.array(reply.covariance)[3:, 3:]),
     )
 
 

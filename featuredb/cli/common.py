@@ -67,6 +67,20 @@ def open_database(args: argparse.Namespace) -> "Database":
     return Database.open(args.db, storage_options=storage_options(args))
 
 
+def place_for_database(args: argparse.Namespace) -> "Database":
+    """The database that the arguments name, which a command makes later where there is none.
+
+    Raises:
+        StoreError: there is no place for it, as where the path is mistyped.
+    """
+    from featuredb.store import Database
+    from featuredb.store.durable.making import check_place
+
+    database = Database(args.db, storage_options(args))
+    check_place(database.url)
+    return database
+
+
 def version_or_time(text: str) -> int | datetime:
     """A snapshot given by number, or by an ISO 8601 time (UTC where it names no zone)."""
     if text.isdigit():

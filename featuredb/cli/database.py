@@ -18,6 +18,7 @@ from featuredb.cli.common import (
     hours,
     json_text,
     open_database,
+    place_for_database,
     storage_options,
     version_or_time,
     write_json,
@@ -25,7 +26,7 @@ from featuredb.cli.common import (
 from featuredb.store.vacuum_options import VacuumOptions
 
 if TYPE_CHECKING:
-    from featuredb.store import UnplacedSummary
+    from featuredb.store import MapSummary, UnplacedSummary
     from featuredb.store.sql import SqlResult
 
 _DEFAULTS = VacuumOptions()
@@ -73,6 +74,7 @@ def register(subparsers: Any) -> None:
 def run_init(args: argparse.Namespace) -> int:
     from featuredb.store import Database
 
+    place_for_database(args)
     database = Database.create(args.db, storage_options=storage_options(args))
     sys.stdout.write(f"database at {database.url}, version {database.poll_version()}\n")
     return 0
@@ -87,11 +89,17 @@ def run_maps(args: argparse.Namespace) -> int:
         rows = [row for row in snapshot.rows() if row["map_id"] in wanted]
         write_json({"snapshot": snapshot.version, "timestamp": snapshot.timestamp, "maps": rows})
         return 0
+    sys.stdout.write(maps_table(maps) + unplaced_text(unplaced))
+    return 0
+
+
+def maps_table(maps: Sequence["MapSummary"]) -> str:
+    """Maps with a place, and why some are in quarantine."""
     header = (
         "map", "name", "status", "method", "gen", "drift_m", "epsg", "images", "points", "residual_m",
         "committed",
     )  # fmt: skip
-    rows_ = [
+    rows = [
         (
             m.map_id, m.name, m.status, m.method, m.generation,
             None if m.drift_m is None else round(m.drift_m, 3), m.epsg, m.images, m.points,
@@ -99,18 +107,15 @@ def run_maps(args: argparse.Namespace) -> int:
         )
         for m in maps
     ]  # fmt: skip
-    sys.stdout.write(format_table(header, rows_))
-    sys.stdout.writelines(
+    return format_table(header, rows) + "".join(
         f"{m.map_id}: {m.status_reason}\n" for m in maps if m.status == "quarantined" and m.status_reason
     )
-    _write_unplaced(unplaced)
-    return 0
 
 
-def _write_unplaced(unplaced: Sequence["UnplacedSummary"]) -> None:
-    """The maps without a place, with what would give them one."""
+def unplaced_text(unplaced: Sequence["UnplacedSummary"]) -> str:
+    """The maps without a place, with what would give them one; nothing where there are none."""
     if not unplaced:
-        return
+        return ""
     header = (
         "map without a place", "name", "status", "metric", "upright", "images", "points", "why", "committed",
     )  # fmt: skip
@@ -121,10 +126,11 @@ def _write_unplaced(unplaced: Sequence["UnplacedSummary"]) -> None:
         )
         for m in unplaced
     ]  # fmt: skip
-    sys.stdout.write("\n" + format_table(header, rows))
+    lines = ["\n" + format_table(header, rows)]
     for m in unplaced:
-        sys.stdout.write(f"{m.map_id}: {m.no_place.reason}\n")
-        sys.stdout.writelines(f"  {way}\n" for way in m.no_place.ways)
+        lines.append(f"{m.map_id}: {m.no_place.reason}\n")
+        lines += [f"  {way}\n" for way in m.no_place.ways]
+    return "".join(lines)
 
 
 def run_history(args: argparse.Namespace) -> int:

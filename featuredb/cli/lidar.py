@@ -13,7 +13,7 @@ from featuredb.cli.common import (
     count_bars,
     format_table,
     open_database,
-    storage_options,
+    place_for_database,
     write_json,
 )
 from featuredb.geo.heights import HEIGHT_DATUMS, HEIGHT_UNITS
@@ -52,13 +52,12 @@ def run_add(args: argparse.Namespace) -> int:
     """Add a scan and say what is in it."""
     from featuredb.lidar.add import add_scan
     from featuredb.lidar.options import AddOptions, OrthoChoice, ScanLabels
-    from featuredb.store import Database
 
+    database = place_for_database(args)
     options = AddOptions(crs=args.crs, height_unit=args.height_unit, height_datum=args.height_datum)
     if args.keep_outliers:
         options = replace(options, outliers=None)
     ortho = None if args.ortho is None else OrthoChoice(path=args.ortho, crs=args.ortho_crs)
-    database = Database(args.db, storage_options(args))
     with _progress(args.quiet) as on_progress:
         result = add_scan(
             database,

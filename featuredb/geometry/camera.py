@@ -69,7 +69,9 @@ class Camera:
     def from_focal(cls, width: int, height: int, focal_px: float, model: str = "SIMPLE_RADIAL") -> Self:
         """A camera of the given model with this focal length, centred, without distortion."""
         if model not in SUPPORTED_MODELS:
-            raise InvalidValueError(f"Camera.model: unknown model {model!r}")
+            raise InvalidValueError(
+                f"Camera.model: expected one of {', '.join(SUPPORTED_MODELS)}, found {model!r}"
+            )
         width, height = _pixel_count("Camera.width", width), _pixel_count("Camera.height", height)
         camera = _pycolmap().Camera.create_from_model_name(1, model, float(focal_px), width, height)
         return cls(model=model, width=width, height=height, params=tuple(camera.params))

@@ -6,12 +6,14 @@ needs, and has no way to files, network, extensions or settings.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import duckdb
 import pyarrow as pa
 
 from featuredb.errors import StoreError
+from featuredb.extras import require
 from featuredb.store.candidates.upkeep import growth_tables
 from featuredb.store.database import Database
 from featuredb.store.encode import map_rows_table
@@ -29,6 +31,7 @@ from featuredb.store.tables import (
 )
 
 _BATCH_ROWS = 1024  # rows that are fetched at a time; bounds memory, not the result
+_SHOWN_ROWS = 20  # in a notebook
 _ALLOWED = (duckdb.StatementType.SELECT, duckdb.StatementType.EXPLAIN)
 
 _CAMERAS_VIEW = """
@@ -64,6 +67,41 @@ class SqlResult:
     rows: Iterator[tuple[Any, ...]]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SqlTable:
+    """All rows of a query, as an Arrow table."""
+
+    table: Any
+
+    def arrow(self) -> Any:
+        """A `pyarrow.Table`."""
+        return self.table
+
+    def df(self) -> Any:
+        """A `pandas.DataFrame`.
+
+        Raises:
+            MissingExtraError: pandas is not installed.
+        """
+        require("notebook", "df()", "pandas")
+        return self.table.to_pandas()
+
+    def __len__(self) -> int:
+        return int(self.table.num_rows)
+
+    def __repr__(self) -> str:
+        columns = ", ".join(f"{field.name} {field.type}" for field in self.table.schema)
+        return f"{len(self)} rows of {columns}"
+
+    def _repr_html_(self) -> str:
+        """The first rows, for a notebook."""
+        shown = self.table.slice(0, _SHOWN_ROWS).to_pylist()
+        head = "".join(f"<th>{escape(name)}</th>" for name in self.table.column_names)
+        rows = ("".join(f"<td>{escape(str(v))}</td>" for v in row.values()) for row in shown)
+        body = "".join(f"<tr>{cells}</tr>" for cells in rows)
+        return f"<table><tr>{head}</tr>{body}</table><p>{len(self)} rows</p>"
+
+
 class SqlSession:
     """DuckDB over one snapshot; a context manager.
 
@@ -95,6 +133,27 @@ class SqlSession:
         Raises:
             StoreError: not one reading statement, or DuckDB refuses it; the message is DuckDB's.
         """
+        statement = self._statement(text)
+        try:
+            self._connection.execute(statement)
+        except duckdb.Error as error:
+            raise StoreError(f"SQL: {error}") from error
+        columns = tuple(column[0] for column in self._connection.description or [])
+        return SqlResult(columns=columns, rows=self._fetch())
+
+    def table(self, text: str) -> SqlTable:
+        """The same, with all rows at once.
+
+        Raises:
+            StoreError: as `query`.
+        """
+        statement = self._statement(text)
+        try:
+            return SqlTable(table=self._connection.sql(statement).to_arrow_table())
+        except (duckdb.Error, OSError, pa.ArrowException) as error:
+            raise StoreError(f"SQL: {error}") from error
+
+    def _statement(self, text: str) -> Any:
         try:
             statements = self._connection.extract_statements(text)
         except duckdb.Error as error:
@@ -102,12 +161,7 @@ class SqlSession:
         if len(statements) != 1 or statements[0].type not in _ALLOWED:
             found = ", ".join(s.type.name for s in statements) or "nothing"
             raise StoreError(f"SQL: expected one SELECT, found {found}; this is read-only")
-        try:
-            self._connection.execute(statements[0])
-        except duckdb.Error as error:
-            raise StoreError(f"SQL: {error}") from error
-        columns = tuple(column[0] for column in self._connection.description or [])
-        return SqlResult(columns=columns, rows=self._fetch())
+        return statements[0]
 
     def _register(self) -> None:
         self._connection.register("stored_maps", _without_zone(map_rows_table(self.snapshot.rows())))

@@ -180,7 +180,8 @@ def _timed(folder: Path, names: list[str], fps: float | None) -> list[tuple[floa
     else:
         raise VideoError(
             f"{folder}: expected the times of its {len(names)} pictures, found none; put a {_CSV_NAME} "
-            f"(columns file,time_s) or a {_TXT_NAME} (a time on each line) beside them, or give a rate (fps)"
+            f"(columns file,time_s) or a {_TXT_NAME} (a time on each line) beside them, or give their "
+            "rate by --fps"
         )
     for (before_s, before), (time_s, name) in pairwise(timed):
         if time_s <= before_s:

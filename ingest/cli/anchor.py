@@ -1,14 +1,13 @@
 """`featuredb anchor DB MAP`: arguments in; proposals, pictures, a report, a placed map out."""
 
 import argparse
-import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from featuredb.store import Database
-    from ingest.anchoring import Anchoring, AnchorRequest
+    from ingest.anchoring import AnchorRequest
 
 _EPILOG = """\
 Without --auto and --confirm nothing is changed: the frames that register best are shown, with the command
@@ -72,7 +71,8 @@ def run_anchor(args: argparse.Namespace) -> int:
     """Anchor; 0 if the map was placed or frames were proposed, 1 if not, with the reason."""
     from featuredb.cli.common import open_database
     from ingest.anchoring import anchor
-    from ingest.cli.progress_bars import progress_bars
+    from ingest.api.anchor_words import anchoring_text
+    from ingest.api.progress_bars import progress_bars
 
     request = _request(args)
     database = open_database(args)
@@ -80,7 +80,7 @@ def run_anchor(args: argparse.Namespace) -> int:
         return _page(database, request, args)
     with progress_bars(args.quiet) as progress:
         done = anchor(database, request, progress)
-    sys.stdout.write(summary(done, args))
+    sys.stdout.write(anchoring_text(done, args.db))
     return 0 if done.placed or done.proposed else 1
 
 
@@ -128,44 +128,3 @@ def _request(args: argparse.Namespace) -> "AnchorRequest":
         start=StartFiles(pose=args.pose, picks=args.picks, image=args.image),
         storage_options=tuple(args.storage_option),
     )
-
-
-def summary(done: "Anchoring", args: argparse.Namespace) -> str:
-    """What happened, for the terminal; the report has the rest."""
-    from featuredb.cli.common import format_table
-    from ingest.register.anchor.report import FRAME_HEADER, frame_rows
-
-    report, result = done.report, done.report.result
-    lines = list(report.notes)
-    rows = frame_rows(report)
-    if rows:
-        lines.append(format_table(FRAME_HEADER, rows).rstrip())
-    lines.extend(f"{name}: {seconds:.2f} s" for name, seconds in report.times_s().items())
-    if done.placed and result is not None and result.before is not None and result.after is not None:
-        move = result.checks["move"]
-        lines.append(
-            f"map {done.map_id} is placed by its scan: version {done.version}; moved "
-            f"{move['horizontal_m']:.2f} m in plan and {move['up_m']:+.2f} m up; its points lie "
-            f"{result.after.median_m:.3f} m (median) from the scan, {result.before.median_m:.2f} m before"
-        )
-        lines.extend(f"quarantined, since this map had placed it: {map_id}" for map_id in done.flagged)
-        lines.append(f"the old placement: featuredb rollback {shlex.quote(args.db)} {done.version_before}")
-    elif result is not None:
-        lines.append(f"not placed: {result.reason}: {result.message}")
-    elif done.proposed:
-        lines.append(f"look at {done.page}; if the edges of the scan lie on the photos, place the map:")
-        lines.append(f"  {done.command}")
-    else:
-        lines.append(_nothing(done))
-    lines.append(f"report: {done.report_page}")
-    return "\n".join(lines) + "\n"
-
-
-def _nothing(done: "Anchoring") -> str:
-    tried = done.report.tried.tried
-    if not tried:
-        return (
-            "nothing proposed: no frame of the map sees enough of the scan from where the map is placed now"
-        )
-    reasons = "; ".join(f"{f.image.name}: {f.registration.reason}: {f.registration.message}" for f in tried)
-    return f"nothing proposed: no frame was registered: {reasons}"

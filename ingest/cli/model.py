@@ -79,7 +79,7 @@ def add_model_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run_model(args: argparse.Namespace) -> int:
     """Import, commit, and say in a line what came of it."""
-    from featuredb.cli.common import storage_options
+    from featuredb.cli.common import place_for_database, storage_options
     from featuredb.maps.unplaced_map import UnplacedMap
     from featuredb.store import Database
     from ingest.models_in.model_map import ModelOptions, map_of_model
@@ -98,6 +98,7 @@ def run_model(args: argparse.Namespace) -> int:
         owner=args.owner,
         licence=args.licence,
     )
+    place_for_database(args)
     made = map_of_model(args.folder, options)
     database = Database.create(args.db, storage_options=storage_options(args))
     result = database.commit_map(made)

@@ -3,11 +3,7 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from ingest.register.control.maps import GcpRegistration
-    from ingest.register.control.placement import GcpOptions
+from typing import Any
 
 
 def register(subparsers: Any) -> None:
@@ -63,67 +59,24 @@ def add_control_arguments(parser: Any) -> None:
     )
 
 
-def control_options(args: argparse.Namespace, *, keep_lens: bool = False) -> "GcpOptions":
-    """Options of a placement by control points."""
-    from ingest.register.control.placement import GcpOptions
-
-    return GcpOptions(sigma_m=args.gcp_sigma, ground_m=args.ground_height, keep_lens=keep_lens)
-
-
 def run_register(args: argparse.Namespace) -> int:
     """Place, print the residuals, commit; 0 if the map has its new place, 1 if it was refused."""
     from featuredb.cli.common import open_database
-    from featuredb.maps.unplaced_map import UnplacedMap
-    from ingest.register.control.control_file import read_control_file
-    from ingest.register.control.maps import (
-        gcp_evidence,
-        place_unplaced_by_gcp,
-        register_by_gcp,
-        residual_table,
+    from ingest.api.registering import place_by_control
+    from ingest.register.control.placement import GcpOptions
+
+    done = place_by_control(
+        open_database(args),
+        args.map_id,
+        args.gcp,
+        crs=args.gcp_crs,
+        options=GcpOptions(sigma_m=args.gcp_sigma, ground_m=args.ground_height),
+        height_datum=args.height_datum,
+        report=args.report,
+        dry_run=args.dry_run,
     )
-    from ingest.register.control.report import write_control_report
-
-    file = read_control_file(args.gcp, args.gcp_crs)
-    database = open_database(args)
-    snapshot = database.snapshot()
-    before = snapshot.load_any(args.map_id)
-    options = control_options(args)
-    if isinstance(before, UnplacedMap):
-        result = place_unplaced_by_gcp(before, file, options, args.height_datum)
-    else:
-        result = register_by_gcp(before, file, options, args.height_datum)
-    sys.stdout.write("".join(f"note: {note}\n" for note in file.notes))
-    sys.stdout.write(residual_table(result.placement, result.control))
-    if args.report is not None:
-        write_control_report(
-            args.report,
-            f"Control points of {before.name}",
-            result.placement,
-            result.control,
-            gcp_evidence(result.placement, result.control),
-        )
-    if result.feature_map is None:
-        sys.stdout.write(f"refused: {result.placement.reason}: {result.placement.message}\n")
-        return 1
-    sys.stdout.write(_moved_words(result))
-    if args.dry_run:
-        sys.stdout.write("nothing was committed, as asked\n")
-        return 0
-    committed = database.commit_map(
-        result.feature_map, replaces=args.map_id, based_on=snapshot.get_any(args.map_id).write_id
-    )
-    word = "committed" if committed.created else "was placed so already"
-    sys.stdout.write(f"map {args.map_id}: {word}, snapshot {committed.version}\n")
-    for other in committed.flagged:
-        sys.stdout.write(f"warning: map {other} was placed by this one and is quarantined now\n")
-    return 0
-
-
-def _moved_words(result: "GcpRegistration") -> str:
-    if result.moved_m is None:
-        return "the map had no place before\n"
-    east, north, up = result.moved_m
-    return f"the map moves by {east:+.2f} m east, {north:+.2f} m north, {up:+.2f} m up\n"
+    sys.stdout.write(done.as_text())
+    return 1 if done.result.feature_map is None else 0
 
 
 def sigmas_m(text: str) -> tuple[float, float]:

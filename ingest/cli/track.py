@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from featuredb.geometry.camera import Camera
     from featuredb.maps.feature_map import GeoPrior
-    from reloc.tracking.track_video import TrackedVideo
 
 
 def register(subparsers: Any) -> None:
@@ -67,6 +66,9 @@ def register(subparsers: Any) -> None:
         metavar="FILE",
         help="coarse pose of the first frame, JSON as for `featuredb anchor --pose`; a scan alone needs it",
     )
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per second of a folder without a file of times"
+    )
     parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
     parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
     parser.add_argument(
@@ -82,53 +84,31 @@ def run_track(args: argparse.Namespace) -> int:
     Raises:
         InvalidValueError, VideoError, StoreError, ServiceError, RegistrationError, ScanNotFoundError
     """
-    from dataclasses import replace
-
     from featuredb.cli.common import open_database
-    from featuredb.errors import InvalidValueError
-    from ingest.track.finders import FilmGround, finder_for
-    from reloc.localise.result import LocaliseRequest
-    from reloc.tracking.map_ground import MapFinder
-    from reloc.tracking.track_video import TrackVideoOptions, track_video
-    from reloc.tracking.trajectory.outputs import (
-        check_outputs,
-        check_outputs_in_map,
-        exit_code,
-        write_outputs,
-    )
+    from ingest.api.tracking import track_film
+    from ingest.track.finders import FilmGround
+    from reloc.tracking.track_video import TrackVideoOptions
+    from reloc.tracking.trajectory.outputs import exit_code
 
-    check_outputs(args.out)
-    options = TrackVideoOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end)
-    camera = _camera(args.camera)
-    database = open_database(args)
-    asked = FilmGround(
-        by=args.by,
-        maps=tuple(args.map) if args.map else None,
-        scans=tuple(args.scan) if args.scan else None,
-        pose_file=args.pose,
-    )
-    finder, version = finder_for(database, asked, camera, options.track)
-    prior = _prior(args.prior)
-    if isinstance(finder, MapFinder) and finder.own_map is not None:
-        check_outputs_in_map(args.out, finder.own_map)
-        if prior is not None:
-            raise InvalidValueError(
-                f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"
-            )
-    found = track_video(
+    done = track_film(
+        open_database(args),
         args.video,
-        finder,
-        camera=camera,
-        request=LocaliseRequest(prior=prior),
+        out=args.out,
         overlay=args.overlay,
-        options=options,
+        ground=FilmGround(
+            by=args.by,
+            maps=tuple(args.map) if args.map else None,
+            scans=tuple(args.scan) if args.scan else None,
+            pose_file=args.pose,
+        ),
+        camera=_camera(args.camera),
+        prior=_prior(args.prior),
+        options=TrackVideoOptions(
+            max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
+        ),
     )
-    trajectory = replace(found.trajectory, database=args.db, version=version)
-    found = replace(found, trajectory=trajectory)
-    outputs = write_outputs(args.out, trajectory)
-    summary = _summary(found, [*outputs.written, *([str(args.overlay)] if args.overlay else [])])
-    sys.stdout.write(json.dumps(summary) + "\n" if args.json else _text(summary))
-    return exit_code(outputs, trajectory)
+    sys.stdout.write(json.dumps(done.summary()) + "\n" if args.json else done.as_text())
+    return exit_code(done.outputs, done.video.trajectory)
 
 
 def _camera(text: str | None) -> "Camera | None":
@@ -155,54 +135,3 @@ def _prior(text: str | None) -> "GeoPrior | None":
         sigma_horizontal_m=asked.sigma_m,
         sigma_vertical_m=asked.sigma_vertical_m,
     )
-
-
-def _summary(found: "TrackedVideo", written: list[str]) -> dict[str, Any]:
-    points = found.trajectory.points
-    states = {state: sum(p.state == state for p in points) for state in ("tracking", "relocalised", "lost")}
-    seconds = found.seconds
-    lost = [p for p in points if p.state == "lost"]
-    return {
-        "video": found.trajectory.source,
-        "frames": len(points),
-        **states,
-        "stretches": [list(times) for times in found.trajectory.times_found()],
-        "frame": "own" if found.trajectory.is_in_map else "earth",
-        "last_reason": lost[-1].detail if lost else "",
-        "frames_per_s": round(len(points) / max(seconds.total, 1e-9), 1),
-        "seconds": {
-            name: round(getattr(seconds, name), 3)
-            for name in ("total", "decoding", "tracking", "drawing", "longest_gap")
-        },
-        "camera": None
-        if found.camera is None
-        else {
-            "model": found.camera.model,
-            "width": found.camera.width,
-            "height": found.camera.height,
-            "params": list(found.camera.params),
-        },
-        "complaints": list(found.complaints),
-        "written": written,
-    }
-
-
-def _text(summary: dict[str, Any]) -> str:
-    lines = [
-        f"{summary['video']}: {summary['frames']} frames, {summary['tracking']} tracked, "
-        f"{summary['relocalised']} relocalised, {summary['lost']} lost",
-    ]
-    lines += [f"  from {a:.2f} s to {b:.2f} s" for a, b in summary["stretches"]]
-    if summary["last_reason"]:
-        lines.append(f"  lost at the end or before: {summary['last_reason']}")
-    seconds = summary["seconds"]
-    lines.append(
-        f"  {summary['frames_per_s']} frames a second: {seconds['decoding']:.1f} s decoding, "
-        f"{seconds['tracking']:.1f} s tracking, {seconds['drawing']:.1f} s drawing; longest gap "
-        f"{1000 * seconds['longest_gap']:.0f} ms"
-    )
-    if summary["frame"] == "own":
-        lines.append("  poses are in the map's own frame, and say nothing of where on Earth that is")
-    lines += [f"  the film: {what}" for what in summary["complaints"]]
-    lines += [f"  wrote {file}" for file in summary["written"]]
-    return "\n".join(lines) + "\n"

@@ -70,11 +70,10 @@ def run_video(args: argparse.Namespace) -> int:
         VideoError: no film can be read, or they show too little motion.
         TelemetryError, IngestError, StoreError, InvalidValueError
     """
-    from featuredb.cli.common import storage_options
+    from featuredb.cli.common import place_for_database
     from featuredb.geo.heights import HEIGHT_DATUMS
-    from featuredb.store import Database
+    from ingest.api.progress_bars import progress_bars
     from ingest.cli.ingest import ingest_folder
-    from ingest.cli.progress_bars import progress_bars
     from ingest.video.films import find_films, make_films
     from ingest.video.keyframes import KeyframeOptions
     from ingest.video.stills import StillsOptions
@@ -91,7 +90,7 @@ def run_video(args: argparse.Namespace) -> int:
         keyframes=KeyframeOptions(most=args.keyframes, least=min(KeyframeOptions().least, args.keyframes)),
     )
     # The database is made when there are photos: films that are refused leave none behind.
-    database = Database(str(args.db), storage_options(args))
+    database = place_for_database(args)
     root = args.work or default_root(database.url)
     with progress_bars(args.quiet) as progress:
         films = make_films(files.paths, partial(_telemetry, args), root, options, progress)

@@ -29,7 +29,7 @@ from ingest.photos.duplicates import (
     picture_hash,
 )
 from ingest.photos.photo import Photo
-from ingest.photos.table import PhotoTable, TableRow, missing_reason, summary_of
+from ingest.photos.table import PhotoTable, TableRow, is_table, missing_reason, summary_of
 from ingest.photos.walk import ExaminedFile, FoundFile, read_cache, walk, write_cache
 
 # Raised when the same file would be judged differently, so that old caches are not used.
@@ -354,6 +354,31 @@ def _mark_near(photos: list[Photo], hashes: dict[str, str]) -> list[Photo]:
 
 def _skipped(photo: Photo, code: str, reason: str, duplicate_of: str) -> Photo:
     return replace(photo, status="skipped", reason_code=code, reason=reason, duplicate_of=duplicate_of)
+
+
+def require_photos(folder: Path) -> None:
+    """Before a database is made for them: does anything begin as a photo? A table is not looked into.
+
+    Raises:
+        IngestError: no folder, or nothing in it does.
+    """
+    if is_table(folder):
+        return
+    found = [file for file in walk(folder) if not file.reason_code]
+    if not any(_begins_as_photo(file.path) for file in found):
+        raise IngestError(
+            f"{folder}: expected photos (JPEG, PNG, WebP, TIFF, BMP) in it or in folders in it, found none "
+            f"among {len(found)} files; check the path"
+        )
+
+
+def _begins_as_photo(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            check_signature(file.read(32))
+    except (OSError, ImageError):
+        return False
+    return True
 
 
 def require_usable(result: ScanResult, folder: Path, least: int = 1) -> tuple[Photo, ...]:

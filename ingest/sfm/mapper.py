@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from featuredb.geometry.camera import Camera
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.camera import SUPPORTED_MODELS, Camera
 from ingest.colmap.adjust import AdjustOptions, Known, adjust_models
 from ingest.colmap.bridge import Model, SfmPhoto, read_models, run_incremental, write_database
 from ingest.sfm.extract import read_keypoints
@@ -71,6 +72,12 @@ class SfmOptions:
     seed: int = 0
     threads: int = 1
     adjust: AdjustOptions = field(default_factory=AdjustOptions)
+
+    def __post_init__(self) -> None:
+        if self.camera_model not in SUPPORTED_MODELS:
+            raise InvalidValueError(
+                f"camera model: expected one of {', '.join(SUPPORTED_MODELS)}, found {self.camera_model!r}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

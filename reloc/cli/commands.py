@@ -11,7 +11,7 @@ from featuredb.errors import FeatureDbError, InvalidValueError, ServiceError
 if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
     from featuredb.store import Database
-    from reloc.localiser import Localiser
+    from reloc.asking import PhotoAsker
     from reloc.wire.query import CameraRequest, LocaliseReply
 
     # A photo's bytes, its lens where it is known, and whether it is asked for the first time of two.
@@ -111,7 +111,12 @@ def add_request_arguments(parser: argparse.ArgumentParser) -> None:
         help="where it may have been taken, WGS84 degrees and metres; with an equals sign where the latitude "
         "is negative: --prior=-33.86,151.21,25",
     )
-    parser.add_argument("--exif-prior", action="store_true", help="the photo's own GPS is the prior")
+    parser.add_argument(
+        "--no-exif-prior",
+        action="store_true",
+        help="leave out the position in the photo's EXIF, which settles what is ambiguous where there is no "
+        "--prior",
+    )
     parser.add_argument(
         "--camera",
         metavar="MODEL,WIDTH,HEIGHT,PARAMS...",
@@ -192,6 +197,7 @@ def _query(args: argparse.Namespace) -> int:
         raise InvalidValueError(
             "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
         )
+    _require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
         def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
@@ -201,7 +207,7 @@ def _query(args: argparse.Namespace) -> int:
                 lens or camera,
                 timeout_s=args.timeout,
                 inliers=first or args.overlay is not None,
-                exif_prior=args.exif_prior,
+                exif_prior=not args.no_exif_prior,
                 maps=tuple(args.map) if args.map else None,
                 contribute=args.contribute and not first,
                 credit=args.credit,
@@ -209,66 +215,62 @@ def _query(args: argparse.Namespace) -> int:
                 client_id=args.client_id,
             )
 
-        return _answer_all(args, ask)
+        return _answer_all(args, ask, client.database)
 
 
 def _localise(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from reloc.overlay import map_points_in_view
 
-    localiser, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
-    return _answer_all(args, ask, lambda reply: map_points_in_view(localiser.areas, reply))
+    _require_an_image(args.image)
+    asker, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
+    return _answer_all(
+        args, ask, asker.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
+    )
 
 
 def asking_here(
     args: argparse.Namespace, database: "Callable[[], Database]", inliers: bool = False
-) -> "tuple[Localiser, Ask]":
+) -> "tuple[PhotoAsker, Ask]":
     """What answers in this process, to what `add_request_arguments` was told; that is checked first.
 
     Raises:
         InvalidValueError: the prior or the camera is none.
     """
-    import uuid
-
-    from featuredb.features.decode import DecodeLimits
-    from featuredb.stage_clock import StageClock
+    from reloc.asking import PhotoAsker
     from reloc.cli.query_arguments import parse_camera, parse_prior
-    from reloc.localiser import Localiser
-    from reloc.service.handler import answer_query
-    from reloc.wire.query import LocaliseWireRequest, RequestOptions
 
     prior, camera = parse_prior(args.prior), parse_camera(args.camera, args.camera_sigmas)
-    localiser = Localiser.open(database())
+    asker = PhotoAsker(database())
 
     def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
-        request = LocaliseWireRequest(
+        answer = asker.ask(
+            data,
             prior=prior,
             camera=lens or camera,
-            options=RequestOptions(
-                inliers=first or inliers,
-                exif_prior=args.exif_prior,
-                maps=tuple(args.map) if args.map else None,
-            ),
+            exif_prior=not args.no_exif_prior,
+            maps=tuple(args.map) if args.map else None,
+            inliers=first or inliers,
         )
-        return answer_query(
-            data,
-            request,
-            localiser,
-            limits=DecodeLimits(),
-            request_id=uuid.uuid4().hex,
-            clock=StageClock(),
-        )
+        return answer.reply
 
-    return localiser, ask
+    return asker, ask
+
+
+def _require_an_image(paths: list[str]) -> None:
+    """Before maps are loaded, or a server is waited for."""
+    if not any(Path(path).is_file() for path in paths):
+        raise InvalidValueError(f"{', '.join(paths)}: expected a photo, found no such file; check the path")
 
 
 def _answer_all(
     args: argparse.Namespace,
     ask: "Ask",
+    database: str,
     other_points: Callable[["LocaliseReply"], "FloatArray | None"] = lambda reply: None,
 ) -> int:
     """Ask for each image, print the answers; 0 if all were localised, 1 if some were not, 2 on errors."""
-    from reloc.cli.wording import describe
+    from reloc.wording import describe
 
     codes = {0}
     lenses = _shared_lenses(args, ask) if args.shared_lens else {}
@@ -276,7 +278,9 @@ def _answer_all(
         try:
             data = path.read_bytes()
             reply = ask(data, lenses.get(path), False)
-            sys.stdout.write(_as_json_line(path, reply) if args.json else describe(str(path), reply))
+            sys.stdout.write(
+                _as_json_line(path, reply, database) if args.json else describe(str(path), reply, database)
+            )
             sys.stdout.flush()
             if reply.status == "not_localised":
                 codes.add(_NOT_LOCALISED)
@@ -340,10 +344,10 @@ def _shared_lenses(args: argparse.Namespace, ask: "Ask") -> "dict[Path, CameraRe
     return {p: lens for p, lens in zip(paths, asked_with, strict=True) if lens is not None}
 
 
-def _as_json_line(path: Path, reply: "LocaliseReply") -> str:
+def _as_json_line(path: Path, reply: "LocaliseReply", database: str) -> str:
     import json
 
-    return json.dumps({"image": str(path), **reply.model_dump(mode="json")}) + "\n"
+    return json.dumps({"image": str(path), "database": database, **reply.model_dump(mode="json")}) + "\n"
 
 
 def _overlay_path(overlay: Path, image: Path, images: Iterable[str]) -> Path:

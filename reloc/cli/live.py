@@ -49,6 +49,9 @@ def register(subparsers: Any) -> None:
     parser.add_argument(
         "--prior", metavar="LAT,LON,SIGMA_M", help="where the film begins, WGS84 degrees and metres"
     )
+    parser.add_argument(
+        "--fps", type=float, metavar="N", help="frames per second of a folder without a file of times"
+    )
     parser.add_argument("--start", type=float, metavar="S", help="of the film; default: its beginning")
     parser.add_argument("--end", type=float, metavar="S", help="of the film; default: its end")
     parser.add_argument("--max-side", type=int, default=1280, metavar="PX", help="frames are sent at; 1280")
@@ -75,7 +78,9 @@ def run_live(args: argparse.Namespace) -> int:
             args.video,
             camera=camera,
             prior=prior,
-            options=StreamOptions(max_side_px=args.max_side, start_s=args.start, end_s=args.end),
+            options=StreamOptions(
+                max_side_px=args.max_side, start_s=args.start, end_s=args.end, fps=args.fps
+            ),
             on_pose=_as_json if args.json else _teller(),
         )
     outputs = write_outputs(args.out, found.trajectory)

@@ -137,15 +137,15 @@ def answered_view(
     if args.answer is not None:
         return AnsweredView.of_reply(_read_answer(args.answer, Path(args.image))), None
     from reloc.cli.commands import asking_here
-    from reloc.cli.wording import describe
+    from reloc.wording import describe
 
     data = Path(args.image).read_bytes()
-    localiser, ask = asking_here(args, lambda: database)
+    asker, ask = asking_here(args, lambda: database)
     reply = ask(data, None, False)
     if reply.status != "localised":
-        sys.stderr.write(describe(args.image, reply))
-        return None, localiser
-    return AnsweredView.of_reply(reply), localiser
+        sys.stderr.write(describe(args.image, reply, asker.name))
+        return None, asker.localiser()
+    return AnsweredView.of_reply(reply), asker.localiser()
 
 
 def _read_answer(path: Path, image: Path) -> "LocaliseReply":

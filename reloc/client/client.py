@@ -24,6 +24,7 @@ from reloc.wire.query import (
     PriorRequest,
     RequestOptions,
     encode,
+    explain,
 )
 from reloc.wire.server import Event, MapsReply, StatusReply
 
@@ -133,7 +134,7 @@ class Client:
                 asked again, ever less often, while it lasts.
             request_id: appears in the reply and in the server's log.
             inliers: the reply carries pixels and UTM points of the matches that agree.
-            exif_prior: the photo's own GPS serves as prior where `prior` is None.
+            exif_prior: the position in the photo's EXIF settles what is ambiguous, where `prior` is None.
             maps: ask only these maps.
             contribute: give the photo to the database, so that its maps can grow; needs `credit` and
                 `licence`. The reply's `contribution` says whether it was taken.
@@ -159,7 +160,7 @@ class Client:
                 ),
             )
         except ValidationError as error:
-            raise InvalidValueError(f"localise: {error}") from error
+            raise InvalidValueError(f"localise: {explain(error)}") from error
         key = self._keys.localise(self.name)
         end, wait_s = time.perf_counter() + timeout_s, _FIRST_WAIT_S
         while True:
@@ -243,8 +244,8 @@ class Client:
         except zenoh.ZError as error:
             raise ServiceError(
                 NO_SERVER,
-                f"nobody answers at {self._where} ({str(error).split(' at /')[0]}); is `featuredb serve` "
-                "running, and is this its --listen endpoint?",
+                f"nobody answers at {self._where}; is `featuredb serve` running, and is this its --listen "
+                "endpoint?",
             ) from error
 
     def _ask(

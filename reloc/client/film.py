@@ -31,6 +31,7 @@ class StreamOptions:
         max_side_px: frames are made smaller before they are sent; a server tracks no larger ones by default.
         jpeg_quality: of the frames.
         start_s, end_s: the stretch of the film; None: all of it.
+        fps: frames per second of a folder of pictures without a file of times.
         max_late_s: a frame of a file that is later than this against the film's clock is not sent: this
             machine is too slow, and a live source would have gone on.
         last_wait_s: how long the pose of the last frame is waited for.
@@ -40,6 +41,7 @@ class StreamOptions:
     jpeg_quality: int = 80
     start_s: float | None = None
     end_s: float | None = None
+    fps: float | None = None
     max_late_s: float = 0.1
     last_wait_s: float = 2.0
 
@@ -121,7 +123,9 @@ def stream_film(
         ServiceError: no session could be opened.
     """
     options = options or StreamOptions()
-    settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
+    settings = VideoOptions(
+        max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s, fps=options.fps
+    )
     trouble: list[str] = []
     sent, last = 0, -1
     with open_video(source, settings) as video, client.track(camera, prior) as live:

@@ -4,7 +4,7 @@ The steps, in order: features; clusters of map images that may show the same; 2D
 cluster; robust pose; matches guided by it; refinement; uncertainty; acceptance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,8 +21,15 @@ from reloc.localise.candidates import IndexedArea
 from reloc.localise.lens_prior import seen_by_a_map
 from reloc.localise.options import LocaliseOptions
 from reloc.localise.pose import PoseUncertainty, pose_uncertainty
-from reloc.localise.prior import contradicts_prior
-from reloc.localise.result import LocaliseRequest, LocaliseResult, Reason, RunnerUp
+from reloc.localise.prior import contradicts_prior, distance_from, weakened
+from reloc.localise.result import (
+    LocaliseRequest,
+    LocaliseResult,
+    OwnPosition,
+    PositionRole,
+    Reason,
+    RunnerUp,
+)
 from reloc.localise.rivals import runner_up
 from reloc.localise.search import PoseCandidate, Search, pairs, search
 
@@ -93,10 +100,57 @@ def _localised(
     snapshot: int,
     clock: StageClock,
 ) -> Localised:
-    found = search(features, request, areas, options, clock)
-    localised = _decide(found, features, request, options, snapshot)
-    clock.lap("answer")
+    def ask(asked: LocaliseRequest) -> Localised:
+        found = search(features, asked, areas, options, clock)
+        localised = _decide(found, features, asked, options, snapshot)
+        clock.lap("answer")
+        return localised
+
+    localised = ask(request)
+    if request.own_position is not None and request.prior is None:
+        localised = _with_own_position(localised, request, ask, options)
     return replace(localised, result=replace(localised.result, timings_ms=clock.milliseconds()))
+
+
+def _with_own_position(
+    everywhere: Localised,
+    request: LocaliseRequest,
+    ask: Callable[[LocaliseRequest], Localised],
+    options: LocaliseOptions,
+) -> Localised:
+    """The answer that the photo's own position allows, which may be that of another town.
+
+    All places compete without it first. Where that gives no answer, one near the position is believed, unless
+    much more spoke for a place elsewhere. Where it gives one elsewhere, that stays, or is ambiguous if the
+    photo fits near its position about as well.
+    """
+    assert request.own_position is not None
+    position, first = weakened(request.own_position), everywhere.result
+
+    def said(chosen: Localised, role: PositionRole) -> Localised:
+        pose = chosen.result.pose
+        own = OwnPosition(role=role, distance_m=None if pose is None else distance_from(pose, position))
+        return replace(chosen, result=replace(chosen.result, own_position=own))
+
+    if first.pose is not None and contradicts_prior(first.pose, position) is None:
+        return said(everywhere, "agrees")
+    near = ask(replace(request, prior=position, own_position=None))
+    fits = near.best is not None and near.result.inliers >= options.acceptance.rival_share * first.inliers
+    if everywhere.best is None:
+        return said(near, "decided") if fits else said(everywhere, "no_help")
+    if not fits:
+        return said(everywhere, "contradicted")
+    assert near.best is not None
+    refused = replace(
+        first,
+        reason="AMBIGUOUS",
+        detail=f"the photo fits a place far from its own position with {first.inliers} inliers, and one "
+        f"there with {near.result.inliers}",
+        pose=None,
+        confidence=0.0,
+        runner_up=runner_up(everywhere.best, [near.best]),
+    )
+    return said(Localised(result=refused), "contradicted")
 
 
 def check_extractor(areas: Sequence[IndexedArea], options: LocaliseOptions) -> None:

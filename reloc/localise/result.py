@@ -25,6 +25,7 @@ Reason = Literal[
     "CONTRADICTS_PRIOR",
 ]
 REASONS: tuple[Reason, ...] = get_args(Reason)
+PositionRole = Literal["agrees", "decided", "contradicted", "no_help"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +44,8 @@ class LocaliseRequest:
             lenses that maps have of its shots are tried.
         exif_focal_px: focal length from EXIF in pixels, a start for the estimate; None: unknown.
         prior: where the photo may have been taken; None: anywhere in the database.
+        own_position: where the photo itself says so, which may be wrong: it settles what nothing else does,
+            and moves no answer. Beside `prior` it does not count.
         beyond: a prior that was tried in vain; what it reaches is not tried again.
         map_ids: only these maps; None: all active ones. A map without a place is named alone; it answers in
             its own frame, and a prior does not count.
@@ -56,6 +59,7 @@ class LocaliseRequest:
     film: str | None = None
     exif_focal_px: float | None = None
     prior: GeoPrior | None = None
+    own_position: GeoPrior | None = None
     beyond: GeoPrior | None = None
     map_ids: tuple[str, ...] | None = None
     want_inliers: bool = False
@@ -176,6 +180,21 @@ class RunnerUp:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OwnPosition:
+    """What a photo's own position did to its answer.
+
+    Attributes:
+        role: `agrees`: the answer is the same without it. `decided`: without it there is none.
+            `contradicted`: the photo shows another place; it is answered there, or refused where both places
+            fit. `no_help`: not localised with it either.
+        distance_m: of the answer from it, horizontally; None without an answer.
+    """
+
+    role: PositionRole
+    distance_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
     """The figures behind a decision.
 
@@ -210,6 +229,7 @@ class LocaliseResult:
         snapshot: version of the database that answered.
         evidence: for the best pose, believed or not; None where no pose was found at all.
         timings_ms: stage name -> milliseconds, in the order they ran, and their `total`.
+        own_position: what the request's own position did; None where it has none.
     """
 
     reason: Reason | None
@@ -224,6 +244,7 @@ class LocaliseResult:
     evidence: Evidence | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     in_map: PoseInMap | None = None
+    own_position: OwnPosition | None = None
 
     def __post_init__(self) -> None:
         said = [value is not None for value in (self.reason, self.pose, self.in_map)]

@@ -13,7 +13,7 @@ import numpy as np
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
-from reloc.localise.answer import radius_68
+from reloc.localise.answer import error_radius
 from reloc.pixels.surfaces import Met, RaySurface
 from reloc.pixels.view import AnsweredView
 
@@ -63,11 +63,11 @@ class PixelPlace:
 
     @property
     def horizontal_68_m(self) -> float | None:
-        return None if self.covariance is None else radius_68(self.covariance[:2, :2])
+        return None if self.covariance is None else error_radius(self.covariance[:2, :2])
 
     @property
     def vertical_68_m(self) -> float | None:
-        return None if self.covariance is None else radius_68(self.covariance[2:, 2:])
+        return None if self.covariance is None else error_radius(self.covariance[2:, 2:])
 
 
 def locate(

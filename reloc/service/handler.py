@@ -82,8 +82,6 @@ def localise_request(
     height, width = gray.shape
     exif = read_exif(data)
     prior = None if wire_request.prior is None else geo_prior(wire_request.prior)
-    if prior is None and wire_request.options.exif_prior:
-        prior = prior_from_exif(exif)
     lens = wire_request.camera
     camera = None if lens is None else _camera(lens, width, height)
     return LocaliseRequest(
@@ -93,6 +91,7 @@ def localise_request(
         camera_key=exif.camera_key or None,
         exif_focal_px=exif.focal_px,
         prior=prior,
+        own_position=prior_from_exif(exif) if wire_request.options.exif_prior else None,
         map_ids=wire_request.options.maps,
         want_inliers=wire_request.options.inliers,
     )

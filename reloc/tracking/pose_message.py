@@ -6,7 +6,7 @@ import numpy as np
 
 from featuredb.geo.geopose import BODY_AXES, GeoPose
 from featuredb.geometry.camera import Camera
-from reloc.localise.answer import radius_68
+from reloc.localise.answer import error_radius
 from reloc.reply import place_fields
 from reloc.tracking.trajectory.values import EarthPose, TrajectoryPoint
 from reloc.wire.query import Accuracy
@@ -72,9 +72,9 @@ def _pose_fields(pose: EarthPose, camera: Camera) -> dict[str, Any]:
     return {
         **place_fields(pose),
         "accuracy": Accuracy(
-            horizontal_68_m=radius_68(pose.covariance[3:5, 3:5]),
-            vertical_68_m=radius_68(pose.covariance[5:, 5:]),
-            orientation_68_deg=float(np.degrees(radius_68(pose.covariance[:3, :3]))),
+            horizontal_68_m=error_radius(pose.covariance[3:5, 3:5]),
+            vertical_68_m=error_radius(pose.covariance[5:, 5:]),
+            orientation_68_deg=float(np.degrees(error_radius(pose.covariance[:3, :3]))),
         ),
         "camera": Intrinsics(
             model=camera.model, width=camera.width, height=camera.height, params=camera.params

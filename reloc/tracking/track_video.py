@@ -38,12 +38,14 @@ class TrackVideoOptions:
         max_side_px: frames are made smaller for tracking; flow costs as their area, and 1280 pixels tell a
             pose to centimetres at the distances of drones. The overlay is of this size, too.
         start_s, end_s: the stretch of the film; None: all of it.
+        fps: frames per second of a folder of pictures without a file of times.
         track: the tracker's settings.
     """
 
     max_side_px: int = 1280
     start_s: float | None = None
     end_s: float | None = None
+    fps: float | None = None
     track: TrackOptions = field(default_factory=TrackOptions)
 
 
@@ -109,7 +111,9 @@ def track_video(
     trouble: list[str] = []
     clock = StageClock()
     last = gap = 0.0
-    settings = VideoOptions(max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s)
+    settings = VideoOptions(
+        max_side_px=options.max_side_px, start_s=options.start_s, end_s=options.end_s, fps=options.fps
+    )
     threads = cv2.getNumThreads()
     # Flow of a few hundred points gains nothing by a second thread; the keyframes have that core.
     cv2.setNumThreads(1)

@@ -207,6 +207,18 @@ class RunnerUpPose(Answer):
     lon: float
 
 
+class OwnPositionUse(Answer):
+    """What the position in the photo's EXIF did to the answer, where `options.exif_prior` asked for it.
+
+    `agrees`: the answer is the same without it. `decided`: without it there is none. `contradicted`: the
+    photo shows another place, where it is answered, or both places fit. `no_help`: not localised with it
+    either. `distance_m`: of the answer from it, horizontally.
+    """
+
+    role: Literal["agrees", "decided", "contradicted", "no_help"]
+    distance_m: NotNegative | None
+
+
 class InlierPoints(Answer):
     """Evidence, on request: k pixels of the query, the UTM points they saw, and the row in `maps` of each."""
 
@@ -293,6 +305,7 @@ class LocaliseReply(Answer):
     contribution: ContributionReply | None = None
     in_map: InMapPose | None = None
     view_covariance: tuple[tuple[float, ...], ...] | None = None
+    exif_prior: OwnPositionUse | None = None
 
     @model_validator(mode="after")
     def _size_of_view(self) -> "LocaliseReply":
@@ -348,7 +361,7 @@ def parse_attachment(model: type[_Attached], attachment: bytes | None) -> _Attac
     try:
         return model.model_validate_json(attachment)
     except ValidationError as error:
-        raise RequestError(ErrorCode.BAD_REQUEST, _explain(error), _request_id_of(attachment)) from error
+        raise RequestError(ErrorCode.BAD_REQUEST, explain(error), _request_id_of(attachment)) from error
 
 
 def encode(message: BaseModel) -> bytes:
@@ -356,7 +369,7 @@ def encode(message: BaseModel) -> bytes:
     return message.model_dump_json().encode()
 
 
-def _explain(error: ValidationError) -> str:
+def explain(error: ValidationError) -> str:
     """One line for people out of pydantic's list: field, expectation, what was found."""
     parts = []
     for item in error.errors(include_url=False)[:3]:

@@ -1,6 +1,5 @@
 """`featuredb anchor` on photos and a scan of textured hills: what is placed, proposed, refused, kept."""
 
-import argparse
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,7 +19,7 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from featuredb.store.scans import list_scans
 from ingest.anchoring import AnchorRequest, anchor
-from ingest.cli.anchor import summary
+from ingest.api.anchor_words import anchoring_text
 from ingest.register.anchor import frames
 from ingest.register.anchor.anchor_map import AnchorOptions
 from schemas import load_schema
@@ -198,8 +197,7 @@ def test_a_scan_of_another_place_moves_nothing(
     document = json.loads((out / "anchor.json").read_text())
     jsonschema.validate(document, load_schema("ingest/anchor"))
     assert document["placement"]["reason"] == "NO_FRAME"
-    arguments = argparse.Namespace(db=str(path))
-    assert "not placed: NO_FRAME: none of 1 frames was registered" in summary(done, arguments)
+    assert "not placed: NO_FRAME: none of 1 frames was registered" in anchoring_text(done, str(path))
 
 
 def test_an_interrupted_run_leaves_the_database_as_it_was(

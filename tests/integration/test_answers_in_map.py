@@ -13,13 +13,13 @@ from featuredb.geometry.rotation import so3_exp
 from featuredb.geometry.sim3 import Sim3
 from featuredb.maps.unplaced_map import NoPlace, OwnFrame, OwnPoints, UnplacedMap
 from featuredb.store import Database
-from reloc.cli.wording import describe
 from reloc.gateway.geopose import NotLocalisedError, response_of
 from reloc.gateway.protocol import GeoPoseReq
 from reloc.localise.result import LocaliseRequest
 from reloc.localiser import Localiser
 from reloc.reply import reply_from_result
 from reloc.wire.query import LocaliseReply
+from reloc.wording import describe
 from schemas import load_schema
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
 
@@ -109,8 +109,8 @@ def test_schema_and_client_type_keep_it_apart_from_a_place(reply: LocaliseReply)
 
 
 def test_the_text_says_that_it_is_no_place(reply: LocaliseReply) -> None:
-    said = describe("photo.jpg", reply)
-    assert "NO PLACE ON EARTH" in said
+    said = describe("photo.jpg", reply, "town.db")
+    assert "of town.db, which has NO PLACE ON EARTH" in said
     assert "not metres" in said
     assert "UTM" not in said
     assert "WGS84" not in said

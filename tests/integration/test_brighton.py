@@ -1,14 +1,21 @@
 """Real drone photos through a whole ingest; held-out photos are a row of the scoreboard."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from featuredb.features.decode import decode_gray
+from featuredb.geo.local_frame import LocalFrame
 from featuredb.geo.utm import utm_from_geodetic
 from featuredb.store import Database
 from ingest.photos.scan import ScanOptions
 from ingest.pipeline import IngestOptions, ingest_photos
+from reloc.localise.localise import localise
+from reloc.service.handler import localise_request
+from reloc.wire.query import LocaliseWireRequest, RequestOptions
+from tests.support.scenes import indexed
 from tools.real_photos import Ingest, ingest
 
 pytestmark = [pytest.mark.real_data, pytest.mark.slow]
@@ -61,3 +68,34 @@ def test_the_same_ingest_again_changes_nothing(part: Ingest, photos: Path, work:
     assert {p.name for p in again.photos if p.status == "skipped"} == set(_HELD_OUT)
     assert [m.status for m in again.maps] == ["already_there"]
     assert [s.reused == s.total for s in again.stages if s.total] == [True] * 4
+
+
+def test_a_photos_own_position_settles_which_of_two_places_it_shows(part: Ingest, photos: Path) -> None:
+    """The same park once more, three kilometres to the east; a photo of the map, and one held out."""
+    snapshot = Database.open(part.database).snapshot()
+    park = snapshot.load_map(snapshot.maps()[0].map_id)
+    easting, northing, height = park.frame.utm_from_enu(np.zeros(3), park.epsg)
+    frame = LocalFrame.from_utm(easting + 3000.0, northing, height, park.epsg)
+    utm = frame.utm_from_enu(park.points_local(), park.epsg)
+    twin = replace(park, map_id="twin", frame=frame, points=replace(park.points, utm=utm))
+    areas = [indexed(twin), indexed(park)]
+    for name in ("DJI_0027.JPG", "DJI_0025.JPG"):
+        data = (photos / name).read_bytes()
+        gray = decode_gray(data)
+        told = localise_request(LocaliseWireRequest(options=RequestOptions(exif_prior=True)), data, gray)
+        assert told.own_position is not None
+        assert localise(gray, replace(told, own_position=None), areas).reason == "AMBIGUOUS"
+        found = localise(gray, told, areas)
+        assert found.pose is not None
+        assert found.pose.map_ids == (park.map_id,)
+        assert found.own_position is not None
+        assert found.own_position.role == "decided"
+        assert found.own_position.distance_m == pytest.approx(0.0, abs=3.0)
+        # The position of another town is believed neither where two places fit, nor where one does.
+        town = replace(told, own_position=replace(told.own_position, latitude_deg=48.0, longitude_deg=11.0))
+        assert localise(gray, town, areas).reason == "AMBIGUOUS"
+        alone = localise(gray, town, areas[1:])
+        assert alone.pose is not None
+        assert np.linalg.norm(alone.pose.utm - found.pose.utm) < 0.5
+        assert alone.own_position is not None
+        assert alone.own_position.role == "contradicted"

@@ -85,7 +85,7 @@ def test_photos_that_cannot_be_placed_are_kept_and_it_says_how_to_place_them(
 def test_a_folder_without_photos_is_an_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "photos").mkdir()
     assert _run(tmp_path / "db", tmp_path / "photos") == 2
-    assert "usable photos" in capsys.readouterr().err
+    assert "expected photos" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -200,7 +200,9 @@ def test_people_read_utm_degrees_accuracy_and_what_to_try(server, photos, capsys
     said = re.search(r"WGS84 +(\S+), (\S+) +h", out)
     assert (float(said[1]), float(said[2])) == pytest.approx((lat, lon), abs=1e-6)  # 0.1 m
     assert "68 %" in out
-    assert "not localised: TOO_FEW_" in out
+    assert "not localised in Field-maps: TOO_FEW_" in out
+    assert "looks     heading " in out
+    assert "95 %" in out
     assert "try:" in out
 
 

@@ -42,6 +42,18 @@ def test_help_imports_nothing_heavy() -> None:
         assert f"\n    {command} " in said
 
 
+def test_import_featuredb_is_light_and_says_all_that_it_has() -> None:
+    code = (
+        "import sys, featuredb; from importlib.metadata import version\n"
+        "assert dir(featuredb) == ['Camera', 'FeatureDatabase', 'FeatureDbError', '__version__', 'open']\n"
+        "assert featuredb.__version__ == version('featuredb')\n"
+        f"heavy = set({_HEAVY!r} + ('deltalake', 'numpy', 'pyarrow', 'pyproj', 'ingest', 'reloc'))\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+        "assert all(getattr(featuredb, name) for name in dir(featuredb))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60.0)
+
+
 @pytest.mark.parametrize("command", ["maps", "history", "lineage"])
 def test_looking_at_a_database_imports_what_reads_it(tmp_path: Path, command: str) -> None:
     Database.create(tmp_path / "db").commit_map(random_map(1))

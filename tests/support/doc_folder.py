@@ -2,6 +2,7 @@
 
     photo.jpg                 a photo of the town that no map was made of
     home/photos/park          photos of a flight, and table.csv beside the folder; ~ of the commands is home
+    photos                    the same photos
     scan.laz                  an airborne scan; tile1.laz and tile2.laz are its halves
     film.mp4, film.srt        a film of another flight, and its telemetry
     gcp_list.txt              ground control points, marked in the photos of the park
@@ -79,6 +80,7 @@ def make_folder(folder: Path) -> Path:
     park = folder / "home" / "photos" / "park"
     town = write_world(folder / "world", _TOWN)
     names = _take_photos(town, park)
+    (folder / "photos").symlink_to(park)
     _write_table(park.parent / "table.csv", town.truth, names)
     shutil.copy(town.images("queries")[0], folder / "photo.jpg")
     scan = scan_town(town_of(_TOWN), AirborneScanOptions(density_per_m2=4.0))

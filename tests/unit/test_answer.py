@@ -10,7 +10,7 @@ from featuredb.geometry.rotation import matrix_from_quaternion, so3_log
 from featuredb.geometry.sim3 import Sim3
 from featuredb.index.area import build_area
 from featuredb.maps.feature_map import FeatureMap
-from reloc.localise.answer import make_answer, radius_68
+from reloc.localise.answer import error_radius, make_answer
 from reloc.localise.lens_prior import lens_of, with_lens
 from reloc.localise.pose import PoseHypothesis, PoseUncertainty
 from reloc.localise.result import LocalisedPose
@@ -64,16 +64,17 @@ def answer_of(
         np.array([[3.0, 1.0, 0.5], [1.0, 2.0, -0.7], [0.5, -0.7, 1.0]]),
     ],
 )
-def test_radius_68_against_monte_carlo(covariance: np.ndarray) -> None:
+@pytest.mark.parametrize("share", [0.68, 0.95])
+def test_the_radius_against_monte_carlo(covariance: np.ndarray, share: float) -> None:
     rng = np.random.default_rng(0)
     drawn = rng.multivariate_normal(np.zeros(len(covariance)), covariance, 200_000)
-    expected = np.quantile(np.linalg.norm(drawn, axis=1), 0.68)
-    assert radius_68(covariance) == pytest.approx(expected, rel=0.03)
+    expected = np.quantile(np.linalg.norm(drawn, axis=1), share)
+    assert error_radius(covariance, share) == pytest.approx(expected, rel=0.03)
 
 
 def test_radius_of_nothing_is_zero() -> None:
-    assert radius_68(np.zeros((2, 2))) == 0.0
-    assert radius_68(np.diag([1.0])) == pytest.approx(0.9945, abs=1e-3)  # 68 %, not one sigma's 68.27 %
+    assert error_radius(np.zeros((2, 2))) == 0.0
+    assert error_radius(np.diag([1.0])) == pytest.approx(0.9945, abs=1e-3)  # 68 %, not one sigma's 68.27 %
 
 
 def test_the_placement_moves_the_camera_as_the_covariance_says() -> None:

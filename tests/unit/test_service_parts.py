@@ -11,7 +11,6 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.geopose import BODY_AXES
 from featuredb.geometry.camera import Camera
 from featuredb.stage_clock import StageClock
-from reloc.cli.wording import ADVICE, describe
 from reloc.localise.result import REASONS
 from reloc.reply import reply_from_result
 from reloc.service.metrics import ServerMetrics
@@ -21,6 +20,7 @@ from reloc.service.session import bind_free_port
 from reloc.service.threads import capped_process
 from reloc.wire.keys import Keys
 from reloc.wire.query import ContributionReply, RequestError, encode, parse_request
+from reloc.wording import ADVICE, describe
 from tests.support.service import localised, not_localised
 
 
@@ -124,8 +124,8 @@ def test_every_reason_has_advice():
 
 def test_people_read_the_reason_and_what_to_try():
     reply = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
-    text = describe("photo.jpg", reply)
-    assert text.startswith("photo.jpg: not localised: TOO_FEW_INLIERS (7 of 12 needed)")
+    text = describe("photo.jpg", reply, "town.db")
+    assert text.startswith("photo.jpg: not localised in town.db: TOO_FEW_INLIERS (7 of 12 needed)")
     assert ADVICE["TOO_FEW_INLIERS"] in text
 
 
@@ -153,18 +153,18 @@ def test_no_attachment_means_all_defaults():
 def test_people_read_what_a_grown_map_stands_on_and_what_became_of_their_photo():
     result = localised(7, Camera.from_focal(640, 480, 600.0))
     reply = reply_from_result(result, request_id="r", timings_ms={"total": 1.0})
-    assert "lineage" not in describe("a.jpg", reply), "nothing is to be said of an anchor"
+    assert "lineage" not in describe("a.jpg", reply, "db"), "nothing is to be said of an anchor"
     grown = reply.lineage[0].model_copy(
         update={"steps": 3, "anchors": ("A12", "B"), "drift_m": 0.312, "budget_m": 0.5}
     )
     taken = ContributionReply(accepted=True, candidate_id="0" * 32, reason=None, detail="queued")
-    text = describe("a.jpg", reply.model_copy(update={"lineage": (grown,), "contribution": taken}))
+    text = describe("a.jpg", reply.model_copy(update={"lineage": (grown,), "contribution": taken}), "db")
     assert "  lineage   3 steps from anchor A12, 0.31 of 0.50 m\n" in text
     assert f"  given     candidate {'0' * 32}\n" in text
     full = ContributionReply(accepted=False, candidate_id=None, reason="QUEUE_FULL", detail="32 wait")
     lost = reply_from_result(not_localised(3), request_id="r", timings_ms={"total": 12.0})
     assert "  not taken QUEUE_FULL: 32 wait\n" in describe(
-        "a.jpg", lost.model_copy(update={"contribution": full})
+        "a.jpg", lost.model_copy(update={"contribution": full}), "db"
     )
 
 

@@ -89,7 +89,7 @@ def test_times_that_do_not_fit_are_refused(tmp_path: Path, file: str, text: str,
 
 def test_folders_that_are_refused(tmp_path: Path) -> None:
     folder = _folder(tmp_path / "frames", NAMES)
-    with pytest.raises(VideoError, match=r"times of its 6 pictures.*or give a rate \(fps\)"):
+    with pytest.raises(VideoError, match=r"times of its 6 pictures.*or give their rate by --fps"):
         open_video(folder)
     (folder / "times.txt").write_text("1")
     (folder / "timestamps.csv").write_text("1")

@@ -1,6 +1,7 @@
 """How tables are made, and what their Parquet files are written like."""
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -10,10 +11,11 @@ from deltalake.exceptions import TableNotFoundError
 from featuredb.errors import DatabaseNotFoundError, SnapshotNotFoundError, StoreError
 from featuredb.store.durable.filesystem import table_files
 from featuredb.store.durable.log import damaged, log_problems
-from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, TableSpec
+from featuredb.store.tables import FORMAT_VERSION, READABLE_FORMATS, SPECS, TableSpec
 
 # The log is the history that `as_of` reads; it is small, so it is kept until `vacuum` is told otherwise.
 LOG_RETENTION = "interval 36500 days"
+_WORK = "_work"  # where jobs keep what is unfinished, before there are tables
 
 
 def create_table(url: str, spec: TableSpec, storage_options: dict[str, str] | None) -> None:
@@ -109,8 +111,32 @@ def why_not_opened(
         return damaged(url, problem)
     if isinstance(error, TableNotFoundError):
         return DatabaseNotFoundError(
-            f"no featuredb table at {url}; create the database with `featuredb init` or check the path"
+            f"no featuredb table at {url}; check the path, or create the database with `featuredb init`"
         )
     if version is not None:
         return SnapshotNotFoundError(f"{url} has no version {version}: {error}")
     return StoreError(f"cannot open {url}: {error}")
+
+
+def check_place(url: str) -> None:
+    """Before hours of work for a new database: is there one, or a place for one? Makes nothing.
+
+    Args:
+        url: of a `Database`.
+
+    Raises:
+        StoreError: a local path that is mistyped: in no folder, a file, or a folder of other things.
+    """
+    if "://" in url:
+        return
+    folder = Path(url)
+    if not folder.parent.is_dir():
+        raise StoreError(
+            f"{folder}: there is no folder {folder.parent} to make a database in; check the path, or make "
+            "that folder first"
+        )
+    if folder.exists() and not folder.is_dir():
+        raise StoreError(f"{folder} is a file, and a database is a folder; name another one")
+    there = {entry.name for entry in folder.iterdir()} if folder.is_dir() else set()
+    if there and not there & {*SPECS, _WORK}:
+        raise StoreError(f"{folder} is a folder of other things, and no database; name one that is free")

@@ -1,7 +1,16 @@
 """Answers in words for people."""
 
+import math
+
+import numpy as np
+
+from featuredb.geo.geopose import GeoPose
 from featuredb.maps.lineage import lineage_text
+from reloc.localise.answer import error_radius
 from reloc.wire.query import InMapPose, LocaliseReply
+
+# Steeper than this a photo shows no horizon, and people ask where its top points.
+_STEEP_DEG = 60.0
 
 # What a person can do about each reason.
 ADVICE = {
@@ -17,27 +26,31 @@ ADVICE = {
 }
 
 
-def describe(name: str, reply: LocaliseReply) -> str:
-    """A few lines about one answer."""
+def describe(name: str, reply: LocaliseReply, database: str) -> str:
+    """A few lines about one answer of a database."""
     total = reply.timings_ms.get("total", 0.0)
     if reply.in_map is not None:
-        return _in_map(name, reply, reply.in_map)
+        return _in_map(name, reply, reply.in_map, database)
     if reply.utm is None or reply.position is None or reply.accuracy is None or reply.camera is None:
         advice = ADVICE.get(reply.reason or "", "")
         return (
-            f"{name}: not localised: {reply.reason} ({reply.detail})\n"
+            f"{name}: not localised in {database}: {reply.reason} ({reply.detail})\n"
             f"  {reply.inliers} inliers, {reply.matches} matches, {reply.features} features, {total:.0f} ms\n"
+            f"{_own_position(reply)}"
             f"{_contribution(reply)}"
             f"  try: {advice}\n"
         )
     utm, position, accuracy = reply.utm, reply.position, reply.accuracy
     return (
-        f"{name}: localised, confidence {reply.confidence:.3f}\n"
+        f"{name}: localised in {database}, confidence {reply.confidence:.3f}\n"
         f"  UTM       EPSG:{utm.epsg}  E {utm.easting:.3f}  N {utm.northing:.3f}  "
         f"height {utm.height:.3f} m ({reply.height_datum})\n"
         f"  WGS84     {position.lat:.8f}, {position.lon:.8f}  h {position.h:.3f} m\n"
+        f"  looks     {_looks(reply)}\n"
         f"  68 %      {accuracy.horizontal_68_m:.3f} m horizontally, "
         f"{accuracy.vertical_68_m:.3f} m vertically, {accuracy.orientation_68_deg:.3f} deg\n"
+        f"{_radii_95(reply)}"
+        f"{_own_position(reply)}"
         f"  evidence  {reply.inliers} inliers from {reply.matches} matches, residual "
         f"{reply.residual_rms_px or 0.0:.2f} px, camera from {reply.camera.source}, "
         f"maps {', '.join(reply.maps)}\n"
@@ -47,12 +60,60 @@ def describe(name: str, reply: LocaliseReply) -> str:
     )
 
 
-def _in_map(name: str, reply: LocaliseReply, pose: InMapPose) -> str:
+def angles(reply: LocaliseReply) -> GeoPose:
+    """The pose of a localised reply, which tells its angles; see docs/localisation.md."""
+    assert reply.position is not None
+    assert reply.quaternion is not None
+    q = reply.quaternion
+    return GeoPose(
+        latitude_deg=reply.position.lat,
+        longitude_deg=reply.position.lon,
+        height_m=reply.position.h,
+        quaternion_xyzw=(q.x, q.y, q.z, q.w),
+    )
+
+
+def _looks(reply: LocaliseReply) -> str:
+    pose = angles(reply)
+    heading, pitch, roll = pose.heading_pitch_roll_deg
+    text = f"heading {heading:.2f} deg from true north, pitch {pitch:+.2f}, roll {roll:+.2f}"
+    if abs(pitch) > _STEEP_DEG:
+        up = pose.true_enu_from_body[:, 2]
+        text += f"; the photo's top points to {math.degrees(math.atan2(up[0], up[1])) % 360.0:.2f}"
+    return text
+
+
+def _radii_95(reply: LocaliseReply) -> str:
+    c = np.array(reply.covariance)
+    across, up, turn = (error_radius(part, 0.95) for part in (c[3:5, 3:5], c[5:, 5:], c[:3, :3]))
+    return f"  95 %      {across:.3f} m horizontally, {up:.3f} m vertically, {math.degrees(turn):.3f} deg\n"
+
+
+def _own_position(reply: LocaliseReply) -> str:
+    """What the position in the photo's EXIF did; nothing where it has none, or was not asked."""
+    own = reply.exif_prior
+    if own is None:
+        return ""
+    away = "" if own.distance_m is None else f", {_metres(own.distance_m)} away"
+    said = {
+        "agrees": f"the photo's EXIF position{away}, agrees; the answer is the same without it",
+        "decided": f"the photo's EXIF position{away}, decided; --no-exif-prior leaves it out",
+        "contradicted": f"the photo's EXIF position{away}, is not what the photo shows; not believed",
+        "no_help": "the photo's EXIF position was tried, and did not help",
+    }
+    return f"  prior     {said[own.role]}\n"
+
+
+def _metres(distance_m: float) -> str:
+    return f"{distance_m:.1f} m" if distance_m < 1000.0 else f"{distance_m / 1000.0:.1f} km"
+
+
+def _in_map(name: str, reply: LocaliseReply, pose: InMapPose, database: str) -> str:
     """A pose in a map's own frame, worded so that nobody takes it for a place."""
     x, y, z = pose.center
     unit = "m" if pose.metric else "units of the map, not metres"
     return (
-        f"{name}: found in map {pose.map_id}, which has NO PLACE ON EARTH, "
+        f"{name}: found in map {pose.map_id} of {database}, which has NO PLACE ON EARTH, "
         f"confidence {reply.confidence:.3f}\n"
         f"  in map    x {x:.3f}  y {y:.3f}  z {z:.3f} {unit}; "
         f"z is {'up' if pose.upright else 'not known to be up'}\n"

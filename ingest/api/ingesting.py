@@ -1,0 +1,177 @@
+"""What a person says of an ingest, and the ingest of photos that follows from it."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, TypedDict, Unpack
+
+from featuredb.features.extractor import ExtractorOptions
+from featuredb.index.vocabulary import read_vocabulary
+from featuredb.store import Database
+from ingest.api.progress_bars import progress_bars
+from ingest.map_builder import MapOptions
+from ingest.photos.scan import ScanOptions
+from ingest.pipeline import IngestOptions, ingest_photos
+from ingest.reconstruction import MapMakingOptions, Stage
+from ingest.register.control.control_file import read_control_file
+from ingest.register.control.maps import Survey, residual_table
+from ingest.register.control.placement import GcpOptions
+from ingest.report.films import FilmOutcome, films_text
+from ingest.report.page import write_report
+from ingest.report.values import IngestReport, MapOutcome
+from ingest.sfm.mapper import SfmOptions
+
+_LISTED = 40  # photos that are named on the terminal
+
+
+class IngestChoices(TypedDict, total=False):
+    """Choices of an ingest, all optional; None is the default, as in `featuredb ingest photos --help`.
+
+    exclude: globs of files to skip. name: of the map. owner, licence: of photos that do not name theirs.
+    trust_geotags: positions of a table place active maps. cameras: whether photos of one camera share a lens.
+    camera_model: COLMAP's name. keep_focal: do not refine focal lengths. max_features: per photo.
+    max_side: pixels. min_track_length: photos that see a point with descriptors. height_datum: of the
+    positions. gps_sigma: metres, horizontal and vertical. gcp: a file of control points, with gcp_crs,
+    gcp_sigma (m), ground_height (m and its sigma). work: folder of unfinished work. stop_after: a stage.
+    dask: address of a scheduler. vocabulary: a file. workers: processes.
+    """
+
+    exclude: Sequence[str]
+    name: str
+    owner: str
+    licence: str
+    trust_geotags: bool
+    cameras: Literal["shared", "per-image"]
+    camera_model: str | None
+    keep_focal: bool
+    max_features: int | None
+    max_side: int | None
+    min_track_length: int | None
+    height_datum: str
+    gps_sigma: tuple[float, float] | None
+    gcp: Path | None
+    gcp_crs: str | None
+    gcp_sigma: tuple[float, float] | None
+    ground_height: tuple[float, float] | None
+    work: Path | None
+    stop_after: Stage | None
+    dask: str | None
+    vocabulary: Path | None
+    workers: int | None
+
+
+def ingest(
+    database: Database,
+    folder: Path,
+    options: IngestOptions,
+    films: Sequence[FilmOutcome] = (),
+    *,
+    report: Path | None = None,
+    quiet: bool = False,
+) -> IngestReport:
+    """Make maps of photos, with bars that show the progress.
+
+    Args:
+        folder: of photos, or a table of them.
+        films: whose keyframes the folder holds.
+        report: folder for report.html and report.json.
+
+    Raises:
+        IngestError, StoreError: see `ingest_photos`.
+    """
+    with progress_bars(quiet) as progress:
+        done = replace(ingest_photos(database, folder, options, progress), films=tuple(films))
+    if report is not None:
+        write_report(report, done)
+    return done
+
+
+def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> IngestOptions:
+    """The pipeline's options; what is left open keeps its default.
+
+    Raises:
+        InvalidValueError, ControlFileError: a choice that cannot be.
+    """
+    asked: dict[str, Any] = {**choices}
+
+    def given(**names: str) -> dict[str, Any]:
+        return {name: asked[choice] for name, choice in names.items() if asked.get(choice) is not None}
+
+    keep_focal = bool(asked.get("keep_focal"))
+    making = MapMakingOptions(
+        extractor=ExtractorOptions(**given(max_features="max_features", max_side_px="max_side")),
+        sfm=SfmOptions(refine_focal=not keep_focal, **given(camera_model="camera_model")),
+        maps=MapOptions(**given(height_datum="height_datum", min_track_length="min_track_length")),
+        **given(cameras="cameras"),
+    )
+    scan = ScanOptions(
+        exclude=tuple(asked.get("exclude", ())),
+        films=films,
+        **given(owner="owner", licence="licence", trust_geotags="trust_geotags"),
+    )
+    words = asked.get("vocabulary")
+    return IngestOptions(
+        scan=scan,
+        making=making,
+        survey=_survey(asked, keep_focal),
+        vocabulary=None if words is None else read_vocabulary(words),
+        **given(
+            gps_sigma_m="gps_sigma", name="name", work="work", stop_after="stop_after", dask="dask",
+            workers="workers",
+        ),
+    )  # fmt: skip
+
+
+def _survey(asked: dict[str, Any], keep_focal: bool) -> Survey | None:
+    """The control points, where there are some."""
+    if asked.get("gcp") is None:
+        return None
+    return Survey(
+        file=read_control_file(Path(asked["gcp"]), asked.get("gcp_crs")),
+        options=GcpOptions(
+            sigma_m=asked.get("gcp_sigma"), ground_m=asked.get("ground_height"), keep_lens=keep_focal
+        ),
+    )
+
+
+def summary(report: IngestReport) -> str:
+    """A few lines for the terminal; the report has the rest."""
+    lines = [
+        f"{report.count('registered')} of {len(report.photos)} files registered, "
+        f"{report.count('unplaced')} in maps without a place, {report.count('not_registered')} not, "
+        f"{report.count('skipped')} skipped, {report.seconds:.1f} s"
+    ]
+    for outcome in report.maps:
+        if outcome.status == "refused":
+            lines.append(f"refused: {outcome.name}: {outcome.reason_code}: {outcome.reason}")
+        elif outcome.status == "unplaced":
+            lines += _unplaced_lines(outcome)
+        else:
+            lines.append(
+                f"map {outcome.map_id} ({outcome.name}): {outcome.status.replace('_', ' ')}, "
+                f"{outcome.photos} photos, {outcome.points} points, EPSG:{outcome.epsg}, "
+                f"{'control' if outcome.control else 'GPS'} residual {outcome.residual_rms_m or 0.0:.2f} m, "
+                f"place known to {outcome.radius_m or 0.0:.2f} m (95 %)"
+            )
+        if outcome.control is not None and outcome.control.control.marks:
+            lines.extend(f"note: {text}" for text in outcome.control.file.notes)
+            lines.append(residual_table(outcome.control.placement, outcome.control.control).rstrip("\n"))
+    lines += films_text(report.films, report.photos)
+    left_out = [photo for photo in report.photos if photo.status in ("not_registered", "skipped")]
+    lines.extend(f"  {p.name}: {p.reason_code}: {p.reason}" for p in left_out[:_LISTED])
+    if len(left_out) > _LISTED:
+        counts = Counter(p.reason_code for p in left_out[_LISTED:])
+        more = ", ".join(f"{count} {code}" for code, count in counts.most_common())
+        lines.append(f"  and {len(left_out) - _LISTED} more: {more}; --report DIR has them all")
+    lines.extend(f"warning: {warning}" for outcome in report.maps for warning in outcome.warnings)
+    lines.extend(f"warning: {warning}" for warning in report.warnings)
+    return "\n".join(lines) + "\n"
+
+
+def _unplaced_lines(outcome: MapOutcome) -> list[str]:
+    return [
+        f"map {outcome.map_id} ({outcome.name}): without a place, {outcome.photos} photos, "
+        f"{outcome.points} points; {outcome.reason_code}: {outcome.reason}",
+        "  `featuredb maps` says what would give it one; named by --map it answers in its own frame",
+    ]

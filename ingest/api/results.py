@@ -1,0 +1,120 @@
+"""What the methods of a database give back: values that a notebook shows."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+from featuredb.cli.database import maps_table, unplaced_text
+from featuredb.store import MapSummary, UnplacedSummary
+from ingest.anchoring import Anchoring
+from ingest.api.ingesting import summary
+from ingest.api.registering import ControlledMap
+from ingest.api.tracking import TrackedFilm
+from ingest.growth.growth_report import GrowthReport
+from ingest.html_parts import picture
+from ingest.report.plots import plan_png
+from ingest.report.values import IngestReport
+from reloc.tracking.trajectory.plot import plot_png
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ListedMaps:
+    """The maps of a database at one version; those without a place come last."""
+
+    placed: tuple[MapSummary, ...]
+    unplaced: tuple[UnplacedSummary, ...]
+
+    def __getitem__(self, row: int) -> MapSummary | UnplacedSummary:
+        every: tuple[MapSummary | UnplacedSummary, ...] = (*self.placed, *self.unplaced)
+        return every[row]
+
+    def __len__(self) -> int:
+        return len(self.placed) + len(self.unplaced)
+
+    def __iter__(self) -> Iterator[MapSummary | UnplacedSummary]:
+        yield from self.placed
+        yield from self.unplaced
+
+    def __str__(self) -> str:
+        return maps_table(self.placed) + unplaced_text(self.unplaced)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return _pre(str(self))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Ingested:
+    """What an ingest did with every file and map; `report` has the figures."""
+
+    report: IngestReport
+
+    @property
+    def map_ids(self) -> tuple[str, ...]:
+        """Of the maps that are in the database now, largest first."""
+        return tuple(outcome.map_id for outcome in self.report.maps if outcome.map_id)
+
+    def __str__(self) -> str:
+        return summary(self.report)
+
+    def _repr_html_(self) -> str:
+        plans = (picture(plan_png(m.plan), m.name) for m in self.report.maps if m.plan is not None)
+        return _pre(str(self)) + "".join(plans)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Aligned:
+    """A map that was to be placed, and by what.
+
+    Attributes:
+        placed: whether it is in the database at its new place.
+        report: of the scan, of the control points, or of the maps that placed it.
+        page: HTML with pictures to decide by; None where there is none.
+    """
+
+    map_id: str
+    placed: bool
+    report: Anchoring | ControlledMap | GrowthReport
+    text: str
+    page: Path | None = None
+
+    def __str__(self) -> str:
+        return self.text
+
+    def _repr_html_(self) -> str:
+        return _pre(self.text)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FilmTrack:
+    """The poses of a film's frames; `film.video.trajectory.points` has each with its covariance."""
+
+    film: TrackedFilm
+
+    def __str__(self) -> str:
+        return self.film.as_text()
+
+    def _repr_html_(self) -> str:
+        trajectory = self.film.video.trajectory
+        known = any(point.pose is not None for point in trajectory.points)
+        return _pre(str(self)) + (picture(plot_png(trajectory), "the track in plan") if known else "")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Grown:
+    """What became of contributed photos and of maps without a place."""
+
+    report: GrowthReport
+
+    def __str__(self) -> str:
+        return self.report.as_text()
+
+    def _repr_html_(self) -> str:
+        return _pre(str(self))
+
+
+def _pre(text: str) -> str:
+    return f"<pre>{escape(text)}</pre>"

@@ -1,0 +1,124 @@
+"""A film tracked by a database: the poses, files of them, and a summary."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from featuredb.errors import InvalidValueError
+from featuredb.geometry.camera import Camera
+from featuredb.maps.feature_map import GeoPrior
+from featuredb.store import Database
+from ingest.track.finders import FilmGround, finder_for
+from reloc.localise.result import LocaliseRequest
+from reloc.tracking.map_ground import MapFinder
+from reloc.tracking.track_video import TrackedVideo, TrackVideoOptions, track_video
+from reloc.tracking.trajectory.outputs import Outputs, check_outputs, check_outputs_in_map, write_outputs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackedFilm:
+    """The frames of a film with their poses, and the files that were written."""
+
+    video: TrackedVideo
+    outputs: Outputs
+    overlay: Path | None
+
+    def summary(self) -> dict[str, Any]:
+        """Figures, JSON-able."""
+        found = self.video
+        points = found.trajectory.points
+        states = {
+            state: sum(p.state == state for p in points) for state in ("tracking", "relocalised", "lost")
+        }
+        lost = [p for p in points if p.state == "lost"]
+        return {
+            "video": found.trajectory.source,
+            "frames": len(points),
+            **states,
+            "stretches": [list(times) for times in found.trajectory.times_found()],
+            "frame": "own" if found.trajectory.is_in_map else "earth",
+            "last_reason": lost[-1].detail if lost else "",
+            "frames_per_s": round(len(points) / max(found.seconds.total, 1e-9), 1),
+            "seconds": {
+                name: round(getattr(found.seconds, name), 3)
+                for name in ("total", "decoding", "tracking", "drawing", "longest_gap")
+            },
+            "camera": None
+            if found.camera is None
+            else {
+                "model": found.camera.model,
+                "width": found.camera.width,
+                "height": found.camera.height,
+                "params": list(found.camera.params),
+            },
+            "complaints": list(found.complaints),
+            "written": [*self.outputs.written, *([] if self.overlay is None else [str(self.overlay)])],
+        }
+
+    def as_text(self) -> str:
+        """For the terminal."""
+        summary = self.summary()
+        lines = [
+            f"{summary['video']}: {summary['frames']} frames, {summary['tracking']} tracked, "
+            f"{summary['relocalised']} relocalised, {summary['lost']} lost",
+        ]
+        lines += [f"  from {a:.2f} s to {b:.2f} s" for a, b in summary["stretches"]]
+        if summary["last_reason"]:
+            lines.append(f"  lost at the end or before: {summary['last_reason']}")
+        seconds = summary["seconds"]
+        lines.append(
+            f"  {summary['frames_per_s']} frames a second: {seconds['decoding']:.1f} s decoding, "
+            f"{seconds['tracking']:.1f} s tracking, {seconds['drawing']:.1f} s drawing; longest gap "
+            f"{1000 * seconds['longest_gap']:.0f} ms"
+        )
+        if summary["frame"] == "own":
+            lines.append("  poses are in the map's own frame, and say nothing of where on Earth that is")
+        lines += [f"  the film: {what}" for what in summary["complaints"]]
+        lines += [f"  wrote {file}" for file in summary["written"]]
+        return "\n".join(lines) + "\n"
+
+
+def track_film(
+    database: Database,
+    film: str | Path,
+    *,
+    out: Sequence[Path] = (),
+    overlay: Path | None = None,
+    ground: FilmGround | None = None,
+    camera: Camera | None = None,
+    prior: GeoPrior | None = None,
+    options: TrackVideoOptions | None = None,
+) -> TrackedFilm:
+    """The pose of every frame of a film, or that it is lost.
+
+    Args:
+        film: a file, a folder of pictures, or an address. out: trajectories to write, by their suffix.
+        ground: by what it is followed. camera: intrinsics of the upright frames. prior: where it begins.
+
+    Raises:
+        InvalidValueError, VideoError, StoreError, RegistrationError, ScanNotFoundError
+    """
+    check_outputs(out)
+    options = options or TrackVideoOptions()
+    finder, version = finder_for(database, ground or FilmGround(), camera, options.track)
+    if isinstance(finder, MapFinder) and finder.own_map is not None:
+        check_outputs_in_map(out, finder.own_map)
+        if prior is not None:
+            raise InvalidValueError(
+                f"--prior is a place on Earth, and map {finder.own_map} has none; leave it out"
+            )
+    found = track_video(
+        str(film),
+        finder,
+        camera=camera,
+        request=LocaliseRequest(prior=prior),
+        overlay=overlay,
+        options=options,
+    )
+    trajectory = replace(found.trajectory, database=database.url, version=version)
+    return TrackedFilm(
+        video=replace(found, trajectory=trajectory),
+        outputs=write_outputs(out, trajectory),
+        overlay=overlay,
+    )

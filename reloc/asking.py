@@ -1,0 +1,223 @@
+"""Photos asked of a database in this process: what `featuredb localise` and Python share."""
+
+import base64
+import threading
+import uuid
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from featuredb.errors import ImageError, InvalidValueError
+from featuredb.features.decode import DecodeLimits
+from featuredb.geometry.arrays import FloatArray
+from featuredb.geometry.camera import Camera
+from featuredb.stage_clock import StageClock
+from featuredb.store import Database
+from reloc.localiser import Localiser
+from reloc.overlay import draw_overlay, map_points_in_view
+from reloc.service.handler import answer_query
+from reloc.service.options import wire_name_of
+from reloc.wire.query import (
+    CameraRequest,
+    LocaliseReply,
+    LocaliseWireRequest,
+    PriorRequest,
+    RequestOptions,
+    explain,
+)
+from reloc.wording import angles, describe
+
+Image = bytes | str | Path | NDArray[np.uint8]
+_SHOWN_PX = 900  # longer side of a picture in a notebook
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhotoAnswer:
+    """Where a photo was taken, or why that is not known. `print` it, or let a notebook show it.
+
+    Attributes:
+        name: of the photo. database: name of the one that was asked.
+        reply: every figure, as the wire words it (docs/wire.md).
+        photo: bytes of the image file.
+        other_points_utm: (n, 3) further points of the map that the photo should show, easting, northing,
+            height in metres; None where it is not localised on Earth.
+    """
+
+    name: str
+    database: str
+    reply: LocaliseReply
+    photo: bytes
+    other_points_utm: FloatArray | None
+
+    @property
+    def localised(self) -> bool:
+        """Whether there is a pose, on Earth or in a map without a place."""
+        return self.reply.status != "not_localised"
+
+    @property
+    def utm(self) -> FloatArray | None:
+        """(3,) float64: easting, northing, height of the camera in metres, zone `reply.utm.epsg`; or None."""
+        utm = self.reply.utm
+        return None if utm is None else np.array([utm.easting, utm.northing, utm.height])
+
+    @property
+    def heading_pitch_roll_deg(self) -> tuple[float, float, float] | None:
+        """Degrees: heading clockwise from true north, pitch up from level, roll clockwise; or None."""
+        return None if self.reply.quaternion is None else angles(self.reply).heading_pitch_roll_deg
+
+    @property
+    def covariance(self) -> FloatArray | None:
+        """(6, 6) float64 along true east, north, up: rotation (rad) before position (m); or None."""
+        return None if self.reply.covariance is None else np.array(self.reply.covariance)
+
+    def overlay(self) -> NDArray[np.uint8]:
+        """The photo with the projected map, (h, w, 3) uint8 red first, longer side at most 1600 px.
+
+        Raises:
+            InvalidValueError: not localised on Earth.
+        """
+        return np.ascontiguousarray(draw_overlay(self.photo, self.reply, self.other_points_utm)[:, :, ::-1])
+
+    def __str__(self) -> str:
+        return describe(self.name, self.reply, self.database)
+
+    def _repr_html_(self) -> str:
+        """Text, the photo with its inliers, and where they lie in plan."""
+        text = f"<pre>{escape(str(self))}</pre>"
+        if self.reply.inlier_points is None or self.utm is None:
+            return text
+        picture = self.overlay()[:, :, ::-1]
+        scale = min(1.0, _SHOWN_PX / max(picture.shape[:2]))
+        small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        data = base64.b64encode(cv2.imencode(".jpg", small)[1].tobytes()).decode("ascii")
+        return f'{text}<img alt="inliers" src="data:image/jpeg;base64,{data}">{_plan_svg(self)}'
+
+
+class PhotoAsker:
+    """Answers photos from the newest snapshot; its index is kept between calls. Threads may share it."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self.name = wire_name_of(database.url)  # as a server calls it
+        self._lock = threading.Lock()
+        self._localiser: Localiser | None = None
+
+    def localiser(self) -> Localiser:
+        """The maps of the newest snapshot; what did not change is not indexed again."""
+        with self._lock:
+            if self._localiser is None or self._localiser.snapshot != self._database.poll_version():
+                self._localiser = Localiser.open(self._database, previous=self._localiser)
+            return self._localiser
+
+    def ask(
+        self,
+        image: Image,
+        *,
+        prior: PriorRequest | tuple[float, float, float] | None = None,
+        camera: CameraRequest | Camera | None = None,
+        exif_prior: bool = True,
+        maps: tuple[str, ...] | None = None,
+        inliers: bool = True,
+        name: str | None = None,
+    ) -> PhotoAnswer:
+        """Where was this photo taken?
+
+        Args:
+            image: path or bytes of an image file, or its pixels, (h, w) or (h, w, 3) uint8, red first.
+            prior: where it may have been taken: latitude, longitude (WGS84 degrees), standard deviation (m).
+            camera: intrinsics, for any size of the picture; exact unless a CameraRequest gives sigmas.
+            exif_prior: the position in the photo's EXIF settles what is ambiguous, where `prior` is None.
+            maps: ask only maps of these ids.
+            inliers: the answer carries the matches that agree, which its pictures need.
+
+        Raises:
+            ImageError, OSError: no usable image. InvalidValueError: a prior or camera that is none.
+            RequestError: an image, a camera or maps that do not fit. StoreError: the database is gone.
+        """
+        photo, called = _image_bytes(image)
+        request = _request(prior, camera, exif_prior, maps, inliers)
+        localiser = self.localiser()
+        reply = answer_query(
+            photo,
+            request,
+            localiser,
+            limits=DecodeLimits(),
+            request_id=uuid.uuid4().hex,
+            clock=StageClock(),
+        )
+        on_earth = reply.status == "localised"
+        return PhotoAnswer(
+            name=name or called,
+            database=self.name,
+            reply=reply,
+            photo=photo,
+            other_points_utm=map_points_in_view(localiser.areas, reply) if on_earth and inliers else None,
+        )
+
+
+def _image_bytes(image: Image) -> tuple[bytes, str]:
+    """An image file, and what to call it."""
+    if isinstance(image, bytes):
+        return image, "photo"
+    if isinstance(image, str | Path):
+        return Path(image).read_bytes(), str(image)
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)):
+        raise ImageError(
+            f"image: expected pixels (h, w) or (h, w, 3) uint8, found {pixels.shape} {pixels.dtype}"
+        )
+    stored = pixels if pixels.ndim == 2 else pixels[:, :, ::-1]
+    return cv2.imencode(".png", stored, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes(), "photo"
+
+
+def _request(
+    prior: PriorRequest | tuple[float, float, float] | None,
+    camera: CameraRequest | Camera | None,
+    exif_prior: bool,
+    maps: tuple[str, ...] | None,
+    inliers: bool,
+) -> LocaliseWireRequest:
+    try:
+        if isinstance(prior, tuple):
+            lat, lon, sigma_m = map(float, prior)
+            prior = PriorRequest(lat=lat, lon=lon, sigma_m=sigma_m)
+        if isinstance(camera, Camera):
+            camera = CameraRequest(
+                model=camera.model, width=camera.width, height=camera.height, params=camera.params
+            )
+        options = RequestOptions(inliers=inliers, exif_prior=exif_prior, maps=maps)
+        return LocaliseWireRequest(prior=prior, camera=camera, options=options)
+    except ValidationError as error:
+        raise InvalidValueError(f"localise: {explain(error)}") from error
+
+
+def _plan_svg(answer: PhotoAnswer, side_px: int = 360) -> str:
+    """The inliers' map points and the camera with its direction, grid north up."""
+    reply, camera = answer.reply, answer.utm
+    assert camera is not None
+    assert reply.inlier_points is not None
+    points = np.array(reply.inlier_points.utm).reshape(-1, 3)[:, :2] - camera[:2]
+    reach_m = max(float(np.abs(points).max(initial=1.0)), 1.0)
+    scale, middle = 0.46 * side_px / reach_m, side_px / 2
+    step = max(1, len(points) // 500)
+    dots = "".join(
+        f'<circle cx="{middle + scale * e:.1f}" cy="{middle - scale * n:.1f}" r="1.5" fill="#3cb043"/>'
+        for e, n in points[::step]
+    )
+    up = angles(reply).true_enu_from_body
+    # Looking down, a camera has no direction in plan; its top has.
+    ahead = up[:2, 0] if abs(up[2, 0]) < 0.9 else up[:2, 2]
+    east, north = 0.12 * side_px * ahead / max(float(np.linalg.norm(ahead)), 1e-9)
+    return (
+        f'<svg width="{side_px}" height="{side_px}" role="img" aria-label="plan">'
+        f'<rect width="100%" height="100%" fill="#f6f8fa"/>{dots}'
+        f'<line x1="{middle}" y1="{middle}" x2="{middle + east:.1f}" y2="{middle - north:.1f}" '
+        'stroke="#c62828" stroke-width="3"/>'
+        f'<circle cx="{middle}" cy="{middle}" r="5" fill="#c62828"/>'
+        f'<text x="8" y="{side_px - 8}" font-size="12">north up, {2 * reach_m:.0f} m across</text></svg>'
+    )
