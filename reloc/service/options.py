@@ -21,9 +21,12 @@ class ServeOptions:
 
     Attributes:
         listen: Zenoh endpoints to listen on; port 0 takes a free one. Empty where `config_path` says it.
-        config_path: a Zenoh configuration (JSON5); `listen` is added to it.
+        connect: Zenoh endpoints of a router, or of another server, that clients connect to.
+        config_path: a Zenoh configuration (JSON5), in which `listen` and `connect` replace what it has.
         insecure: start also where whoever reaches the server could answer in its place.
         name: the database's name on the wire; "" takes the name of the database's folder.
+        metrics_port: of this machine, where Prometheus finds the server's figures; 0 takes a free one, None:
+            there is no such page.
         workers: queries localised at a time, each in a process of its own; two fill the reference machine's
             two cores.
         threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
@@ -47,9 +50,11 @@ class ServeOptions:
     """
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = ()
     config_path: Path | None = None
     insecure: bool = False
     name: str = ""
+    metrics_port: int | None = None
     workers: int = 2
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
     query_memory_bytes: int = 3 * 2**30

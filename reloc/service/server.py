@@ -114,7 +114,7 @@ class Server:
             FeatureDbError: the area cannot be loaded.
         """
         config = server_config(
-            options.listen, options.config_path, MESSAGE_HEADROOM * options.limits.max_bytes
+            options.listen, options.connect, options.config_path, MESSAGE_HEADROOM * options.limits.max_bytes
         )
         if not options.insecure:
             check_exposure(config)
