@@ -28,9 +28,9 @@ from reloc.tracking.options import TrackOptions
 from reloc.wire.query import CameraRequest, PriorRequest
 from reloc.wire.track import LiveStatus
 from schemas import load_schema
-from tests.support.bombs import png, zeros
 from tests.support.live import LENS, SOON_S, error_m, jpeg, localiser, wait_until
 from tests.support.service import MemorySource, ScriptedLocaliser, area_of, client_of, photo, running_server
+from tools.bombs import png, zeros
 
 _LIVE = LiveOptions(track=TrackOptions(live=True, keyframe_every=8), idle_timeout_s=60.0)
 
@@ -172,7 +172,6 @@ def test_a_closed_session_leaves_nothing_behind() -> None:
 _CLIENT = """
 import sys, time
 from reloc.client import Client
-from tests.support.bombs import png, zeros
 from tests.support.live import LENS, jpeg
 frames = [jpeg(k) for k in range(5)]
 with Client(sys.argv[1]) as client, client.track(LENS) as live:
