@@ -48,10 +48,14 @@ class CommandProcess:
         assert " on " in self.announced, (self.announced, self.stop(), self.errors)
         self.endpoint = self.announced.split(" on ")[1].split(";")[0].split(", asking")[0].strip()
 
-    def stop(self, number: int = signal.SIGTERM, timeout_s: float = 30.0) -> int:
-        """The exit code. Raises subprocess.TimeoutExpired: it does not end."""
+    def stop(self, number: int = signal.SIGTERM, timeout_s: float = 60.0) -> int:
+        """The exit code. Raises subprocess.TimeoutExpired: it does not end, and is killed."""
         self.process.send_signal(number)
-        code = self.process.wait(timeout_s)
+        try:
+            code = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
         self._reader.join(10)
         assert self.process.stdout is not None
         assert self.process.stderr is not None
