@@ -37,6 +37,13 @@ def register(subparsers: Any) -> None:
         help=f"Zenoh endpoint, may be repeated; default {_DEFAULT_ENDPOINT} where no --config is given",
     )
     serve.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="Zenoh endpoint of a router that clients connect to, may be repeated; with --config the server "
+        "then listens only where --listen says so",
+    )
+    serve.add_argument(
         "--config",
         type=Path,
         metavar="FILE",
@@ -66,6 +73,9 @@ def register(subparsers: Any) -> None:
         default=5.0,
         metavar="SECONDS",
         help="a live session without a usable frame for so long ends; default 5",
+    )
+    serve.add_argument(
+        "--metrics-port", type=int, metavar="PORT", help="serve http://127.0.0.1:PORT/metrics for Prometheus"
     )
     serve.set_defaults(run=_serve)
 
@@ -162,9 +172,11 @@ def _serve(args: argparse.Namespace) -> int:
     listen = tuple(args.listen or (() if args.config else (_DEFAULT_ENDPOINT,)))
     options = ServeOptions(
         listen=listen,
+        connect=tuple(args.connect or ()),
         config_path=args.config,
         insecure=args.insecure,
         name=args.name,
+        metrics_port=args.metrics_port,
         workers=args.workers,
         max_queue=args.max_queue,
         deadline_s=args.deadline,

@@ -183,7 +183,12 @@ class LiveTrack:
         return self._latency_ms.get(sequence)
 
     def _asked(self) -> TrackOpened:
-        replies = self._session.get(self._key, attachment=encode(self._request), timeout=self._timeout_s)
+        replies = self._session.get(
+            self._key,
+            attachment=encode(self._request),
+            timeout=self._timeout_s,
+            source_info=zenoh.SourceInfo(self._session.id, 0),  # one client among others
+        )
         for reply in replies:
             if reply.ok is not None:
                 return read_message(reply.ok.payload.to_bytes(), TrackOpened)

@@ -1,12 +1,19 @@
-"""Counts and latencies of a server."""
+"""Counts and latencies of a server, and its page for Prometheus."""
 
 import threading
 from collections import Counter, deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
+from prometheus_client import CollectorRegistry, ProcessCollector, start_http_server
+from prometheus_client.core import Metric
+from prometheus_client.registry import Collector
 
-from reloc.wire.server import Latency, QueryCounts
+from reloc.service.session import ServiceStartError
+from reloc.wire.server import Latency, QueryCounts, StatusReply
+from reloc.wire.status_metrics import status_metrics
 
 _LATENCY_WINDOW = 1000  # latest queries; enough for a 99th percentile, forgets a slow start
 
@@ -56,3 +63,38 @@ class ServerMetrics:
             return Latency(count=0, p50=None, p90=None, p99=None, max=None)
         p50, p90, p99 = (round(float(v), 3) for v in np.percentile(values, [50, 90, 99]))
         return Latency(count=len(values), p50=p50, p90=p90, p99=p99, max=round(float(values.max()), 3))
+
+
+@contextmanager
+def metrics_page(port: int, status: Callable[[], StatusReply]) -> Iterator[int]:
+    """Within the block `http://127.0.0.1:PORT/metrics` says what the server's status does; the port.
+
+    Args:
+        port: 0 takes a free one.
+
+    Raises:
+        ServiceStartError: the port is taken.
+    """
+    registry = CollectorRegistry()
+    registry.register(_Status(status))
+    ProcessCollector(registry=registry)
+    try:
+        server, thread = start_http_server(port, addr="127.0.0.1", registry=registry)
+    except OSError as error:
+        raise ServiceStartError(
+            f"cannot listen on 127.0.0.1:{port}: {error.strerror or error}; choose another --metrics-port"
+        ) from error
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Status(Collector):
+    def __init__(self, status: Callable[[], StatusReply]) -> None:
+        self._status = status
+
+    def collect(self) -> Iterator[Metric]:
+        return status_metrics(self._status())

@@ -9,6 +9,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.features.decode import DecodeLimits
 from reloc.service.contributions.inbox import InboxOptions
 from reloc.service.live.options import LiveOptions
+from reloc.service.workers.answering import WorkerLimits
 from reloc.wire.keys import NAME_PATTERN
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # Zenoh's own port, this machine only
@@ -20,15 +21,18 @@ class ServeOptions:
 
     Attributes:
         listen: Zenoh endpoints to listen on; port 0 takes a free one. Empty where `config_path` says it.
-        config_path: a Zenoh configuration (JSON5); `listen` is added to it.
+        connect: Zenoh endpoints of a router, or of another server, that clients connect to.
+        config_path: a Zenoh configuration (JSON5), in which `listen` and `connect` replace what it has.
         insecure: start also where whoever reaches the server could answer in its place.
         name: the database's name on the wire; "" takes the name of the database's folder.
+        metrics_port: of this machine, where Prometheus finds the server's figures; 0 takes a free one, None:
+            there is no such page.
         workers: queries localised at a time, each in a process of its own; two fill the reference machine's
             two cores.
         threads_per_worker: of OpenCV and BLAS within one query. All cores, so that a lone query, the common
             case of a robot or a phone, is answered soonest; workers that run at once share them.
-        query_memory_bytes: what one query may take of memory, beyond the maps. The largest pictures that
-            `limits` lets in take 1.5 GiB.
+        query_memory_bytes: what one query, or a frame of a live session, may take of memory, beyond the maps.
+            The largest pictures that `limits` lets in take 1.5 GiB.
         max_queue: queries that may wait; the next gets BUSY. At 0.25 s a query and two workers, 32
             waiting ones are answered within 4 s, half of the deadline.
         max_queued_bytes: of all waiting payloads together, so that the queue cannot fill the memory.
@@ -46,9 +50,11 @@ class ServeOptions:
     """
 
     listen: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    connect: tuple[str, ...] = ()
     config_path: Path | None = None
     insecure: bool = False
     name: str = ""
+    metrics_port: int | None = None
     workers: int = 2
     threads_per_worker: int = field(default_factory=lambda: os.cpu_count() or 1)
     query_memory_bytes: int = 3 * 2**30
@@ -64,8 +70,17 @@ class ServeOptions:
 
     @property
     def work_s(self) -> float:
-        """The longest that a worker is at one query."""
+        """The longest that a worker is at one picture."""
         return 0.5 * self.deadline_s
+
+    @property
+    def worker_limits(self) -> WorkerLimits:
+        """What one picture may use: a query's, or a frame of a live session."""
+        return WorkerLimits(
+            threads=self.threads_per_worker,
+            memory_bytes=self.query_memory_bytes,
+            processor_s=self.threads_per_worker * self.work_s,
+        )
 
     def __post_init__(self) -> None:
         for name, value in (

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 
 from featuredb.stop_signals import on_stop_signals
 from featuredb.store import Database
@@ -9,6 +10,7 @@ from reloc.localise.options import LocaliseOptions
 from reloc.service.contributions.database_inbox import DatabaseInbox
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.database_source import DatabaseSource
+from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
 
@@ -43,7 +45,13 @@ def serve(
         As `start_server`.
     """
     stop = threading.Event()
-    with on_stop_signals(stop.set), start_server(database, options, localise_options) as server:
+    with (
+        on_stop_signals(stop.set),
+        start_server(database, options, localise_options) as server,
+        ExitStack() as stack,
+    ):
+        if options is not None and options.metrics_port is not None:
+            stack.enter_context(metrics_page(options.metrics_port, server.status))
         on_ready(server)
         # A signal that a library's thread receives does not end a wait: its handler runs at the next.
         while not stop.wait(_TURN_S):

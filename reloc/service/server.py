@@ -13,6 +13,8 @@ import zenoh
 
 from reloc.service.contributions.inbox import Inbox
 from reloc.service.exposure import authenticates, check_exposure
+from reloc.service.live.follower import Follower
+from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.sessions import LiveSessions
 from reloc.service.metrics import ServerMetrics
 from reloc.service.options import ServeOptions
@@ -84,7 +86,15 @@ class Server:
             on_area=self._swap,
             on_failure=self._reload_failed,
         )
-        self._live = LiveSessions(session, self._keys, lambda: self._area, options.live, self.server_id)
+        self._live = LiveSessions(
+            session,
+            self._keys,
+            lambda: self._area,
+            self._follower,
+            options.live,
+            self.server_id,
+            authenticates=authenticates,
+        )
         self._queryables: list[zenoh.Queryable[None]] = []
         self._tokens: dict[str, zenoh.LivelinessToken] = {}
         self._token_lock = threading.Lock()
@@ -104,7 +114,7 @@ class Server:
             FeatureDbError: the area cannot be loaded.
         """
         config = server_config(
-            options.listen, options.config_path, MESSAGE_HEADROOM * options.limits.max_bytes
+            options.listen, options.connect, options.config_path, MESSAGE_HEADROOM * options.limits.max_bytes
         )
         if not options.insecure:
             check_exposure(config)
@@ -217,6 +227,17 @@ class Server:
             ),
             contributions=None if self._inbox is None else self._inbox.status(),
             live=self._live.status(),
+        )
+
+    def _follower(self, answerer: FrameAnswerer) -> Follower:
+        """A live session's, with the limits of a query."""
+        options = self._options
+        return Follower(
+            answerer,
+            limits=options.worker_limits,
+            frame_s=options.work_s,
+            max_bytes=options.live.limits.max_bytes,
+            files=lambda: self._workers.published,
         )
 
     # Zenoh calls these in threads of its own; they must return at once.

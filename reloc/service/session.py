@@ -16,8 +16,10 @@ class ServiceStartError(FeatureDbError):
     """The server cannot start: port taken, bad endpoint, bad configuration."""
 
 
-def server_config(listen: tuple[str, ...], config_path: Path | None, max_message_bytes: int) -> zenoh.Config:
-    """The Zenoh configuration of a server.
+def server_config(
+    listen: tuple[str, ...], connect: tuple[str, ...], config_path: Path | None, max_message_bytes: int
+) -> zenoh.Config:
+    """The Zenoh configuration of a server; one that connects listens only where `listen` says so.
 
     Raises:
         ServiceStartError: the file cannot be read.
@@ -32,7 +34,9 @@ def server_config(listen: tuple[str, ...], config_path: Path | None, max_message
         config.insert_json5("transport/shared_memory/enabled", "false")
         # A fragmented message is gathered in memory before anybody sees its length.
         config.insert_json5("transport/link/rx/max_message_size", str(max_message_bytes))
-    if listen:
+    if connect:
+        config.insert_json5("connect/endpoints", json.dumps(list(connect)))
+    if listen or connect:
         config.insert_json5("listen/endpoints", json.dumps(list(listen)))
     return config
 

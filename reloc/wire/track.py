@@ -29,6 +29,7 @@ class EndReason(StrEnum):
 
     CLIENT_GONE = "CLIENT_GONE"  # the client's liveliness token is gone: it has closed the session, or died
     IDLE = "IDLE"  # no frame that could be used for too long
+    MADE_ROOM = "MADE_ROOM"  # for a client who has fewer sessions
     SHUTTING_DOWN = "SHUTTING_DOWN"  # the server stops
     INTERNAL = "INTERNAL"  # a defect of the server; its log has the session
 

@@ -137,13 +137,13 @@ def test_metrics_count_requests_by_route_and_status_and_show_the_server():
     assert len([name for name in found if name.startswith(total)]) == 4
     name = "featuredb_gateway_request_seconds"
     assert found[f'{name}_count{{route="/geopose"}}'] == 4
-    assert found[f'{name}_bucket{{route="/geopose",le="+Inf"}}'] == 4
-    rising = [found[key] for key in found if key.startswith(f'{name}_bucket{{route="/geopose"')]
+    assert found[f'{name}_bucket{{le="+Inf",route="/geopose"}}'] == 4
+    rising = [found[key] for key in found if key.startswith(f"{name}_bucket{{") and "/geopose" in key]
     assert rising == sorted(rising)
     assert 0 < found[f'{name}_sum{{route="/geopose"}}'] < 60
     assert found["featuredb_server_up"] == 1
-    assert found['featuredb_server_queries_total{outcome="localised",code=""}'] == 3
-    assert found['featuredb_server_queries_total{outcome="error",code="BAD_IMAGE"}'] == 1
+    assert found['featuredb_server_queries_total{code="",outcome="localised"}'] == 3
+    assert found['featuredb_server_queries_total{code="BAD_IMAGE",outcome="error"}'] == 1
     assert found["featuredb_server_snapshot"] == 5
     assert found["featuredb_gateway_sessions_total"] == 1
 

@@ -16,9 +16,9 @@ from featuredb.store import Database
 from reloc.client import CameraRequest, Client
 from reloc.service.options import ServeOptions
 from reloc.service.serve import start_server
-from tests.support.bombs import png, progressive_jpeg, zeros
 from tests.support.planar_map import CAMERA, field_texture, planar_map, render, view
-from tests.support.serve_process import ServeProcess
+from tools.bombs import png, progressive_jpeg, zeros
+from tools.serve_process import ServeProcess
 
 SIDE = 10_944  # 120 million pixels, the most that are taken
 LENS = CameraRequest(model="PINHOLE", width=640, height=480, params=CAMERA.params)

@@ -11,8 +11,8 @@ from PIL import Image
 
 from featuredb.errors import ServiceError
 from reloc.wire.query import ErrorCode, LocaliseReply
-from tests.support.bombs import png
 from tests.support.service import ScriptedLocaliser, client_of, photo, running_server
+from tools.bombs import png
 
 QUERIES = 300
 

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -28,7 +29,8 @@ from reloc.wire.query import CameraRequest, PriorRequest
 from reloc.wire.track import LiveStatus
 from schemas import load_schema
 from tests.support.live import LENS, SOON_S, error_m, jpeg, localiser, wait_until
-from tests.support.service import MemorySource, area_of, client_of, photo, running_server
+from tests.support.service import MemorySource, ScriptedLocaliser, area_of, client_of, photo, running_server
+from tools.bombs import png, zeros
 
 _LIVE = LiveOptions(track=TrackOptions(live=True, keyframe_every=8), idle_timeout_s=60.0)
 
@@ -115,7 +117,7 @@ def test_poses_come_in_the_order_of_the_frames_and_are_right() -> None:
             assert pose.snapshot == 1
             assert list(pose.camera.params) == pytest.approx(LENS.params)
             stages = dict(pose.timings_ms)
-            assert set(stages) == {"queue", "decode", "track", "reply", "total"}
+            assert set(stages) == {"queue", "worker", "decode", "track", "reply", "total"}
             assert stages.pop("total") == pytest.approx(sum(stages.values()), abs=0.01)
             assert live.latency_ms(pose.sequence) is not None
         counts = live_status(server)
@@ -410,18 +412,86 @@ def test_hostile_openings_get_an_error_each_and_open_nothing() -> None:
             exchange(live, range(1))
 
 
-def test_a_defect_ends_the_session_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(*_: object) -> None:
-        raise ZeroDivisionError("a defect")
+class BrokenLocaliser(ScriptedLocaliser):
+    """Meets a defect in the worker process, with every frame."""
 
-    monkeypatch.setattr("reloc.service.live.frames.point_of", broken)
-    with serving() as (server, client):
-        with client.track(LENS) as live:
-            assert end_of(live, jpeg(0)).code == "INTERNAL"
-        assert live_status(server).open == 0
-        monkeypatch.undo()
-        with client.track(LENS) as live:
-            exchange(live, range(1))
+    def __reduce__(self) -> tuple[object, ...]:
+        return SimpleNamespace, ()
+
+
+def test_a_defect_costs_its_frame_and_says_so() -> None:
+    source = MemorySource(area_of(BrokenLocaliser(1)))
+    options = ServeOptions(live=_LIVE, poll_interval_s=0.05)
+    with running_server(source, options) as server, client_of(server) as client, client.track(LENS) as live:
+        live.send(jpeg(0), 0.0)
+        wait_until(lambda: bool(live.refusals), "the refusal")
+        assert live.refusals[0].code == "INTERNAL"
+        source.publish(area_of(localiser(2)))
+        wait_until(lambda: server.status().snapshot == 2, "the reload")
+        exchange(live, range(1, 3))
+
+
+def live_worker(server: Server) -> int:
+    (session,) = server._live._open.values()
+    process = session._follower._process
+    assert process is not None
+    pid = process._process.pid
+    assert pid is not None
+    return pid
+
+
+@pytest.mark.parametrize("how", [signal.SIGSEGV, signal.SIGSTOP])
+def test_a_frame_that_crashes_or_hangs_costs_itself_alone(how: signal.Signals) -> None:
+    """The server, the session and another one go on; a new process finds the track again."""
+    options = ServeOptions(live=_LIVE, deadline_s=4.0)
+    with (
+        running_server(localiser(), options) as server,
+        client_of(server) as client,
+        client.track(LENS) as live,
+    ):
+        before = until_tracking(live)[-1].sequence
+        pid = live_worker(server)
+        os.kill(pid, how)
+        if how == signal.SIGSTOP:  # the frame waits for a process that does nothing
+            live.send(jpeg(0), (before + 1) / 30.0)
+            wait_until(lambda: bool(live.refusals), "the refusal")
+            assert [r.code for r in live.refusals] == ["DEADLINE"]
+            assert live.refusals[0].sequence == before + 1
+        else:
+            wait_until(lambda: not Path(f"/proc/{pid}").exists(), "its end")
+        found = until_tracking(live, first=before + 2)
+        assert found[0].state == "lost"
+        assert found[-1].dropped == 0 if how == signal.SIGSTOP else 1
+        assert live_worker(server) != pid
+        assert live_status(server).open == 1
+
+
+def test_a_frame_beyond_its_memory_is_refused() -> None:
+    options = ServeOptions(live=replace(_LIVE, limits=DecodeLimits()), query_memory_bytes=100 << 20)
+    with (
+        running_server(localiser(), options) as server,
+        client_of(server) as client,
+        client.track() as live,
+    ):
+        live.send(png(10_900, 10_900, zeros(10_901 * 10_900)), 0.0)
+        wait_until(lambda: bool(live.refusals), "the refusal")
+        assert live.refusals[0].code == "TOO_LARGE"
+
+
+def test_who_has_several_sessions_gives_one_up_to_who_has_none() -> None:
+    with (
+        serving(max_sessions=2) as (server, greedy),
+        client_of(server) as other,
+        greedy.track(LENS) as first,
+        greedy.track(LENS) as second,
+        other.track(LENS) as third,
+    ):
+        exchange(third, range(2))
+        assert end_of(second).code == "MADE_ROOM"
+        exchange(first, range(2))
+        with pytest.raises(ServiceError) as caught, greedy.track():
+            pass
+        assert caught.value.code == "BUSY"
 
 
 def test_frames_larger_than_are_tracked_are_made_smaller() -> None:

@@ -38,7 +38,7 @@ from tests.support.planar_map import (
     render,
     view,
 )
-from tests.support.serve_process import ServeProcess
+from tools.serve_process import ServeProcess
 
 pytestmark = pytest.mark.slow
 

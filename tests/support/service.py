@@ -115,7 +115,7 @@ class ScriptedLocaliser:
             self._listener = mp.Listener(authkey=multiprocessing.current_process().authkey)
             threading.Thread(target=self._serve, args=(self._listener,), daemon=True).start()
         authkey = bytes(multiprocessing.current_process().authkey)
-        return _Remote, (self._listener.address, authkey, self.snapshot)
+        return _Remote, (self._listener.address, authkey, self.snapshot, self.areas)
 
     def _serve(self, listener: mp.Listener) -> None:
         while True:
@@ -144,11 +144,10 @@ class ScriptedLocaliser:
 class _Remote:
     """A `ScriptedLocaliser` of the test's process, in a worker."""
 
-    areas: tuple[IndexedArea, ...] = ()
     options = LocaliseOptions()
 
-    def __init__(self, address: str, authkey: bytes, snapshot: int) -> None:
-        self.snapshot, self._address, self._authkey = snapshot, address, authkey
+    def __init__(self, address: str, authkey: bytes, snapshot: int, areas: tuple[IndexedArea, ...]) -> None:
+        self.areas, self.snapshot, self._address, self._authkey = areas, snapshot, address, authkey
 
     def localise(self, gray: NDArray[np.uint8], request: LocaliseRequest) -> LocaliseResult:
         with mp.Client(self._address, authkey=self._authkey) as connection:

@@ -15,15 +15,16 @@ from featuredb.features import decode
 from featuredb.features.decode import DecodeLimits
 from reloc.localiser import OnDemand
 from reloc.service.workers import answering, process
-from reloc.service.workers.answering import WorkerLimits
+from reloc.service.workers.answering import QueryAnswerer, WorkerLimits
 from reloc.service.workers.area_files import AreaFiles
 from reloc.service.workers.process import WorkerEndedError, WorkerProcess
 
-LIMITS = WorkerLimits(threads=1, memory_bytes=1 << 30, processor_s=5.0, decode=DecodeLimits())
+LIMITS = WorkerLimits(threads=1, memory_bytes=1 << 30, processor_s=5.0)
+ANSWERER = QueryAnswerer(decode=DecodeLimits())
 
 
 def test_a_process_that_was_told_to_end_is_not_alive():
-    worker = WorkerProcess(LIMITS)
+    worker = WorkerProcess(LIMITS, ANSWERER)
     try:
         assert worker.is_alive()
         worker.kill()
@@ -38,7 +39,7 @@ def test_too_many_open_files_are_a_process_that_does_not_come_up(monkeypatch):
 
     monkeypatch.setattr(process, "_CONTEXT", SimpleNamespace(Pipe=none_left))
     with pytest.raises(WorkerEndedError):
-        WorkerProcess(LIMITS)
+        WorkerProcess(LIMITS, ANSWERER)
 
 
 @pytest.mark.parametrize(("hard", "set_to"), [(1000, 1000), (resource.RLIM_INFINITY, 5000)])

@@ -26,6 +26,65 @@ SPEED: tuple[Row, ...] = (
         minutes=2,
     ),
     Row(
+        name="service-attacks",
+        group="speed",
+        form="full",
+        claim="a real map of `brighton` with copies of it to 200,000 points, served with keys: honest "
+        "clients' answer times and the server's memory under eleven attacks (tools/attacks.py)",
+        commands=(
+            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            ("tools.attacks_benchmark", "{work}/db", BRIGHTON, *OUT),
+        ),
+        figures=same("points", "asked", "quiet_mib", "after_mib", "worst_http_p99_s", "failures_by_kills"),
+        text="99 % within {quiet_p99_s:.2f} s quiet, {worst_p99_s:.2f} s under the worst attack, {failures} "
+        "failed, {wrong} wrong; {peak_mib:.0f} MiB at the peak",
+        limits=(
+            Limit(figure="points", least=200_000),
+            Limit(figure="worst_p99_s", most=7.9),  # a failed question counts as the deadline, 8 s
+            Limit(figure="wrong", most=0),
+            Limit(figure="peak_mib", most=8192),
+        ),
+        needs=("brighton/images",),
+        minutes=12,
+    ),
+    Row(
+        name="service-soak",
+        group="speed",
+        form="full",
+        claim="a server for an hour: queries with and without priors, commits, reloads, killed workers, "
+        "broken messages",
+        commands=(
+            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            ("tools.service_soak", "{work}/db", BRIGHTON, "--minutes", "60", *OUT),
+        ),
+        figures=same("failed", "p99_s", "late_mib", "exit_code"),
+        text="{asked} questions, {wrong} wrong, {missing} without a reply, {kills} workers killed, {reloads} "
+        "reloads; {grown_mib:+.0f} MiB",
+        limits=(
+            Limit(figure="wrong", most=0),
+            Limit(figure="missing", most=0),
+            Limit(figure="grown_mib", most=100),
+            Limit(figure="exit_code", least=0, most=0),
+        ),
+        needs=("brighton/images",),
+        minutes=65,
+    ),
+    Row(
+        name="service-stops",
+        group="speed",
+        form="full",
+        claim="a server told to stop in the middle of its load, 200 times",
+        commands=(
+            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            ("tools.service_stops", "{work}/db", BRIGHTON, *OUT),
+        ),
+        figures=same("stops", "slowest_s"),
+        text="{clean} of {stops} clean, the slowest in {slowest_s:.1f} s",
+        limits=(Limit(figure="clean", least=200),),
+        needs=("brighton/images",),
+        minutes=25,
+    ),
+    Row(
         name="scan-memory",
         group="speed",
         form="full",

@@ -1,4 +1,4 @@
-"""One live session: a thread that takes the latest frame, tracks it and hands out its pose."""
+"""One live session: a thread that takes the latest frame, has it tracked and hands out its pose."""
 
 import logging
 import threading
@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel
 
-from reloc.service.live.frames import FrameAnswerer, FrameError
+from reloc.service.live.follower import Follower, FrameError
 from reloc.service.live.latest import Arrival, LatestFrame
 from reloc.service.live.metrics import LiveMetrics
 from reloc.wire.track import EndReason, TrackEvent
@@ -18,6 +18,7 @@ logger = logging.getLogger(__name__)
 
 _END_TEXT = {
     EndReason.CLIENT_GONE: "the client has closed the session, or is gone",
+    EndReason.MADE_ROOM: "another client asks for a session, and this one's has several",
     EndReason.SHUTTING_DOWN: "the server is stopping; open a session of another one or later",
     EndReason.INTERNAL: "the server failed on this session; its log says why under the session's name",
 }
@@ -28,12 +29,14 @@ class LiveSession:
 
     Attributes:
         name: of the session on the wire.
+        asker: who shares the server with others, as of a query.
     """
 
     def __init__(
         self,
         name: str,
-        answerer: FrameAnswerer,
+        asker: str,
+        follower: Follower,
         *,
         idle_timeout_s: float,
         publish: Callable[[str, BaseModel], None],
@@ -45,8 +48,8 @@ class LiveSession:
             publish: sends a message under a leaf of the session's key; never waits for the client.
             on_end: called by the session's thread when nothing is left of it, before it says so.
         """
-        self.name = name
-        self._answerer = answerer
+        self.name, self.asker = name, asker
+        self._follower = follower
         self._idle_timeout_s = idle_timeout_s
         self._publish = publish
         self._metrics = metrics
@@ -70,13 +73,18 @@ class LiveSession:
             self._reason = self._reason or reason
         self._inbox.close()
 
+    @property
+    def ending(self) -> bool:
+        """Whether it takes no more frames."""
+        return self._reason is not None
+
     def join(self, timeout_s: float) -> None:
         """Wait for the end."""
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
         try:
-            with self._answerer:
+            with self._follower:
                 self._answer_frames()
         except Exception:
             logger.exception(
@@ -98,7 +106,7 @@ class LiveSession:
     def _answered(self, arrival: Arrival) -> bool:
         """Whether the frame could be used: it has been answered then."""
         try:
-            pose = self._answerer.answer(arrival)
+            pose = self._follower.answer(arrival)
         except FrameError as error:
             self._metrics.frame_refused(error.code)
             self._states["refused"] += 1

@@ -4,6 +4,7 @@ import logging
 import re
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 
@@ -11,12 +12,16 @@ import zenoh
 from pydantic import BaseModel
 from zenoh.handlers import Callback
 
+from featuredb.errors import IncompatibleExtractorError
+from reloc.service.live.follower import Follower
 from reloc.service.live.frames import FrameAnswerer
 from reloc.service.live.latest import Arrival
 from reloc.service.live.metrics import LiveMetrics
 from reloc.service.live.options import LiveOptions
 from reloc.service.live.session import LiveSession
+from reloc.service.pending import session_of
 from reloc.service.source import ServedArea
+from reloc.tracking.map_ground import usable_areas
 from reloc.wire.keys import NAME_PATTERN, Keys
 from reloc.wire.query import (
     MAX_ATTACHMENT_BYTES,
@@ -40,22 +45,29 @@ _JSON = zenoh.Encoding.APPLICATION_JSON
 
 
 class LiveSessions:
-    """Opens and ends sessions; at most `LiveOptions.max_sessions` at a time."""
+    """Opens and ends sessions; at most `LiveOptions.max_sessions` at a time, shared by who asks.
+
+    Where all are open, the asker who has most gives up his newest for one who has at least two fewer.
+    """
 
     def __init__(
         self,
         session: zenoh.Session,
         keys: Keys,
         area: Callable[[], ServedArea],
+        follower: Callable[[FrameAnswerer], Follower],
         options: LiveOptions,
         server_id: str,
+        *,
+        authenticates: bool,
     ) -> None:
         """
         Args:
-            area: gives the area in service.
+            area: gives the area in service. follower: has a session's frames answered.
+            authenticates: whether clients' names are proven; else who asks is the session it says it is.
         """
-        self._session, self._keys, self._area = session, keys, area
-        self._options, self._server_id = options, server_id
+        self._session, self._keys, self._area, self._follower = session, keys, area, follower
+        self._options, self._server_id, self._authenticates = options, server_id, authenticates
         self._metrics = LiveMetrics()
         self._lock = threading.Lock()
         self._open: dict[str, LiveSession] = {}  # by key
@@ -144,12 +156,15 @@ class LiveSessions:
         key = self._keys.track(client, name)
         attachment = None if query.attachment is None else query.attachment.to_bytes()
         request = parse_attachment(TrackOpenRequest, attachment)
+        answerer, area = FrameAnswerer(name, request, self._options), self._area()
+        asker = client if self._authenticates else session_of(query)
+        _check_comparable(area)
         with self._lock:
-            self._check_room(key)
-            answerer = FrameAnswerer(name, request, self._area, self._options)
+            self._make_room(key, asker)
             session = LiveSession(
                 name,
-                answerer,
+                asker,
+                self._follower(answerer),
                 idle_timeout_s=self._options.idle_timeout_s,
                 publish=lambda leaf, message: self._publish(f"{key}/{leaf}", message),
                 metrics=self._metrics,
@@ -171,7 +186,7 @@ class LiveSessions:
             session=name,
             database=self._keys.database,
             server_id=self._server_id,
-            snapshot=answerer.snapshot,
+            snapshot=area.snapshot,
             idle_timeout_s=self._options.idle_timeout_s,
             limits=TrackLimits(
                 max_payload_bytes=limits.max_bytes,
@@ -180,7 +195,7 @@ class LiveSessions:
             ),
         )
 
-    def _check_room(self, key: str) -> None:
+    def _make_room(self, key: str, asker: str) -> None:
         if self._closed:
             raise RequestError(ErrorCode.SHUTTING_DOWN, "the server is stopping; ask again later")
         if self._options.max_sessions == 0:
@@ -193,12 +208,18 @@ class LiveSessions:
                 ErrorCode.BAD_REQUEST,
                 f"session: {key.rpartition('/')[2]!r} is open; choose another name, at random",
             )
-        if len(self._open) >= self._options.max_sessions:
+        running = [session for session in self._open.values() if not session.ending]
+        if len(running) < self._options.max_sessions:
+            return
+        held = Counter(session.asker for session in running)
+        most = max(held, key=lambda name: held[name])
+        if held[most] <= held[asker] + 1:
             raise RequestError(
                 ErrorCode.BUSY,
-                f"{len(self._open)} live sessions are open, as many as this server takes; try again later, "
+                f"{len(running)} live sessions are open, as many as this server takes; try again later, "
                 "ask another server, or start it with more --live-sessions",
             )
+        [session for session in running if session.asker == most][-1].end(EndReason.MADE_ROOM)
 
     def _on_frame(self, session: LiveSession, sample: zenoh.Sample) -> None:
         """Take a frame over; what is too large is not copied, and refused by the session's thread."""
@@ -235,6 +256,15 @@ class LiveSessions:
             )
         except zenoh.ZError:
             logger.warning("a live session's message could not be published", exc_info=True)
+
+
+def _check_comparable(area: ServedArea) -> None:
+    """Raises RequestError: no map can be compared with the frames."""
+    localiser = area.localiser
+    try:
+        usable_areas(localiser.areas, localiser.options.extractor.fingerprint)
+    except IncompatibleExtractorError as error:
+        raise RequestError(ErrorCode.INCOMPATIBLE_EXTRACTOR, str(error)) from error
 
 
 def _log(message: str, event: str, client: str, session: str, **fields: object) -> None:

@@ -1,4 +1,4 @@
-"""What a worker process does: decode and localise photos, one at a time, over areas that it has mapped."""
+"""What a worker process does: decode and localise pictures, one at a time, over areas that it has mapped."""
 
 import math
 import os
@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import recv_handle
 from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
+from pydantic import BaseModel
 
 from featuredb.features.decode import DecodeLimits
 from featuredb.stage_clock import StageClock
@@ -19,7 +21,14 @@ from reloc.service.handler import answer_query
 from reloc.service.source import LocaliserLike
 from reloc.service.threads import capped_process
 from reloc.service.workers.area_files import MappedAreas
-from reloc.wire.query import ErrorCode, ErrorReply, LocaliseWireRequest, RequestError, encode
+from reloc.wire.query import (
+    ErrorCode,
+    ErrorReply,
+    LocaliseReply,
+    LocaliseWireRequest,
+    RequestError,
+    encode,
+)
 
 # What the first byte of an answer says of the rest.
 REPLY, REFUSAL, DEFECT = b"R", b"E", b"D"
@@ -28,19 +37,25 @@ OUT_OF_MEMORY = 77  # exit code
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerLimits:
-    """What one query may use.
+    """What one picture may use.
 
     Attributes:
         threads: of OpenCV and BLAS.
         memory_bytes: of address space, beyond what the process has before.
         processor_s: of all threads together.
-        decode: bytes and pixels of the image.
     """
 
     threads: int
     memory_bytes: int
     processor_s: float
-    decode: DecodeLimits
+
+
+class Answerer(Protocol):
+    """What answers in the process: it is sent there, as it is, when the process starts."""
+
+    def answer(self, ask: Any, data: bytes, localiser: LocaliserLike) -> BaseModel:
+        """The answer to a message with an image file. Raises RequestError: why there is none."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +73,30 @@ class Ask:
     request_id: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryAnswerer:
+    """Answers queries, each by itself.
+
+    Attributes:
+        decode: bytes and pixels of the image.
+    """
+
+    decode: DecodeLimits
+
+    def answer(self, ask: Ask, data: bytes, localiser: LocaliserLike) -> LocaliseReply:
+        """As `answer_query`."""
+        return answer_query(
+            data,
+            ask.request,
+            localiser,
+            limits=self.decode,
+            request_id=ask.request_id,
+            clock=StageClock(),
+        )
+
+
 class _Stop:
-    """SIGTERM ends an idle process at once, and one that has a query after it."""
+    """SIGTERM ends an idle process at once, and one that has a picture in hand after it."""
 
     def __init__(self) -> None:
         self.busy = self.wanted = False
@@ -72,8 +109,8 @@ class _Stop:
             os._exit(0)
 
 
-def answer_queries(connection: Connection, limits: WorkerLimits) -> None:
-    """Until the other end is closed: answers to `OpenFiles` (empty) and `Ask`."""
+def answer_all(connection: Connection, limits: WorkerLimits, answerer: Answerer) -> None:
+    """Until the other end is closed: answers to `OpenFiles` (empty) and what the answerer is asked."""
     stop, areas = _Stop(), MappedAreas()
     localiser: LocaliserLike | None = None
     unlimited = resource.getrlimit(resource.RLIMIT_AS)
@@ -90,7 +127,7 @@ def answer_queries(connection: Connection, limits: WorkerLimits) -> None:
                     data = connection.recv_bytes()
                     assert localiser is not None
                     _limit(limits)
-                    answer = _answer(message, data, localiser, limits)
+                    answer = _answer(answerer, message, data, localiser)
                 connection.send_bytes(answer)
             except (EOFError, OSError):
                 return
@@ -115,7 +152,7 @@ def _opened(connection: Connection, message: OpenFiles, areas: MappedAreas) -> L
 
 
 def _limit(limits: WorkerLimits) -> None:
-    """Limits of the next query, above what the process has and has used so far."""
+    """Limits of the next picture, above what the process has and has used so far."""
     times = os.times()
     used_s = times.user + times.system
     _set_limit(resource.RLIMIT_CPU, math.ceil(used_s + limits.processor_s) + 1)
@@ -131,20 +168,13 @@ def _set_limit(which: int, wanted: int) -> None:
     resource.setrlimit(which, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
 
 
-def _answer(ask: Ask, data: bytes, localiser: LocaliserLike, limits: WorkerLimits) -> bytes:
+def _answer(answerer: Answerer, ask: object, data: bytes, localiser: LocaliserLike) -> bytes:
     try:
-        reply = answer_query(
-            data,
-            ask.request,
-            localiser,
-            limits=limits.decode,
-            request_id=ask.request_id,
-            clock=StageClock(),
-        )
-        return REPLY + encode(reply)
+        return REPLY + encode(answerer.answer(ask, data, localiser))
     except RequestError as error:
-        refusal = ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=ask.request_id)
-        return REFUSAL + encode(refusal)
+        return REFUSAL + encode(
+            ErrorReply(code=ErrorCode(error.code), message=error.message, request_id=None)
+        )
     except (MemoryError, cv2.error) as error:
         if isinstance(error, MemoryError) or error.code == cv2.Error.StsNoMem:
             raise

@@ -16,8 +16,8 @@ from reloc.service.pending import PendingQuery
 from reloc.service.queueing import DeadlineWatch, QueryQueue, deadline_error
 from reloc.service.session import ServiceStartError
 from reloc.service.source import ServedArea
-from reloc.service.workers.answering import Ask, WorkerLimits
-from reloc.service.workers.area_files import AreaFiles
+from reloc.service.workers.answering import Ask, QueryAnswerer, WorkerLimits
+from reloc.service.workers.area_files import AreaFiles, LocaliserFiles
 from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
 from reloc.wire.query import (
     ContributionReply,
@@ -50,12 +50,8 @@ class WorkerPool:
         self._watch = watch
         self._options = options
         self._inbox = inbox
-        self._limits = WorkerLimits(
-            threads=options.threads_per_worker,
-            memory_bytes=options.query_memory_bytes,
-            processor_s=options.threads_per_worker * options.work_s,
-            decode=options.limits,
-        )
+        self._limits = options.worker_limits
+        self._answerer = QueryAnswerer(decode=options.limits)
         self._files = AreaFiles()
         # A photo is named while it is localised: the query does not wait for a hash of its megabytes.
         self._namer = ThreadPoolExecutor(1, thread_name_prefix="name-photo")
@@ -77,6 +73,11 @@ class WorkerPool:
     def ready(self) -> int:
         """Workers whose process is up, and not beyond its query's deadline."""
         return len(self._up)
+
+    @property
+    def published(self) -> LocaliserFiles:
+        """The area that is answered from."""
+        return self._published
 
     def publish(self, area: ServedArea) -> None:
         """Answer from this area, beginning with the next query of each worker."""
@@ -144,7 +145,7 @@ class WorkerPool:
                 self._gone(process)
                 process = None
             try:
-                process = WorkerProcess(self._limits)
+                process = WorkerProcess(self._limits, self._answerer)
                 process.open(self._published)
             except Exception as error:
                 if process is not None:
@@ -215,7 +216,7 @@ class WorkerPool:
             return
         name = self._namer.submit(candidate_id_of, data) if request.contribute else None
         process.open(self._published)
-        reply = process.ask(Ask(request=request, request_id=item.request_id), data)
+        reply = process.ask(Ask(request=request, request_id=item.request_id), data, LocaliseReply)
         clock.lap("worker", reply.timings_ms)
         reply = reply.model_copy(update={"timings_ms": clock.milliseconds()})
         _check_deadline(item)

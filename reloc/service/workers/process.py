@@ -9,22 +9,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.reduction import send_handle
 from types import ModuleType
+from typing import TypeVar
+
+from pydantic import BaseModel
 
 from reloc.service.workers.answering import (
     DEFECT,
     OUT_OF_MEMORY,
     REFUSAL,
-    Ask,
+    Answerer,
     OpenFiles,
     WorkerLimits,
-    answer_queries,
+    answer_all,
 )
 from reloc.service.workers.area_files import LocaliserFiles
-from reloc.wire.query import ErrorCode, ErrorReply, LocaliseReply, RequestError
+from reloc.wire.query import ErrorCode, ErrorReply, RequestError
 
 # Forked from a process that has imported everything and runs no threads: a new one is there in milliseconds.
 _CONTEXT = multiprocessing.get_context("forkserver")
 _STARTING = threading.Lock()
+_Reply = TypeVar("_Reply", bound=BaseModel)
 _JOIN_S = 5.0  # for one that has ended or is killed
 
 
@@ -58,7 +62,7 @@ class WorkerEndedError(Exception):
     """The process has ended before it answered.
 
     Attributes:
-        out_of_memory: the query needed more than its limit.
+        out_of_memory: the picture needed more than its limit.
     """
 
     def __init__(self, code: int | None) -> None:
@@ -68,13 +72,13 @@ class WorkerEndedError(Exception):
 
 
 class WorkerDefectError(Exception):
-    """The query met a defect; the message is the traceback in the worker."""
+    """The picture met a defect; the message is the traceback in the worker."""
 
 
 class WorkerProcess:
-    """A process that answers one query at a time; of one thread, but for `kill`."""
+    """A process that answers one message at a time; of one thread, but for `kill`."""
 
-    def __init__(self, limits: WorkerLimits) -> None:
+    def __init__(self, limits: WorkerLimits, answerer: Answerer) -> None:
         """Raises WorkerEndedError where no process can be started."""
         try:
             self._connection, theirs = _CONTEXT.Pipe()
@@ -83,7 +87,7 @@ class WorkerProcess:
         self._open: LocaliserFiles | None = None
         self._killed = False
         self._process = _CONTEXT.Process(
-            target=answer_queries, args=(theirs, limits), name="localise", daemon=True
+            target=answer_all, args=(theirs, limits, answerer), name="localise", daemon=True
         )
         try:
             with _without_script():
@@ -126,11 +130,11 @@ class WorkerProcess:
             raise self._ended() from error
         self._open = files
 
-    def ask(self, ask: Ask, data: bytes) -> LocaliseReply:
-        """Localise.
+    def ask(self, ask: object, data: bytes, reply: type[_Reply]) -> _Reply:
+        """What the process's answerer answers.
 
         Args:
-            data: the image file.
+            data: the image file. reply: what the answer is.
 
         Raises:
             RequestError: why there is no answer.
@@ -149,7 +153,7 @@ class WorkerProcess:
         if kind == REFUSAL:
             refusal = ErrorReply.model_validate_json(content)
             raise RequestError(ErrorCode(refusal.code), refusal.message)
-        return LocaliseReply.model_validate_json(content)
+        return reply.model_validate_json(content)
 
     def _ended(self) -> WorkerEndedError:
         self._process.join(_JOIN_S)

@@ -1,0 +1,175 @@
+"""The server's end of a live session: headers are checked here, frames looked at in a process of its own."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Self
+
+from featuredb.stage_clock import StageClock
+from reloc.service.live.frames import FrameAnswerer, FrameAsk
+from reloc.service.live.latest import Arrival
+from reloc.service.workers.answering import WorkerLimits
+from reloc.service.workers.area_files import LocaliserFiles
+from reloc.service.workers.process import WorkerDefectError, WorkerEndedError, WorkerProcess
+from reloc.wire.query import ErrorCode, RequestError, parse_attachment
+from reloc.wire.track import TrackFrame, TrackPose
+
+logger = logging.getLogger(__name__)
+
+
+class FrameError(RequestError):
+    """A frame cannot be used.
+
+    Attributes:
+        sequence: its number, where it could be read.
+    """
+
+    def __init__(self, code: ErrorCode, message: str, sequence: int | None) -> None:
+        super().__init__(code, message)
+        self.sequence = sequence
+
+
+class Follower:
+    """Answers the frames of one session, in their order, from one thread. A context manager.
+
+    The track lives in the process. A frame that the process does not survive is refused; with the next one a
+    new process begins, in which the track is looked for anew.
+    """
+
+    def __init__(
+        self,
+        answerer: FrameAnswerer,
+        *,
+        limits: WorkerLimits,
+        frame_s: float,
+        max_bytes: int,
+        files: Callable[[], LocaliserFiles],
+    ) -> None:
+        """
+        Args:
+            limits: of one frame. frame_s: the longest that the process is at one. max_bytes: of one.
+            files: the area in service, which may be another one from frame to frame.
+        """
+        self._answerer, self._limits = answerer, limits
+        self._frame_s, self._max_bytes, self._files = frame_s, max_bytes, files
+        self._process: WorkerProcess | None = None
+        self._last: TrackFrame | None = None  # whose header was in order
+        self._last_time_s: float | None = None  # of the last frame that was tracked
+        self._looked_at = 0
+
+    def __enter__(self) -> Self:
+        """Raises WorkerEndedError: no process comes up."""
+        self._ready()
+        return self
+
+    def __exit__(self, *failed: object) -> None:
+        self._close()
+
+    def answer(self, arrival: Arrival) -> TrackPose:
+        """The pose of a frame, or that the track is lost.
+
+        Raises:
+            FrameError: a header that is none or goes back, what `FrameAnswerer.answer` refuses, or a frame
+                that is beyond the limits or ends the process.
+        """
+        clock = StageClock(start=arrival.received)
+        header = self._header(arrival)
+        try:
+            self._check_payload(arrival)
+            process = self._ready()
+            clock.lap("queue")
+            frame = FrameAsk(
+                sequence=header.sequence,
+                time_s=header.time_s,
+                dropped=header.sequence + 1 - self._looked_at,
+                received_at=arrival.received_at.isoformat(),
+            )
+            pose = self._asked(process, frame, arrival.payload)
+        except RequestError as error:
+            raise FrameError(ErrorCode(error.code), error.message, header.sequence) from error
+        except (WorkerEndedError, WorkerDefectError) as error:
+            self._close()
+            logger.exception("a frame failed", extra={"fields": {"event": "frame_failed"}})
+            code, why = self._failure(error)
+            raise FrameError(code, why, header.sequence) from error
+        self._last_time_s = header.time_s
+        clock.lap("worker", pose.timings_ms)
+        return pose.model_copy(update={"timings_ms": clock.milliseconds()})
+
+    def _asked(self, process: WorkerProcess, frame: FrameAsk, data: bytes) -> TrackPose:
+        late = threading.Event()
+
+        def end() -> None:
+            late.set()
+            process.kill()
+
+        watch = threading.Timer(self._frame_s, end)
+        watch.start()
+        try:
+            return process.ask(frame, data, TrackPose)
+        except WorkerEndedError as error:
+            if late.is_set():
+                raise RequestError(
+                    ErrorCode.DEADLINE,
+                    f"the frame was not done within {self._frame_s:g} s; send smaller ones",
+                ) from error
+            raise
+        finally:
+            watch.cancel()
+
+    def _failure(self, error: WorkerEndedError | WorkerDefectError) -> tuple[ErrorCode, str]:
+        if isinstance(error, WorkerEndedError) and error.out_of_memory:
+            return ErrorCode.TOO_LARGE, (
+                f"the frame needs more than the {self._limits.memory_bytes >> 20} MiB of memory that it may; "
+                "send smaller ones"
+            )
+        how = error if isinstance(error, WorkerEndedError) else "a defect"
+        return ErrorCode.INTERNAL, f"{how} on this frame; the server's log has it. The track begins anew"
+
+    def _ready(self) -> WorkerProcess:
+        """The process, a new one where it has ended, over the area in service."""
+        if self._process is None or not self._process.is_alive():
+            self._close()
+            self._process = WorkerProcess(self._limits, self._answerer)
+        self._process.open(self._files())
+        return self._process
+
+    def _close(self) -> None:
+        if self._process is not None:
+            self._process.close()
+            self._process = None
+
+    def _header(self, arrival: Arrival) -> TrackFrame:
+        try:
+            header = parse_attachment(TrackFrame, arrival.header)
+        except RequestError as error:
+            raise FrameError(ErrorCode(error.code), error.message, None) from error
+        if self._last is not None and header.sequence <= self._last.sequence:
+            raise FrameError(
+                ErrorCode.BAD_REQUEST,
+                f"sequence: expected more than {self._last.sequence}, that of the frame before, found "
+                f"{header.sequence}; number the frames from 0, and open a new session to begin again",
+                header.sequence,
+            )
+        self._last = header
+        self._looked_at += 1
+        if self._last_time_s is not None and header.time_s <= self._last_time_s:
+            raise FrameError(
+                ErrorCode.BAD_REQUEST,
+                f"time_s: expected more than {self._last_time_s}, that of the frame before, found "
+                f"{header.time_s}",
+                header.sequence,
+            )
+        return header
+
+    def _check_payload(self, arrival: Arrival) -> None:
+        if arrival.size > self._max_bytes:
+            raise RequestError(
+                ErrorCode.TOO_LARGE,
+                f"payload: expected at most {self._max_bytes} bytes, found {arrival.size}; send smaller or "
+                "more compressed frames",
+            )
+        if not arrival.payload:
+            raise RequestError(
+                ErrorCode.BAD_IMAGE, "payload: expected the bytes of an image file, found none"
+            )

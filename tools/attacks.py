@@ -1,0 +1,220 @@
+"""Attacks on a server and its gateway, by a client with a certificate and by strangers: for the benchmark."""
+
+import itertools
+import json
+import os
+import random
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import zenoh
+
+from tools.bombs import png, progressive_jpeg, zeros
+from tools.serve_process import children
+
+_AT_ONCE = 8  # questions of the attacker that wait
+_SIDE = 10_944  # 120 million pixels, the most that are taken
+_CONNECTIONS = 200
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Target:
+    """What the attacker knows.
+
+    Attributes:
+        config: Zenoh configuration of his own certificate, of the client `name`.
+        port: of the server. gateway: host and port.
+        database: its name on the wire. photo: that it localises. map_ids: that it answers from.
+        pid: of the server, on this machine.
+    """
+
+    config: Path
+    name: str
+    port: int
+    gateway: tuple[str, int]
+    database: str
+    photo: bytes
+    map_ids: Sequence[str]
+    pid: int
+
+    def key(self, *leaf: str) -> str:
+        """Below the attacker's own name."""
+        return "/".join(("featuredb", self.database, leaf[0], self.name, *leaf[1:]))
+
+
+Message = tuple[bytes, bytes | None]  # payload and attachment
+
+
+def _ask(target: Target, messages: Iterator[Message], at_once: int = _AT_ONCE) -> None:
+    """Ask for ever, so many questions at a time."""
+    with zenoh.open(zenoh.Config.from_file(str(target.config))) as session:
+        lock = threading.Lock()
+
+        def run() -> None:
+            while True:
+                with lock:
+                    payload, attachment = next(messages)
+                for _ in session.get(
+                    f"featuredb/*/localise/{target.name}",
+                    payload=payload,
+                    attachment=attachment,
+                    timeout=10.0,
+                ):
+                    pass
+
+        threads = [threading.Thread(target=run) for _ in range(at_once)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+
+
+def _large_png(target: Target) -> None:
+    _ask(target, itertools.repeat((png(_SIDE, _SIDE, zeros((_SIDE + 1) * _SIDE)), None)))
+
+
+def _deep_png(target: Target) -> None:
+    """960 MB of pixels in 1 MB."""
+    _ask(
+        target,
+        itertools.repeat((png(_SIDE, _SIDE, zeros((_SIDE * 8 + 1) * _SIDE), bits=16, colour=6), None)),
+    )
+
+
+def _scans(target: Target) -> None:
+    """JPEGs with as many scans as are taken, and with more."""
+    _ask(target, itertools.cycle([(progressive_jpeg(_SIDE, scans), None) for scans in (10, 80)]))
+
+
+def _truncated(target: Target) -> None:
+    photo = target.photo
+    _ask(target, itertools.cycle([(photo[: len(photo) * k // 20], None) for k in range(1, 20)]))
+
+
+def _hostile(target: Target) -> None:
+    photo = target.photo
+    attachments = [
+        b"[" * 60_000,
+        b'{"options": {"maps": [' + b'"a",' * 10_000 + b'"a"]}}',
+        b'{"prior": {"lat": 1e400, "lon": NaN, "sigma_m": 1}}',
+        b'{"camera": {"model": "PINHOLE", "width": 1, "height": 1, "params": [1e308, 1e308, 0, 0]}}',
+        b'{"prior": {"lat": 0, "lon": 0, "sigma_m": 1e300}}',
+        json.dumps({"options": {"inliers": True}, "request_id": "x" * 10_000}).encode(),
+        bytes(60_000),
+    ]
+    _ask(target, itertools.cycle([(photo, a) for a in attachments]))
+
+
+def _parts(target: Target) -> None:
+    """Each question names other maps of the area."""
+    rng = random.Random(1)
+
+    def messages() -> Iterator[Message]:
+        while True:
+            some = rng.sample(list(target.map_ids), len(target.map_ids) // 2)
+            yield target.photo, json.dumps({"options": {"maps": some}}).encode()
+
+    _ask(target, messages())
+
+
+def _flood(target: Target) -> None:
+    """Good photos, as many as go."""
+    _ask(target, itertools.repeat((target.photo, None)), at_once=64)
+
+
+def _kills(target: Target) -> None:
+    """A worker is killed every two seconds, whatever it does."""
+    while True:
+        time.sleep(2.0)
+        os.kill(random.choice(_grandchildren(target.pid)), signal.SIGKILL)
+
+
+def _connections(target: Target) -> None:
+    """Connections to server and gateway that say nothing, opened again as soon as they are closed."""
+    held: list[socket.socket] = []
+    while True:
+        for port in (target.port, target.gateway[1]):
+            held += [_connected("127.0.0.1", port) for _ in range(_CONNECTIONS)]
+        time.sleep(5.0)
+        for connection in held:
+            connection.close()
+        held.clear()
+
+
+def _dripping(target: Target) -> None:
+    """Photos to the gateway, a byte a second."""
+    head = (
+        b"POST /localise HTTP/1.1\r\nHost: x\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+        b"Content-Length: 1000000\r\n\r\n"
+    )
+    while True:
+        held = [_connected(*target.gateway) for _ in range(_CONNECTIONS)]
+        for connection in held:
+            _say(connection, head)
+        for _ in range(20):
+            for connection in held:
+                _say(connection, b"-")
+            time.sleep(1.0)
+        for connection in held:
+            connection.close()
+
+
+def _frames(target: Target) -> None:
+    """Live sessions whose frames are bombs, more than there may be."""
+    bomb = png(4000, 4000, zeros((4000 * 8 + 1) * 4000), bits=16, colour=6)
+    with zenoh.open(zenoh.Config.from_file(str(target.config))) as session:
+        for turn in itertools.count():
+            keys = [target.key("track", f"{turn}-{k}") for k in range(4)]
+            tokens = [session.liveliness().declare_token(f"{key}/client") for key in keys]
+            for key in keys:
+                list(session.get(key, timeout=2.0))
+            for sequence in range(30):
+                header = json.dumps({"sequence": sequence, "time_s": float(sequence)}).encode()
+                for key in keys:
+                    session.put(f"{key}/frames", bomb, attachment=header)
+                time.sleep(0.2)
+            for token in tokens:
+                token.undeclare()
+
+
+def _connected(host: str, port: int) -> socket.socket:
+    made = socket.socket()
+    made.settimeout(1.0)
+    with suppress(OSError):  # no room for it: as good
+        made.connect((host, port))
+    return made
+
+
+def _say(connection: socket.socket, data: bytes) -> None:
+    with suppress(OSError):
+        connection.sendall(data)
+
+
+def _grandchildren(pid: int) -> list[int]:
+    return [w for child in children(pid) for w in children(child)]
+
+
+ATTACKS: dict[str, Callable[[Target], None]] = {
+    "large PNG": _large_png,
+    "deep PNG": _deep_png,
+    "JPEG of many scans": _scans,
+    "truncated photos": _truncated,
+    "hostile messages": _hostile,
+    "parts of an area": _parts,
+    "flood by one identity": _flood,
+    "bombs as live frames": _frames,
+    "dripping connections": _dripping,
+    "workers killed": _kills,
+    "200 connections": _connections,  # the last: the listener is behind for a minute
+}
+
+
+def attack(name: str, target: Target) -> None:
+    """For ever, in a process of its own."""
+    ATTACKS[name](target)

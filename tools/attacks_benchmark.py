@@ -1,0 +1,211 @@
+"""What honest clients notice while others attack: answer times, failures and the server's memory.
+
+    python -m tools.attacks_benchmark DB PHOTOS [--points 200000] [--seconds 30] [--attack NAME ...]
+
+DB has one real map of the PHOTOS, and is made larger by copies of it to so many points. A real server process
+with keys (TLS, rules) and a gateway serve it. Three honest clients ask photos with and without a prior, one
+of them newly connected each time, quiet and under each attack of tools/attacks.py. A failed question counts
+as one that took the deadline.
+"""
+
+import argparse
+import multiprocessing
+import os
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import requests
+
+from featuredb.store import Database
+from reloc.service.options import wire_name_of
+from tools.attacks import ATTACKS, Target, attack
+from tools.figures import add_json_option, write_figures
+from tools.service_world import (
+    ATTACKER,
+    MemoryWatch,
+    Service,
+    enlarged,
+    first_answers,
+    honest_clients,
+    photos_of,
+    running_service,
+)
+
+_CONTEXT = multiprocessing.get_context("spawn")
+_CALM_S = 3.0  # between attacks
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Measured:
+    """One attack; times of all that honest clients asked over Zenoh, and of those over HTTP."""
+
+    attack: str
+    asked: int
+    p50_s: float
+    p99_s: float
+    failures: dict[str, int]
+    wrong: int
+    http_asked: int
+    http_p99_s: float
+    http_failures: int
+    peak_mib: float
+    after_mib: float
+    load: float
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    database = Database.open(args.db)
+    map_ids = enlarged(database, args.points)
+    points = sum(m.points for m in database.snapshot().maps())
+    photos = photos_of(args.photos, 6, args.side)
+    measured: list[Measured] = []
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        running_service(args.db, Path(scratch), args.deadline) as service,
+    ):
+        expected = first_answers(service, photos)
+        localised = sum(reply.status == "localised" for reply in expected)
+        sys.stdout.write(f"{points} points; {localised} of {len(expected)} questions localised\n")
+        host, port = service.gateway.endpoint.removeprefix("http://").rsplit(":", 1)
+        target = Target(
+            config=service.config(ATTACKER),
+            name=ATTACKER,
+            port=service.port,
+            gateway=(host, int(port)),
+            database=wire_name_of(str(args.db)),
+            photo=photos[0],
+            map_ids=map_ids,
+            pid=service.server.process.pid,
+        )
+        for name in ("quiet", *(args.attack or ATTACKS)):
+            with (
+                _attacked(name, target),
+                MemoryWatch(service.server) as memory,
+                honest_clients(service, photos, expected) as heard,
+                _web_client(service, photos) as http,
+            ):
+                time.sleep(args.seconds)
+            time.sleep(_CALM_S)
+            measured.append(
+                Measured(
+                    attack=name,
+                    asked=len(heard.seconds),
+                    p50_s=float(np.median(heard.seconds)),
+                    p99_s=heard.p99_s(),
+                    failures=dict(Counter(heard.failures)),
+                    wrong=heard.wrong,
+                    http_asked=len(http),
+                    http_p99_s=float(np.percentile([s for s, _ in http], 99)),
+                    http_failures=sum(not ok for _, ok in http),
+                    peak_mib=max(memory.mib),
+                    after_mib=service.server.memory_mib(),
+                    load=os.getloadavg()[0],
+                )
+            )
+            _say(measured[-1])
+    write_figures(args.json, figures(measured, points, args.deadline))
+    return 0
+
+
+def figures(measured: Sequence[Measured], points: int, deadline_s: float) -> dict[str, object]:
+    """Those of the quiet server, the worst of all attacks, and each."""
+    quiet, attacked = measured[0], measured[1:]
+    killed = [m for m in attacked if m.attack == "workers killed"]
+    others = [m for m in attacked if m not in killed]
+    return {
+        "points": points,
+        "deadline_s": deadline_s,
+        "quiet_p99_s": quiet.p99_s,
+        "quiet_mib": quiet.peak_mib,
+        "worst_p99_s": max((m.p99_s for m in others), default=None),
+        "worst_http_p99_s": max((m.http_p99_s for m in others), default=None),
+        "failures": sum(sum(m.failures.values()) for m in others),
+        "failures_by_kills": sum(sum(m.failures.values()) for m in killed),
+        "wrong": sum(m.wrong for m in measured),
+        "asked": sum(m.asked for m in measured),
+        "peak_mib": max(m.peak_mib for m in measured),
+        "after_mib": measured[-1].after_mib,
+        "attacks": {m.attack: asdict(m) for m in measured},
+    }
+
+
+@contextmanager
+def _attacked(name: str, target: Target) -> Iterator[None]:
+    if name == "quiet":
+        yield
+        return
+    process = _CONTEXT.Process(target=attack, args=(name, target), daemon=True)
+    process.start()
+    time.sleep(_CALM_S)  # it imports, and begins
+    try:
+        yield
+        assert process.is_alive(), f"the attack {name!r} has ended"
+    finally:
+        process.kill()
+        process.join()
+
+
+@contextmanager
+def _web_client(service: Service, photos: Sequence[bytes]) -> Iterator[list[tuple[float, bool]]]:
+    """Within the block a client asks over HTTP: seconds, and whether it had an answer."""
+    heard: list[tuple[float, bool]] = []
+    stop = threading.Event()
+
+    def run() -> None:
+        number = 0
+        while not stop.wait(1.0):
+            start, number = time.monotonic(), number + 1
+            try:
+                answer = requests.post(
+                    f"{service.gateway.endpoint}/localise",
+                    files={"image": photos[number % len(photos)]},
+                    data={"options": '{"exif_prior": true}'},
+                    timeout=service.deadline_s,
+                )
+                ok = answer.status_code == 200
+            except requests.RequestException:
+                ok = False
+            heard.append((time.monotonic() - start if ok else service.deadline_s, ok))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield heard
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _say(m: Measured) -> None:
+    sys.stdout.write(
+        f"{m.attack:<24}{m.asked:>4} asked, median {m.p50_s:.2f} s, 99 % {m.p99_s:.2f} s, failed "
+        f"{m.failures or 0}, wrong {m.wrong}; HTTP {m.http_asked}, 99 % {m.http_p99_s:.2f} s, failed "
+        f"{m.http_failures}; {m.peak_mib:.0f} MiB at the peak, {m.after_mib:.0f} after; load {m.load:.0f}\n"
+    )
+    sys.stdout.flush()
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("db", type=Path)
+    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
+    parser.add_argument("--points", type=int, default=200_000)
+    parser.add_argument("--seconds", type=float, default=30.0, help="for each attack")
+    parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
+    parser.add_argument("--attack", action="append", choices=sorted(ATTACKS), help="only this one")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

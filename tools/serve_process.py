@@ -1,0 +1,118 @@
+"""`featuredb serve` and `featuredb gateway` as processes of their own."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+_PROGRAM = """
+import sys
+from importlib.metadata import EntryPoint
+from featuredb.cli.main import build_parser, run_command
+entries = [
+    EntryPoint(name=name, value=f"reloc.cli.{name}:register", group="featuredb.commands")
+    for name in ("commands", "gateway")
+]
+args = build_parser(entries).parse_args(sys.argv[1:])
+sys.exit(run_command(args.run, args))
+"""
+
+
+class CommandProcess:
+    """A command that says on its first line where it is, and runs until it is stopped.
+
+    Attributes:
+        announced: that line. endpoint: what stands there after "on". errors: lines of its log so far.
+    """
+
+    def __init__(self, *argv: object) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _PROGRAM, *map(str, argv)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1"},
+        )
+        self.errors: list[str] = []
+        assert self.process.stdout is not None
+        # Read both pipes to their ends, so that the server never waits for us.
+        self._reader = threading.Thread(target=lambda: self.errors.extend(self.process.stderr or ()))
+        self._reader.start()
+        self.announced = self.process.stdout.readline()
+        assert " on " in self.announced, (self.announced, self.stop(), self.errors)
+        self.endpoint = self.announced.split(" on ")[1].split(";")[0].split(", asking")[0].strip()
+
+    def stop(self, number: int = signal.SIGTERM, timeout_s: float = 60.0) -> int:
+        """The exit code. Raises subprocess.TimeoutExpired: it does not end, and is killed."""
+        self.process.send_signal(number)
+        try:
+            code = self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
+        self._reader.join(10)
+        assert self.process.stdout is not None
+        assert self.process.stderr is not None
+        self.process.stdout.close()
+        self.process.stderr.close()
+        return code
+
+    @property
+    def workers(self) -> list[int]:
+        """Process ids of the workers, once there are some: grandchildren, since they are forked."""
+        end = time.monotonic() + 20.0
+        while not (found := [w for child in children(self.process.pid) for w in children(child)]):
+            assert time.monotonic() < end, "no worker is there"
+            time.sleep(0.01)
+        return found
+
+    def log(self) -> list[dict[str, Any]]:
+        return [json.loads(line) for line in self.errors if line.startswith("{")]
+
+    def memory_mib(self) -> float:
+        """Of the process and all that it has started; what they share counts once."""
+        tree, found = [self.process.pid], 0
+        while tree:
+            pid = tree.pop()
+            tree += children(pid)
+            found += _pss_kib(pid)
+        return found / 1024
+
+
+class ServeProcess(CommandProcess):
+    """`featuredb serve`, on a free port where no configuration says another."""
+
+    def __init__(self, *argv: object) -> None:
+        where = () if "--config" in argv else ("--listen", "tcp/127.0.0.1:0")
+        super().__init__("serve", *argv, *where)
+
+
+def _pss_kib(pid: int) -> int:
+    try:
+        lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    except OSError:  # it has ended meanwhile
+        return 0
+    sizes: Counter[str] = Counter()
+    for line in lines[1:]:
+        name, size = line.split()[:2]
+        sizes[name] = int(size)
+    return sizes["Pss:"]
+
+
+def children(pid: int) -> list[int]:
+    """Process ids of a process's children, of whichever of its threads."""
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, parent = status.read_text().rpartition(")")[2].split()[:2]
+        except OSError:  # it has ended meanwhile
+            continue
+        if int(parent) == pid and state != "Z":
+            found.append(int(status.parent.name))
+    return found

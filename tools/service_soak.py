@@ -1,0 +1,136 @@
+"""A server under mixed load for long: queries, commits, reloads, kills, hostile messages.
+
+    python -m tools.service_soak DB PHOTOS [--minutes 10]
+
+Honest clients ask as in tools/attacks_benchmark.py; meanwhile maps are committed and retired, workers killed,
+and truncated photos and broken messages sent, in turn. Every answer must be that of the quiet server, every
+question must have an answer or an error of the server's, and the memory must stay as it was.
+"""
+
+import argparse
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import cycle
+from pathlib import Path
+from statistics import median
+
+from featuredb.errors import ServiceError
+from featuredb.store import Database
+from reloc.client import Client
+from reloc.client.replies import NO_SERVER, TIMEOUT
+from tools.figures import add_json_option, write_figures
+from tools.service_world import (
+    ATTACKER,
+    MemoryWatch,
+    Service,
+    first_answers,
+    honest_clients,
+    moved,
+    photos_of,
+    running_service,
+)
+
+_EVENT_S = 5.0  # between two of what happens beside the queries
+
+
+class Events:
+    """What happens beside the queries. Attributes: counts, by what it was."""
+
+    def __init__(self, database: Database, service: Service, photo: bytes, seed: int) -> None:
+        self.counts: Counter[str] = Counter()
+        self._database, self._service, self._photo = database, service, photo
+        self._rng = random.Random(seed)
+        snapshot = database.snapshot()
+        self._original = snapshot.load_map(snapshot.maps()[0].map_id)
+        self._turns = cycle((self._commit, self._kill, self._send_broken, self._retire, self._kill))
+
+    def next(self) -> None:
+        event: Callable[[], None] = next(self._turns)
+        event()
+        self.counts[event.__name__.strip("_")] += 1
+
+    def _commit(self) -> None:
+        number = 100 + self.counts["commit"]
+        self._map_id = f"soak-{number}"
+        self._database.commit_map(replace(moved(self._original, number), map_id=self._map_id))
+
+    def _retire(self) -> None:
+        self._database.retire(self._map_id, "its turn is over")
+
+    def _kill(self) -> None:
+        os.kill(self._rng.choice(self._service.server.workers), signal.SIGKILL)
+
+    def _send_broken(self) -> None:
+        with Client(config_path=self._service.config(ATTACKER)) as client:
+            for share in (0.1, 0.5, 0.9):
+                try:
+                    client.localise(self._photo[: int(share * len(self._photo))])
+                except ServiceError as error:
+                    self.counts[f"broken {error.code}"] += 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    database = Database.open(args.db)
+    photos = photos_of(args.photos, 4, args.side)
+    with tempfile.TemporaryDirectory() as scratch:
+        with running_service(args.db, Path(scratch), args.deadline) as service:
+            expected = first_answers(service, photos)
+            events = Events(database, service, photos[0], seed=1)
+            end = time.monotonic() + 60 * args.minutes
+            with (
+                MemoryWatch(service.server, every_s=5.0) as memory,
+                honest_clients(service, photos, expected) as heard,
+            ):
+                while time.monotonic() < end:
+                    time.sleep(_EVENT_S)
+                    events.next()
+            with Client(config_path=service.config(ATTACKER)) as client:
+                status = client.status()
+        exit_code = service.server.process.returncode
+    failures = Counter(heard.failures)
+    quarter = len(memory.mib) // 4
+    early, late = median(memory.mib[quarter : 2 * quarter]), median(memory.mib[-quarter:])
+    figures = {
+        "minutes": args.minutes,
+        "asked": len(heard.seconds),
+        "wrong": heard.wrong,
+        "missing": failures[TIMEOUT] + failures[NO_SERVER],
+        "failed": sum(failures.values()),
+        "failures": dict(failures),
+        "kills": events.counts["kill"],
+        "events": dict(events.counts),
+        "reloads": status.reload.count,
+        "reload_error": status.reload.error or "",
+        "p99_s": heard.p99_s(),
+        "early_mib": early,
+        "late_mib": late,
+        "grown_mib": late - early,
+        "exit_code": exit_code,
+        "load": os.getloadavg()[0],
+    }
+    sys.stdout.write("".join(f"{name:<14}{value}\n" for name, value in figures.items()))
+    write_figures(args.json, figures)
+    return 0
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("db", type=Path)
+    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser.add_argument("--minutes", type=float, default=10.0)
+    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
+    parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,115 @@
+"""Does a server that is stopped in the middle of its load end, cleanly and in time?
+
+    python -m tools.service_stops DB PHOTOS [--stops 200]
+
+Each time a server process is started, asked by several clients at once, and told to stop by SIGTERM at a
+random moment. Clean is: exit code 0 within the time that queries in hand may take, nothing left of its
+processes, and an answer or an error for each question that it had taken.
+"""
+
+import argparse
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from featuredb.errors import ServiceError
+from reloc.client import Client
+from reloc.client.replies import TIMEOUT
+from tools.figures import add_json_option, write_figures
+from tools.serve_process import ServeProcess, children
+from tools.service_world import photos_of
+
+_CLIENTS = 4
+_STOP_S = 30.0  # ten for queries in hand, ten for live sessions, ten for the inbox
+_LATEST_S = 2.0  # the last moment of the signal, after the first question
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stopped:
+    """One stop. `codes`: what clients heard, "" for an answer. left: processes that outlived it."""
+
+    seconds: float
+    exit_code: int | None
+    codes: tuple[str, ...]
+    left: int
+
+    @property
+    def clean(self) -> bool:
+        return self.exit_code == 0 and not self.left and TIMEOUT not in self.codes
+
+
+def stopped_under_load(database: Path, photo: bytes, after_s: float) -> Stopped:
+    """Start a server, ask, and stop it so long after the first question."""
+    server = ServeProcess(database)
+    tree = [server.process.pid, *children(server.process.pid), *server.workers]
+    codes: list[str] = []
+    asking = threading.Event()
+
+    def ask() -> None:
+        try:
+            with Client(server.endpoint) as client:
+                while server.process.poll() is None:
+                    asking.set()
+                    client.localise(photo, timeout_s=_STOP_S)
+                    codes.append("")
+        except ServiceError as error:
+            codes.append(error.code)
+
+    threads = [threading.Thread(target=ask) for _ in range(_CLIENTS)]
+    for thread in threads:
+        thread.start()
+    asking.wait(_STOP_S)
+    time.sleep(after_s)
+    start = time.monotonic()
+    try:
+        code: int | None = server.stop(timeout_s=_STOP_S)
+    except subprocess.TimeoutExpired:
+        code = None
+    seconds = time.monotonic() - start
+    for thread in threads:
+        thread.join()
+    end = time.monotonic() + 5.0
+    while (left := sum(Path(f"/proc/{pid}").exists() for pid in tree)) and time.monotonic() < end:
+        time.sleep(0.05)
+    return Stopped(seconds=seconds, exit_code=code, codes=tuple(codes), left=left)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    args = _arguments(argv)
+    (photo,) = photos_of(args.photos, 1, args.side)
+    rng = random.Random(1)
+    found = []
+    for number in range(args.stops):
+        found.append(stopped_under_load(args.db, photo, rng.uniform(0.0, _LATEST_S)))
+        if not found[-1].clean:
+            sys.stdout.write(f"stop {number}: {found[-1]}\n")
+    codes = Counter(code or "answered" for one in found for code in one.codes)
+    figures = {
+        "stops": len(found),
+        "clean": sum(one.clean for one in found),
+        "slowest_s": max(one.seconds for one in found),
+        "codes": dict(codes),
+    }
+    sys.stdout.write("".join(f"{name:<12}{value}\n" for name, value in figures.items()))
+    write_figures(args.json, figures)
+    return 0
+
+
+def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("db", type=Path)
+    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser.add_argument("--stops", type=int, default=200)
+    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
+    add_json_option(parser)
+    return parser.parse_args(argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

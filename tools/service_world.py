@@ -1,0 +1,235 @@
+"""What studies of the service ask: a real map, made larger, a server with keys, and honest clients."""
+
+import io
+import socket
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from featuredb.errors import ServiceError
+from featuredb.geo.local_frame import LocalFrame
+from featuredb.maps.feature_map import FeatureMap
+from featuredb.store import Database
+from reloc.authority.folder import Authority
+from reloc.client import Client, LocaliseReply
+from tools.serve_process import CommandProcess, ServeProcess
+
+HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
+_SAME_M = 0.5  # two answers to one photo
+
+
+def enlarged(database: Database, points: int) -> list[str]:
+    """Copies of the oldest map, each beside the last, until the database has so many points; all map ids.
+
+    A copy has descriptors as real as the map's: their 16 cells are shuffled, in an order of its own.
+    """
+    snapshot = database.snapshot()
+    summary = snapshot.maps()[0]
+    original = snapshot.load_map(summary.map_id)
+    database.commit_maps([moved(original, k) for k in range(1, -(-points // summary.points))])
+    return [m.map_id for m in database.snapshot().maps()]
+
+
+def moved(original: FeatureMap, number: int) -> FeatureMap:
+    """A copy beside it; see `enlarged`."""
+    rng = np.random.default_rng(number)
+    step = 200.0 * np.array([number % 4, number // 4, 0.0])
+    origin = original.frame.utm_from_enu(np.zeros(3), original.epsg) + step
+    cells = original.observations.descriptors.reshape(-1, 16, 8)[:, rng.permutation(16)]
+    return replace(
+        original,
+        map_id=f"{original.map_id}-moved-{number}",
+        name=f"{original.name} moved {number}",
+        frame=LocalFrame.from_utm(float(origin[0]), float(origin[1]), float(origin[2]), original.epsg),
+        points=replace(original.points, utm=original.points.utm + step),
+        observations=replace(original.observations, descriptors=cells.reshape(-1, 128)),
+    )
+
+
+def photos_of(folder: Path, count: int, side_px: int) -> list[bytes]:
+    """Photos as an app sends them: made smaller, with their EXIF."""
+    found = []
+    for path in sorted(folder.glob("*.JPG"))[:count]:
+        with Image.open(path) as photo:
+            exif = photo.info["exif"]
+            photo.thumbnail((side_px, side_px))
+            out = io.BytesIO()
+            photo.save(out, "JPEG", quality=90, exif=exif)
+            found.append(out.getvalue())
+    return found
+
+
+def free_port() -> int:
+    """One that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Service:
+    """A server with keys, and a gateway before it.
+
+    Attributes:
+        keys: folder of the authority. port: of the server. deadline_s: of a query.
+    """
+
+    server: ServeProcess
+    gateway: CommandProcess
+    keys: Path
+    port: int
+    deadline_s: float
+
+    def config(self, client: str) -> Path:
+        return self.keys / "clients" / f"{client}.json5"
+
+
+@contextmanager
+def running_service(database: Path, work: Path, deadline_s: float = 8.0) -> Iterator[Service]:
+    """As `featuredb keys` ships it; both end by SIGTERM."""
+    port, keys = free_port(), work / f"keys-{time.time_ns()}"
+    authority = Authority.create(keys, port=port)
+    for name in (*HONEST, ATTACKER, WEB):
+        authority.add_client(name)
+    with ExitStack() as stack:
+        server = ServeProcess(database, "--config", keys / "server.json5", "--deadline", deadline_s)
+        stack.callback(server.stop)
+        gateway = CommandProcess(
+            "gateway",
+            "--config",
+            keys / f"clients/{WEB}.json5",
+            "--port",
+            free_port(),
+            "--timeout",
+            deadline_s,
+        )
+        stack.callback(gateway.stop)
+        yield Service(server=server, gateway=gateway, keys=keys, port=port, deadline_s=deadline_s)
+
+
+@dataclass(slots=True)
+class Heard:
+    """What honest clients were answered; threads share it.
+
+    Attributes:
+        deadline_s: of a question. seconds: of each, failed ones as long as they may take. failures: codes.
+        wrong: answers that are another place than the first one to the same question, or none where that had
+            a place.
+    """
+
+    deadline_s: float
+    seconds: list[float] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
+    wrong: int = 0
+    localised: int = 0
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def answered(self, seconds: float, reply: LocaliseReply, expected: LocaliseReply) -> None:
+        with self._lock:
+            self.seconds.append(seconds)
+            self.localised += reply.status == "localised"
+            self.wrong += not same_place(reply, expected)
+
+    def failed(self, code: str) -> None:
+        with self._lock:
+            self.seconds.append(self.deadline_s)
+            self.failures.append(code)
+
+    def p99_s(self) -> float:
+        return float(np.percentile(self.seconds, 99)) if self.seconds else float("nan")
+
+
+def same_place(reply: LocaliseReply, expected: LocaliseReply) -> bool:
+    """Whether two answers to one photo agree."""
+    if reply.utm is None or expected.utm is None:
+        return reply.utm is expected.utm
+    a, b = ((u.easting, u.northing, u.height) for u in (reply.utm, expected.utm))
+    return float(np.linalg.norm(np.subtract(a, b))) < _SAME_M
+
+
+def first_answers(service: Service, photos: Sequence[bytes]) -> list[LocaliseReply]:
+    """What each photo is answered when nobody else asks: with its position, then without."""
+    with Client(config_path=service.config(HONEST[0])) as client:
+        return [
+            client.localise(photo, exif_prior=prior, timeout_s=60.0)
+            for prior in (True, False)
+            for photo in photos
+        ]
+
+
+@contextmanager
+def honest_clients(
+    service: Service, photos: Sequence[bytes], expected: Sequence[LocaliseReply], pause_s: float = 1.0
+) -> Iterator[Heard]:
+    """Within the block each honest client asks again and again, after a pause; one of them anew connected.
+
+    Every other question comes without a prior: it is looked for in all maps.
+    """
+    heard, stop = Heard(service.deadline_s), threading.Event()
+
+    def ask(client: Client, number: int) -> None:
+        which = number % len(expected)
+        start = time.monotonic()
+        try:
+            reply = client.localise(
+                photos[which % len(photos)], exif_prior=which < len(photos), timeout_s=service.deadline_s
+            )
+        except ServiceError as error:
+            heard.failed(error.code)
+        else:
+            heard.answered(time.monotonic() - start, reply, expected[which])
+
+    def run(name: str, number: int) -> None:
+        path, again = service.config(name), name == HONEST[-1]
+        while not stop.is_set():
+            try:
+                with Client(config_path=path) as client:
+                    while not stop.is_set():
+                        ask(client, number)
+                        number += 5
+                        stop.wait(pause_s)
+                        if again:
+                            break
+            except ServiceError as error:  # it cannot connect
+                heard.failed(error.code)
+
+    threads = [threading.Thread(target=run, args=(name, 3 * k)) for k, name in enumerate(HONEST)]
+    for thread in threads:
+        thread.start()
+    try:
+        yield heard
+    finally:
+        stop.set()
+        for thread in threads:
+            thread.join()
+
+
+class MemoryWatch:
+    """Looks at a process's memory again and again, within a `with` block.
+
+    Attributes:
+        mib: what it saw, in order.
+    """
+
+    def __init__(self, process: CommandProcess, every_s: float = 1.0) -> None:
+        self.mib = [process.memory_mib()]
+        self._process, self._every_s, self._stop = process, every_s, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> "MemoryWatch":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._stop.wait(self._every_s):
+            self.mib.append(self._process.memory_mib())
