@@ -7,7 +7,7 @@ error moves the place along the ray.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from reloc.pixels.surfaces import Met, RaySurface
 from reloc.pixels.view import AnsweredView
 
 LocateReason = Literal["NO_SURFACE", "GRAZING", "OUTSIDE"]
-LOCATE_REASONS: tuple[LocateReason, ...] = get_args(LocateReason)
 
 _REACH_SIGMAS = 2.45  # of two dimensions: holds 95 %
 _LARGEST_ALONG = 0.1  # of the distance: one deviation along the ray beyond which nothing is linear
