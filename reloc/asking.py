@@ -167,7 +167,11 @@ def _image_bytes(image: Image) -> tuple[bytes, str]:
     if isinstance(image, str | Path):
         return Path(image).read_bytes(), str(image)
     pixels = np.asarray(image)
-    if pixels.dtype != np.uint8 or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3)):
+    if (
+        pixels.dtype != np.uint8
+        or not pixels.size
+        or not (pixels.ndim == 2 or (pixels.ndim == 3 and pixels.shape[2] == 3))
+    ):
         raise ImageError(
             f"image: expected pixels (h, w) or (h, w, 3) uint8, found {pixels.shape} {pixels.dtype}"
         )
@@ -194,6 +198,10 @@ def _request(
         return LocaliseWireRequest(prior=prior, camera=camera, options=options)
     except ValidationError as error:
         raise InvalidValueError(f"localise: {explain(error)}") from error
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(
+            f"localise: expected a prior of latitude, longitude and metres, found {prior!r}"
+        ) from error
 
 
 def _plan_svg(answer: PhotoAnswer, side_px: int = 360) -> str:

@@ -21,7 +21,7 @@ ADVICE = {
     "a prior (--prior), or add photos of the place to the database",
     "TOO_FEW_INLIERS": "the matches do not agree on one pose: give a prior (--prior) or the camera "
     "(--camera), or take another photo",
-    "AMBIGUOUS": "two different places explain it about equally well: give a prior (--prior)",
+    "AMBIGUOUS": "another place, or a look-alike, explains it about as well: give a prior (--prior)",
     "CONTRADICTS_PRIOR": "the photo fits a place far from the prior: check the prior or widen its sigma",
 }
 
@@ -98,7 +98,9 @@ def _own_position(reply: LocaliseReply) -> str:
     said = {
         "agrees": f"the photo's EXIF position{away}, agrees; the answer is the same without it",
         "decided": f"the photo's EXIF position{away}, decided; --no-exif-prior leaves it out",
-        "contradicted": f"the photo's EXIF position{away}, is not what the photo shows; not believed",
+        "contradicted": "the photo fits a place near its EXIF position, and one elsewhere"
+        if own.distance_m is None
+        else f"the photo's EXIF position{away}, is not what the photo shows; not believed",
         "no_help": "the photo's EXIF position was tried, and did not help",
     }
     return f"  prior     {said[own.role]}\n"

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, TypedDict, Unpack
 
+from featuredb.errors import InvalidValueError
 from featuredb.features.extractor import ExtractorOptions
 from featuredb.index.vocabulary import read_vocabulary
 from featuredb.store import Database
@@ -94,6 +95,16 @@ def ingest_options(*, films: bool = False, **choices: Unpack[IngestChoices]) -> 
         InvalidValueError, ControlFileError: a choice that cannot be.
     """
     asked: dict[str, Any] = {**choices}
+    unknown = asked.keys() - IngestChoices.__annotations__.keys()
+    if unknown:
+        raise InvalidValueError(
+            f"ingest: expected some of {', '.join(sorted(IngestChoices.__annotations__))}, found "
+            f"{', '.join(sorted(unknown))}"
+        )
+    of_points = [name for name in ("gcp_crs", "gcp_sigma", "ground_height") if asked.get(name) is not None]
+    if of_points and asked.get("gcp") is None:
+        raise InvalidValueError(f"ingest: {', '.join(of_points)}: expected gcp beside it, control points")
+    asked |= {name: Path(asked[name]) for name in ("work", "vocabulary") if asked.get(name) is not None}
 
     def given(**names: str) -> dict[str, Any]:
         return {name: asked[choice] for name, choice in names.items() if asked.get(choice) is not None}

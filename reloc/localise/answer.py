@@ -76,8 +76,11 @@ def make_answer(
 
 
 def _of_params(camera: Camera, joint: FloatArray) -> FloatArray | None:
-    """Covariance (6 + n, 6 + n) of the pose and the camera's parameters; None where n = 0."""
-    if len(joint) == 6:
+    """Covariance (6 + n, 6 + n) of the pose and the camera's n parameters.
+
+    None where the lens is exact, or what is known of it is in other parameters than those of its model.
+    """
+    if len(joint) != 6 + len(camera.params):
         return None
     by_lens = np.eye(len(joint))
     if camera.model == "OPENCV":

@@ -141,6 +141,9 @@ def _with_own_position(
     if not fits:
         return said(everywhere, "contradicted")
     assert near.best is not None
+    rival = runner_up(everywhere.best, [near.best])
+    if rival is None:  # the same place, on either side of the limit
+        return said(everywhere, "agrees")
     refused = replace(
         first,
         reason="AMBIGUOUS",
@@ -148,7 +151,7 @@ def _with_own_position(
         f"there with {near.result.inliers}",
         pose=None,
         confidence=0.0,
-        runner_up=runner_up(everywhere.best, [near.best]),
+        runner_up=rival,
     )
     return said(Localised(result=refused), "contradicted")
 
@@ -209,7 +212,7 @@ def _decide(
     if told is None and best.pose.lens_prior is None:
         lent_by = LensUncertainty.of_provenance(best.main_map.provenance)
         seen = None if lent_by is None else seen_by_a_map(best.pose.camera, lent_by)
-        if seen is not None:
+        if seen is not None and seen[0].model == best.pose.camera.model:
             pose = replace(best.pose, camera=seen[0], lens_prior=seen[1])
             lent = pose_uncertainty(*inliers, pose, options.pose)
     answer = make_answer(

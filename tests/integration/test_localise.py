@@ -160,6 +160,23 @@ def test_a_camera_told_as_exact_that_made_the_map_goes_with_its_points(
     assert heights["far from the map's"] == pytest.approx(-0.03 * 45.0, abs=0.2)
 
 
+def test_a_map_lends_a_lens_of_fewer_parameters_than_its_uncertainty(
+    field_map: FeatureMap, texture: NDArray[np.uint8]
+) -> None:
+    truth = view(0, 0, 45, 10, 20)
+    uncertainty = LensUncertainty(
+        focal_rel=0.003, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
+        tangential=(1e-5,) * 2, dilution=50.0,
+    )  # fmt: skip
+    assert CAMERA.model == "PINHOLE"
+    provenance = field_map.provenance | uncertainty.as_provenance()
+    made = replace(field_map, camera_keys=("DJI",), provenance=provenance)
+    asked = replace(KNOWN, camera=None, camera_key="DJI")
+    pose = localise(render(texture, truth, seed=5), asked, [indexed(made)]).pose
+    assert pose is not None
+    assert pose.camera_source == "map"
+
+
 @pytest.mark.parametrize("tilt_deg", [45.0, 55.0])
 def test_a_view_far_aside_from_those_of_the_map(
     area: IndexedArea, texture: NDArray[np.uint8], tilt_deg: float

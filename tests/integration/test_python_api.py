@@ -160,3 +160,17 @@ def test_what_cannot_be_done_is_said_in_one_sentence(url: Path, tmp_path: Path) 
     assert db.grow(quiet=True).report.photos == ()
     with pytest.raises(MissingExtraError, match=r"featuredb\[notebook\]"):
         require("notebook", "df()", "no_such_package")
+
+
+def test_unknown_and_lonely_choices_of_an_ingest_are_refused_before_any_work(url: Path) -> None:
+    db = featuredb.open(url)
+    with pytest.raises(InvalidValueError, match="found gcp_file"):
+        db.ingest(url.parent, gcp_file="gcp_list.txt")  # type: ignore[call-arg]
+    with pytest.raises(InvalidValueError, match="gcp_crs: expected gcp beside it"):
+        db.ingest(url.parent, gcp_crs="EPSG:32632")
+
+
+@pytest.mark.parametrize("prior", [(47.0, 8.0), (47.0, 8.0, "near")])
+def test_a_prior_that_is_none_says_what_one_is(url: Path, photo: Path, prior: tuple[float, ...]) -> None:
+    with pytest.raises(InvalidValueError, match="latitude, longitude and metres"):
+        featuredb.open(url).localise(photo, prior=prior)  # type: ignore[arg-type]
