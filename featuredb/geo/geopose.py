@@ -17,7 +17,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rigid3 import Rigid3
-from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+from featuredb.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix, yaw_pitch_roll
 
 BODY_AXES: Final = "x forward, y left, z up"
 
@@ -26,8 +26,6 @@ BODY_FROM_CAM.setflags(write=False)
 
 # Three decimals are what the tersest clients send; a quaternion further off unit length is no rotation.
 UNIT_NORM_TOLERANCE = 2e-3
-# Closer to the vertical than this, the heading of the optical axis says less than that of the image's top.
-_VERTICAL_SINE = math.cos(math.radians(0.1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,12 +74,7 @@ class GeoPose:
 
         Yaw 0 looks east and grows towards north; with y to the left a positive pitch looks down.
         """
-        m = self.true_enu_from_body
-        pitch = math.asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
-        if abs(m[2, 0]) > _VERTICAL_SINE:  # yaw and roll turn about the same axis: give it all to yaw
-            yaw, roll = math.atan2(-m[0, 1], m[1, 1]), 0.0
-        else:
-            yaw, roll = math.atan2(m[1, 0], m[0, 0]), math.atan2(m[2, 1], m[2, 2])
+        yaw, pitch, roll = yaw_pitch_roll(self.true_enu_from_body)
         return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
 
     @property

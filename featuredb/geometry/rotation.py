@@ -4,7 +4,7 @@ In plain floats: of nine numbers that is several times as fast as arrays are, an
 takes longer than most commands.
 """
 
-from math import atan2, cos, hypot, sin
+from math import asin, atan2, cos, hypot, radians, sin
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,8 @@ from featuredb.geometry.arrays import FloatArray, frozen_array
 _SHORTEST_QUATERNION = 1e-6  # a shorter one is an unset field, not a rotation
 _SMALL_ANGLE = 1e-3  # radians; below it the series' next term is under float64's resolution
 _NOT_ORTHONORMAL = 1e-12  # what products of some rotations reach by rounding is left as it is
+# Closer to the vertical than this, the heading of a camera says less than that of its image's top.
+_VERTICAL_SINE = cos(radians(0.1))
 _IDENTITY = np.eye(3)
 
 
@@ -87,6 +89,18 @@ def rotation_angle(rotation: ArrayLike) -> float:
     """Angle in radians, [0, pi], of a rotation matrix (3, 3)."""
     x, y, z, w = _unit_of_matrix(rotation)
     return 2.0 * atan2(hypot(x, y, z), w)
+
+
+def yaw_pitch_roll(rotation: ArrayLike) -> tuple[float, float, float]:
+    """Angles in rad of Rz(yaw) Ry(pitch) Rx(roll) (3, 3).
+
+    Within 0.1 degrees of a pitch of 90 yaw and roll turn about the same axis: roll is 0 there.
+    """
+    m = np.asarray(rotation)
+    pitch = asin(float(np.clip(-m[2, 0], -1.0, 1.0)))
+    if abs(m[2, 0]) > _VERTICAL_SINE:
+        return atan2(-m[0, 1], m[1, 1]), pitch, 0.0
+    return atan2(m[1, 0], m[0, 0]), pitch, atan2(m[2, 1], m[2, 2])
 
 
 def determinant(matrix: FloatArray) -> float:

@@ -4,6 +4,7 @@ Axes: north, east, down at the local frame's origin; body forward, right, down. 
 triangle, row by row, of x, y, z, roll, pitch, yaw.
 """
 
+import logging
 import socket
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -14,7 +15,7 @@ from featuredb.errors import InvalidValueError
 from featuredb.extras import require
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
-from featuredb.geometry.rotation import quaternion_from_matrix
+from featuredb.geometry.rotation import quaternion_from_matrix, yaw_pitch_roll
 from reloc.bridge.robot_pose import FLU_FROM_FRD, NED_FROM_ENU, RobotPose
 
 MavMessage = Literal["odometry", "vision", "gps"]
@@ -24,7 +25,9 @@ _SEA_LEVEL = ("egm96", "egm2008", "navd88")  # MAVLink's altitudes are above mea
 _GPS_EPOCH_S = 315_964_800  # of Unix time
 _LEAP_S = 18  # GPS time ahead of UTC since 2017
 _WEEK_S = 604_800
-_STEEP = 1e-3  # cosine of a pitch at which roll and yaw cannot be told apart
+_STEEP = 1e-3  # cosine of a pitch: steeper ones give their angles no larger derivatives
+
+logger = logging.getLogger(__name__)
 
 
 class MavlinkSender:
@@ -89,7 +92,7 @@ class MavlinkSender:
 
     def _vision(self, pose: RobotPose) -> Any:
         place, turn, covariance = self._local(pose)
-        roll, pitch, yaw = roll_pitch_yaw(turn)
+        yaw, pitch, roll = yaw_pitch_roll(turn)
         return self._dialect.MAVLink_vision_position_estimate_message(
             usec=round(pose.time_s * 1e6),
             **dict(zip("xyz", place.tolist(), strict=True)),
@@ -113,7 +116,7 @@ class MavlinkSender:
         if altitude is None:
             ignored |= flags.GPS_INPUT_IGNORE_FLAG_ALT | flags.GPS_INPUT_IGNORE_FLAG_VERTICAL_ACCURACY
         gps_s = pose.time_s - _GPS_EPOCH_S + _LEAP_S
-        _, _, yaw = roll_pitch_yaw(NED_FROM_ENU @ pose.true_enu_from_body @ FLU_FROM_FRD)
+        yaw, _, _ = yaw_pitch_roll(NED_FROM_ENU @ pose.true_enu_from_body @ FLU_FROM_FRD)
         return flags.MAVLink_gps_input_message(
             time_usec=round(pose.time_s * 1e6),
             gps_id=0,
@@ -127,7 +130,7 @@ class MavlinkSender:
             **dict.fromkeys(("hdop", "vdop", "vn", "ve", "vd", "speed_accuracy"), 0.0),
             horiz_accuracy=float(np.sqrt(np.trace(pose.covariance[:2, :2]))),
             vert_accuracy=float(np.sqrt(pose.covariance[2, 2])),
-            satellites_visible=0,
+            satellites_visible=0,  # none are behind it; GPS_INPUT has no value for unknown
             yaw=round(np.degrees(yaw) * 100.0) % 36_000 or 36_000,  # 0 would be "not known"
         )
 
@@ -146,8 +149,11 @@ class MavlinkSender:
 class UdpLink:
     """Sends packets to `udpout:HOST:PORT`; a context manager.
 
+    Attributes:
+        lost: packets that the network did not take; the first is logged.
+
     Raises:
-        InvalidValueError: not such an address.
+        InvalidValueError: not such an address, or no such host.
     """
 
     def __init__(self, address: str) -> None:
@@ -155,11 +161,23 @@ class UdpLink:
         host, _, port = rest.rpartition(":")
         if kind != "udpout" or not host or not port.isdigit() or not 0 < int(port) < 65536:
             raise InvalidValueError(f"--to: expected udpout:HOST:PORT, found {address!r}")
-        self._to = (host, int(port))
+        try:
+            self._to = socket.getaddrinfo(host, int(port), socket.AF_INET, socket.SOCK_DGRAM)[0][4]
+        except (OSError, UnicodeError) as error:
+            raise InvalidValueError(
+                f"--to: expected a host that is known, found {host!r} ({error})"
+            ) from error
+        self.lost = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def send(self, packet: bytes) -> None:
-        self._socket.sendto(packet, self._to)
+        """Send a packet, or count it as lost: a network that is away for a while ends nothing."""
+        try:
+            self._socket.sendto(packet, self._to)
+        except OSError as error:
+            if not self.lost:
+                logger.warning("a packet was not sent, and others may not be: %s", error)
+            self.lost += 1
 
     def __enter__(self) -> "UdpLink":
         return self
@@ -177,21 +195,9 @@ def altitude_m(pose: RobotPose, geoid_m: float | None) -> float | None:
     return None
 
 
-def roll_pitch_yaw(rotation: FloatArray) -> tuple[float, float, float]:
-    """Angles in rad of Rz(yaw) Ry(pitch) Rx(roll) (3, 3)."""
-    pitch = float(np.arcsin(np.clip(-rotation[2, 0], -1.0, 1.0)))
-    if np.cos(pitch) < _STEEP:  # only one turn about the vertical is left
-        return 0.0, pitch, float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
-    return (
-        float(np.arctan2(rotation[2, 1], rotation[2, 2])),
-        pitch,
-        float(np.arctan2(rotation[1, 0], rotation[0, 0])),
-    )
-
-
 def _angles_by_rotation(rotation: FloatArray) -> FloatArray:
     """(3, 3) derivatives of roll, pitch, yaw by a small rotation about the fixed axes."""
-    _, pitch, yaw = roll_pitch_yaw(rotation)
+    yaw, pitch, _ = yaw_pitch_roll(rotation)
     cos, sin = max(float(np.cos(pitch)), _STEEP), float(np.sin(pitch))
     c, s = float(np.cos(yaw)), float(np.sin(yaw))
     return np.array([[c / cos, s / cos, 0.0], [-s, c, 0.0], [c * sin / cos, s * sin / cos, 1.0]])

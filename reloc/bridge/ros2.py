@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from featuredb.errors import InvalidValueError
 from featuredb.extras import require
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -57,7 +58,7 @@ class McapLog:
 
     Raises:
         MissingExtraError: mcap is not installed.
-        OSError: the file cannot be written.
+        InvalidValueError: the file is there already, or cannot be written; raised when the block begins.
     """
 
     def __init__(self, path: Path, *, origin: LocalFrame | None = None) -> None:
@@ -68,7 +69,12 @@ class McapLog:
     def __enter__(self) -> Self:
         from mcap.writer import Writer
 
-        self._file = self._path.open("wb")
+        try:
+            self._file = self._path.open("xb")  # a recording is never made twice
+        except OSError as error:
+            raise InvalidValueError(
+                f"{self._path}: expected a new file in a folder that is there, found: {error.strerror}"
+            ) from error
         self._writer: Any = Writer(self._file)
         self._writer.start(profile="ros2", library="featuredb")
         self._channels = {

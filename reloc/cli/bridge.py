@@ -31,13 +31,19 @@ def register(subparsers: Any) -> None:
         "--message",
         action="append",
         choices=("odometry", "vision", "gps"),
-        help="ODOMETRY, VISION_POSITION_ESTIMATE or GPS_INPUT; may be repeated; default odometry",
+        help="ODOMETRY, VISION_POSITION_ESTIMATE or GPS_INPUT; may be repeated; default odometry, which "
+        "PX4 takes. For ArduPilot: --message vision",
     )
     ros2 = kinds.add_parser("ros2", help="ROS 2 messages in an MCAP file", description="Write an MCAP file.")
     ros2.add_argument("--out", type=Path, required=True, metavar="FILE.mcap", help="file to write")
     nmea = kinds.add_parser("nmea", help="NMEA 0183 to standard output", description="Print GGA and GST.")
     for kind in (mavlink, ros2):
-        kind.add_argument("--origin", metavar="LAT,LON,H", help="of the local frame; default: the first pose")
+        kind.add_argument(
+            "--origin",
+            metavar="LAT,LON,H",
+            help="of the local frame, WGS84 degrees and metres; with an equals sign where the latitude is "
+            "negative: --origin=-33.86,151.21,20; default: the first pose",
+        )
     for kind in (mavlink, nmea):
         kind.add_argument(
             "--geoid", type=float, metavar="M", help="height of the geoid over the ellipsoid there"
@@ -71,7 +77,8 @@ def _mavlink(args: argparse.Namespace) -> int:
             for packet in sender.pack(pose):
                 link.send(packet)
             count += 1
-    return _said(f"{count} poses sent to {args.to}", count)
+    lost = f"; {link.lost} packets were not sent" if link.lost else ""
+    return _said(f"{count} poses sent to {args.to}{lost}", count)
 
 
 def _ros2(args: argparse.Namespace) -> int:

@@ -209,7 +209,7 @@ def _query(args: argparse.Namespace) -> int:
         raise InvalidValueError(
             "--contribute: expected --credit and --licence, too: whom to name with them, and the terms"
         )
-    _require_an_image(args.image)
+    require_an_image(args.image)
     with Client(args.connect, args.database, config_path=args.config) as client:
 
         def ask(data: bytes, lens: "CameraRequest | None", first: bool) -> "LocaliseReply":
@@ -234,7 +234,7 @@ def _localise(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
     from reloc.overlay import map_points_in_view
 
-    _require_an_image(args.image)
+    require_an_image(args.image)
     asker, ask = asking_here(args, lambda: open_database(args), inliers=args.overlay is not None)
     return _answer_all(
         args, ask, asker.name, lambda reply: map_points_in_view(asker.localiser().areas, reply)
@@ -269,8 +269,12 @@ def asking_here(
     return asker, ask
 
 
-def _require_an_image(paths: list[str]) -> None:
-    """Before maps are loaded, or a server is waited for."""
+def require_an_image(paths: list[str]) -> None:
+    """Before maps are loaded, or a server is waited for.
+
+    Raises:
+        InvalidValueError: none of the paths is a file.
+    """
     if not any(Path(path).is_file() for path in paths):
         raise InvalidValueError(f"{', '.join(paths)}: expected a photo, found no such file; check the path")
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from featuredb.errors import InvalidValueError
 
 if TYPE_CHECKING:
+    from featuredb.geometry.camera import Camera
     from featuredb.render.cloud import PointCloud
     from featuredb.store import Database
     from reloc.pixels.layer import Layer
@@ -46,8 +47,10 @@ def register(subparsers: Any) -> None:
 
 def _draw(args: argparse.Namespace) -> int:
     from featuredb.cli.common import open_database
+    from reloc.cli.locate import check_output
     from reloc.pixels.layer import read_layer
 
+    check_output("--out", args.out, args.image)
     layer = read_layer(args.layer)
     if args.track is not None:
         return _draw_film(args, layer)
@@ -55,23 +58,44 @@ def _draw(args: argparse.Namespace) -> int:
     import numpy as np
 
     from featuredb.features.decode import decode_rgb
+    from reloc.cli.commands import require_an_image
     from reloc.cli.locate import answered_view
     from reloc.pixels.draw import draw_layer
     from reloc.pixels.layer import laid_on
     from reloc.pixels.surfaces import scan_surface
 
+    require_an_image([args.image])
+    suffix = args.out.suffix or ".png"
+    if not cv2.haveImageWriter(f"picture{suffix}"):
+        raise InvalidValueError(f"--out: expected a picture such as drawn.png or drawn.jpg, found {args.out}")
     rgb = decode_rgb(Path(args.image).read_bytes())
     database = open_database(args)
     view, _ = answered_view(args, database)
     if view is None:
         return _NO_POSE
+    _check_shape(view.camera, rgb.shape[1], rgb.shape[0])
     surface = scan_surface(database, view)
     cloud = None if surface is None else surface.cloud
     picture = draw_layer(rgb, view, laid_on(layer, view.frame, cloud), cloud)
-    done, data = cv2.imencode(args.out.suffix or ".png", np.ascontiguousarray(picture[:, :, ::-1]))
-    args.out.write_bytes(data.tobytes() if done else b"")
+    try:
+        done, data = cv2.imencode(suffix, np.ascontiguousarray(picture[:, :, ::-1]))
+    except cv2.error:
+        done = False
+    if not done:
+        raise InvalidValueError(f"--out: {suffix} cannot hold {rgb.shape[1]}x{rgb.shape[0]} pixels; try .png")
+    args.out.write_bytes(data.tobytes())
     sys.stderr.write(f"wrote {args.out}\n")
     return 0
+
+
+def _check_shape(camera: "Camera", width: int, height: int) -> None:
+    try:
+        camera.scaled_to(width, height)
+    except InvalidValueError as error:
+        raise InvalidValueError(
+            f"draw: expected the picture that the answer is about, or a reduced one, of the shape of "
+            f"{camera.width}x{camera.height} pixels, found {width}x{height}"
+        ) from error
 
 
 def _draw_film(args: argparse.Namespace, layer: "Layer") -> int:

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from featuredb.geometry.arrays import FloatArray
     from featuredb.store import Database
     from reloc.localiser import Localiser
+    from reloc.pixels.boxes import MarkedPixel
     from reloc.pixels.locate import PixelPlace
     from reloc.pixels.surfaces import RaySurface
     from reloc.pixels.view import AnsweredView
@@ -85,9 +86,14 @@ def _locate(args: argparse.Namespace) -> int:
     import json
 
     from featuredb.cli.common import open_database
+    from reloc.cli.commands import require_an_image
     from reloc.pixels.boxes import as_json, geojson
     from reloc.pixels.locate import locate
 
+    if args.answer is None:
+        require_an_image([args.image])
+    if args.geojson is not None:
+        check_output("--geojson", args.geojson, args.image)
     marks = _marks(args)
     for name in ("pixel_sigma", "scan_sigma"):
         value = getattr(args, name)
@@ -110,14 +116,50 @@ def _locate(args: argparse.Namespace) -> int:
 
 
 def _marks(args: argparse.Namespace) -> Any:
-    from reloc.pixels.boxes import MarkedPixel, read_coco
+    from reloc.pixels.boxes import MarkedPixel
 
     marks = [MarkedPixel(pixel=_pixel(text)) for text in args.pixel]
     if args.boxes is not None:
-        marks += read_coco(args.boxes, args.image, args.foot)
+        marks += _boxes(args)
     if not marks:
         raise InvalidValueError("locate: expected --pixel U,V or --boxes JSON, found neither")
     return marks
+
+
+def _boxes(args: argparse.Namespace) -> "list[MarkedPixel]":
+    """The foot points of boxes; says on stderr where they may be those of a turned picture."""
+    from featuredb.features.exif.read import read_exif
+    from featuredb.features.image_header import read_header
+    from reloc.pixels.boxes import read_coco
+    from reloc.pixels.view import AnsweredView
+
+    photo = Path(args.image)
+    data = photo.read_bytes() if photo.is_file() else b""
+    picture = (
+        read_header(data)
+        if args.answer is None
+        else AnsweredView.of_reply(_read_answer(args.answer, photo)).camera
+    )
+    marks, says_size = read_coco(args.boxes, args.image, args.foot, (picture.width, picture.height))
+    orientation = read_exif(data).orientation if data else 1
+    if orientation != 1 and not (says_size and orientation > 4):  # up to 4 both have the same size
+        sys.stderr.write(
+            f"featuredb: {photo}: EXIF turns the picture (orientation {orientation}), and {args.boxes} does "
+            "not say which its boxes are of; they are taken as those of the stored one, unturned\n"
+        )
+    return marks
+
+
+def check_output(option: str, path: Path, image: str) -> None:
+    """Before anything is localised: whether an output's folder is there, and it is not the image itself.
+
+    Raises:
+        InvalidValueError: no, or the output is a folder.
+    """
+    if not path.parent.is_dir() or path.is_dir():
+        raise InvalidValueError(f"{option}: expected a file in a folder that is there, found {path}")
+    if path.exists() and Path(image).exists() and path.samefile(image):
+        raise InvalidValueError(f"{option}: expected another file than the image, found {path}")
 
 
 def _pixel(text: str) -> tuple[float, float]:
@@ -149,17 +191,19 @@ def answered_view(
 
 
 def _read_answer(path: Path, image: Path) -> "LocaliseReply":
-    """The answer about a photo: the only one in the file, or the one of that file name."""
+    """The answer about a photo: the one of its file name, or the only one where that has none."""
     import json
 
     from reloc.wire.query import LocaliseReply
 
     try:
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        mine = [line for line in lines if len(lines) == 1 or Path(line["image"]).name == image.name]
-        (answer,) = mine
+        names = [Path(line.get("image") or (image if len(lines) == 1 else "")).name for line in lines]
+        if names.count(image.name) != 1:
+            raise ValueError(f"{names.count(image.name)} among answers about {', '.join(names) or 'nothing'}")
+        answer = lines[names.index(image.name)]
         return LocaliseReply.model_validate_json(json.dumps(answer))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise InvalidValueError(
             f"--answer: expected one answer about {image.name} in {path}, a line of JSON as "
             f"`localise --json` prints it, found {type(error).__name__}: {error!s:.200}"

@@ -20,31 +20,43 @@ class MarkedPixel:
     properties: dict[str, Any] = field(default_factory=dict)
 
 
-def read_coco(path: Path, image: str, foot: Foot) -> list[MarkedPixel]:
+def read_coco(path: Path, image: str, foot: Foot, size: tuple[int, int]) -> tuple[list[MarkedPixel], bool]:
     """The foot point of each box of a photo.
 
     Args:
         path: COCO's annotations (an object with `images` and `annotations`) or results (a list of boxes).
         image: the photo's file name, by which its annotations are found. Results are those whose `image_id`
-            is the name, with or without suffix; where all have one `image_id`, they are the photo's.
+            is the name, with or without suffix; where all have one number, they are the photo's.
         foot: bottom: the middle of a box's lower side, where what stands upright in the picture meets the
             ground; centre: of the box, for photos straight down.
+        size: width and height of the photo's stored picture.
+
+    Returns:
+        The foot points, and whether the file says that its boxes are of a picture of this size.
 
     Raises:
-        InvalidValueError: the file cannot be read or is neither, or has no box of the photo.
+        InvalidValueError: the file cannot be read or is neither, has no box of the photo, or says that the
+            picture has another size.
     """
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
-        boxes = _boxes_of(document, Path(image))
-        names = {c["id"]: c["name"] for c in document["categories"]} if isinstance(document, dict) else {}
-        marks = [_mark(box, foot, names) for box in boxes]
+        whole = document if isinstance(document, dict) else {}
+        images = [i for i in whole.get("images", []) if Path(i["file_name"]).name == Path(image).name]
+        names = {c["id"]: c["name"] for c in whole.get("categories", [])}
+        marks = [_mark(box, foot, names) for box in _boxes_of(document, Path(image), images)]
+        told = {(int(i["width"]), int(i["height"])) for i in images if i.get("width") and i.get("height")}
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InvalidValueError(
             f"{path}: expected boxes in COCO's JSON (annotations, or a list of results), found {error!r}"
         ) from error
     if not marks:
         raise InvalidValueError(f"{path}: expected boxes of {Path(image).name}, found none")
-    return marks
+    for width, height in told - {size}:
+        raise InvalidValueError(
+            f"{path}: expected boxes of a picture of {size[0]}x{size[1]} pixels, as {Path(image).name} is "
+            f"stored, found those of {width}x{height}; a reduced or turned picture has other pixels"
+        )
+    return marks, bool(told)
 
 
 def geojson(places: Sequence[PixelPlace], marks: Sequence[MarkedPixel], photo: str) -> dict[str, Any]:
@@ -89,13 +101,13 @@ def _feature(place: PixelPlace, mark: MarkedPixel) -> dict[str, Any]:
     return {"type": "Feature", "geometry": geometry, "properties": {**mark.properties, **as_json(place)}}
 
 
-def _boxes_of(document: Any, image: Path) -> list[dict[str, Any]]:
+def _boxes_of(document: Any, image: Path, images: list[dict[str, Any]]) -> list[dict[str, Any]]:
     if isinstance(document, dict):
-        ids = {i["id"] for i in document["images"] if Path(i["file_name"]).name == image.name}
+        ids = {i["id"] for i in images}
         return [a for a in document["annotations"] if a["image_id"] in ids]
     named = [box for box in document if str(box["image_id"]) in (image.name, image.stem)]
-    only = len({str(box["image_id"]) for box in document}) == 1
-    return named or (list(document) if only else [])
+    numbers = {box["image_id"] if isinstance(box["image_id"], int) else None for box in document}
+    return named or (list(document) if len(numbers) == 1 and None not in numbers else [])
 
 
 def _mark(box: dict[str, Any], foot: Foot, names: dict[Any, str]) -> MarkedPixel:

@@ -86,8 +86,7 @@ class _Visibility:
             inside = ((pixels >= 0) & (pixels < [camera.width, camera.height])).all(axis=1)
         shown: NDArray[np.bool_] = np.logical_and(inside, np.isfinite(points).all(axis=1))
         if self.depth is not None:
-            height, width = self.depth.shape
-            at = (pixels[shown] * [width / camera.width, height / camera.height]).astype(int)
+            at = (pixels[shown] * (self.depth.shape[1] / camera.width)).astype(int)
             scan = self.depth[at[:, 1], at[:, 0]]
             depth = in_camera[shown, 2]
             shown[shown] = ~(scan < depth * (1.0 - _BEFORE_REL) - self.spacing_m)

@@ -75,7 +75,7 @@ def read_layer(path: Path) -> Layer:
 
 
 def laid_on(layer: Layer, frame: LocalFrame, cloud: PointCloud | None) -> list[Shape]:
-    """The layer in a local frame; lines without heights are laid on the scan.
+    """The layer in a local frame; vertices without heights, and what joins them, are laid on the scan.
 
     A height is that of the highest of the scan's four points that are nearest in plan.
 
@@ -95,8 +95,9 @@ def laid_on(layer: Layer, frame: LocalFrame, cloud: PointCloud | None) -> list[S
         flat = ~np.isfinite(line[:, 2])
         points = frame.enu_from_geodetic(np.where(flat[:, None] & [False, False, True], frame.height_m, line))
         if flat.any() and tree is not None and cloud is not None:
-            points = _dense(points)
-            points[:, 2] = _heights(points, cloud, tree)
+            points = _dense(np.where(flat[:, None] & [False, False, True], np.nan, points))
+            missing = np.isnan(points[:, 2])
+            points[missing, 2] = _heights(points[missing], cloud, tree)
         shapes.append(Shape(points=points, name=name))
     return shapes
 
@@ -111,14 +112,15 @@ def _heights(points: FloatArray, cloud: PointCloud, tree: cKDTree) -> FloatArray
 
 
 def _dense(points: FloatArray) -> FloatArray:
-    """A line with vertices no farther apart than a step."""
+    """A line with vertices no farther apart than a step; NaN heights beside vertices that have none."""
     if len(points) == 1:
         return points
     length = np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1)
     step = max(_STEP_M, float(length.sum()) / _MOST_STEPS)
-    along = np.concatenate([[0.0], np.cumsum(length)])
-    at = np.unique(np.concatenate([along, np.arange(0.0, along[-1], step)]))
-    return np.column_stack([np.interp(at, along, points[:, axis]) for axis in range(3)])
+    counts = np.maximum(np.ceil(length / step), 1).astype(int)
+    rows = np.arange(len(points))
+    at = np.concatenate([*(row + np.arange(n) / n for row, n in enumerate(counts)), rows[-1:]])
+    return np.column_stack([np.interp(at, rows, points[:, axis]) for axis in range(3)])
 
 
 def _crs_of(document: dict[str, Any]) -> str:

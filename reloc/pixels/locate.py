@@ -127,7 +127,7 @@ def _place(view: AnsweredView, surface: RaySurface, pixel: FloatArray, sigma_px:
     return PixelPlace(
         pixel=(float(pixel[0]), float(pixel[1])),
         reason=None,
-        detail=_doubts(other is not None, incidence),
+        detail=_doubts(other is not None, incidence, surface.doubt),
         epsg=view.epsg,
         height_datum=view.height_datum,
         surface=surface.kind,
@@ -201,8 +201,9 @@ def _other_surfaces(
     return np.asarray((away * share[:, None]).T @ away)
 
 
-def _doubts(at_edge: bool, incidence_deg: float) -> str:
-    doubts = ["another surface lies within the pixel's error"] if at_edge else []
+def _doubts(at_edge: bool, incidence_deg: float, of_surface: str) -> str:
+    doubts = [of_surface] if of_surface else []
+    doubts += ["another surface lies within the pixel's error"] if at_edge else []
     if incidence_deg > _GRAZING_DEG:
         doubts.append(f"the surface is seen at {incidence_deg:.0f} degrees off its normal")
     return "; ".join(doubts)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.lidar.load import PlanBox, load_cloud
+from featuredb.maps.lineage import trace
 from featuredb.render.cloud import PointCloud
 from featuredb.render.renderer import RenderOptions, render
 from featuredb.render.rendering import Rendering
@@ -24,6 +25,9 @@ _SMALLEST_HALF_PX = 16
 _SPACINGS = 4.0  # around a place from which its plane is taken: some fifty points
 _NEAREST_POINTS = 12  # of a map
 _TOLERANCE_SPACINGS = 0.25  # flatter than this is flat at a scan's resolution
+_UNKNOWN_HEIGHTS = (
+    "the heights of the map and of the scan are both of an unknown datum, and may be tens of metres apart"
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,10 +56,13 @@ class DepthAround(Protocol):
 
 
 class RaySurface(Protocol):
-    """Something that rays can meet; `kind` is its name in answers."""
+    """Something that rays can meet; `kind` is its name, `doubt` is said of each place on it."""
 
     @property
     def kind(self) -> str: ...
+
+    @property
+    def doubt(self) -> str: ...
 
     def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
         """Where the ray of a pixel (2,) meets it, or why it does not.
@@ -78,6 +85,7 @@ class ScanSurface:
     cloud: PointCloud
     common_m: float | None = None
     kind: str = "scan"
+    doubt: str = ""
     _overview: Rendering | None = field(default=None, repr=False)
 
     def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
@@ -115,7 +123,7 @@ class ScanSurface:
             small = resampled(camera, shrink)
             self._overview = render(self.cloud, small, view.cam_from_local, RenderOptions(attributes=False))
         drawn = self._overview
-        at = pixel * [drawn.camera.width / view.camera.width, drawn.camera.height / view.camera.height]
+        at = pixel * (drawn.camera.width / view.camera.width)
         column, row = (int(v) for v in np.minimum(at, [drawn.camera.width - 1, drawn.camera.height - 1]))
         part = (slice(max(row - 2, 0), row + 3), slice(max(column - 2, 0), column + 3))
         depth, index = drawn.depth[part], drawn.index[part]
@@ -134,6 +142,7 @@ class MapSurface:
 
     points: FloatArray
     kind: str = "map"
+    doubt: str = ""
 
     def meet(self, view: AnsweredView, pixel: FloatArray, reach_px: float) -> Met | str:
         pixels = view.camera.project(view.cam_from_local.act(self.points))
@@ -168,11 +177,11 @@ class _Nowhere:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Window:
-    """Depth (h, w) of a window; its corner (2,) in the photo, and its pixels per pixel of the photo (2,)."""
+    """Depth (h, w) of a window; its corner (2,) in the photo, and its pixels per pixel of the photo."""
 
     depth: NDArray[np.float32]
     corner: FloatArray
-    scale: FloatArray
+    scale: float
 
     def __call__(self, pixels: FloatArray) -> FloatArray:
         at = np.floor((pixels - self.corner) * self.scale).astype(np.int64)
@@ -190,7 +199,7 @@ class _Window:
         away = (np.column_stack([columns, rows]) + 0.5) / self.scale + self.corner - pixel
         apart = np.hypot(away[:, 0], away[:, 1])
         best = int(np.argmin(apart))
-        if apart[best] > max(within_px, 1.0 / float(self.scale.min())):
+        if apart[best] > max(within_px, 1.0 / self.scale):
             return None
         return float(self.depth[rows[best], columns[best]])
 
@@ -209,30 +218,47 @@ def scan_surface(
     if not scans:
         return None
     cloud = load_cloud(database, view.frame, box, scan_ids=scans)
-    return ScanSurface(cloud=cloud) if len(cloud) else None
+    doubt = (
+        _UNKNOWN_HEIGHTS if view.height_datum == "unknown" and not _placed_by_scans(database, view) else ""
+    )
+    return ScanSurface(cloud=cloud, doubt=doubt) if len(cloud) else None
+
+
+def _placed_by_scans(database: Database, view: AnsweredView) -> bool:
+    """Whether all that the answer stands on is maps that scans placed, whose heights are thus a scan's."""
+    maps = {m.map_id: m for m in database.snapshot().maps(include_retired=True)}
+    traced = [trace(map_id, maps).anchors if map_id in maps else () for map_id in view.map_ids]
+    return bool(traced) and all(
+        anchors and all(maps[anchor].method == "lidar" for anchor in anchors) for anchors in traced
+    )
 
 
 def window_camera(
     camera: Camera, pixel: FloatArray, half_px: float, zoom: float
-) -> tuple[Camera, FloatArray, FloatArray]:
+) -> tuple[Camera, FloatArray, float]:
     """The lens for a square of the picture around a pixel.
 
     Returns:
-        The lens; the square's corner (2,) in the picture; its pixels per pixel of the picture (2,).
+        The lens; the square's corner (2,) in the picture; its pixels per pixel of the picture.
     """
     side = max(2 * int(np.ceil(half_px * zoom)) + 1, 3)
     small = resampled(camera, zoom)
-    scale = np.array([small.width / camera.width, small.height / camera.height])
+    scale = small.width / camera.width
     corner = np.floor(pixel * scale) - side // 2
     params = np.array(small.params)
-    first = 1 if len(small.to_pycolmap().focal_length_idxs()) == 1 else 2
-    params[first : first + 2] -= corner
+    params[small.to_pycolmap().principal_point_idxs()] -= corner
     return replace(small, width=side, height=side, params=tuple(params)), corner / scale, scale
 
 
 def resampled(camera: Camera, zoom: float) -> Camera:
-    """The lens for a smaller picture."""
+    """The lens for a smaller picture, by the same factor in both directions: that of the widths.
+
+    Where that leaves a part of a row, the picture has the row, however far that is from the aspect ratio.
+    """
     if zoom >= 1.0:
         return camera
     width = max(round(camera.width * zoom), 1)
-    return camera.scaled_to(width, max(round(camera.height * width / camera.width), 1))
+    scale = width / camera.width
+    lens, params = camera.to_pycolmap(), np.array(camera.params)
+    params[[*lens.focal_length_idxs(), *lens.principal_point_idxs()]] *= scale
+    return replace(camera, width=width, height=int(np.ceil(camera.height * scale)), params=tuple(params))

@@ -2,11 +2,13 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 
 from featuredb.cli.main import main
 from featuredb.geo.geopose import geopose_from_camera
@@ -24,6 +26,7 @@ from reloc.tracking.trajectory.values import EarthPose, Trajectory, TrajectoryPo
 from reloc.wire.query import LocaliseReply
 from tests.support.command_line import only_command
 from tests.support.las_files import SOUTH, WEST, grid_points, write_scan
+from tests.support.maps import random_map
 
 EPSG = 32632
 CENTER = (WEST + 25.0, SOUTH + 24.0, 140.0)
@@ -111,6 +114,26 @@ def test_pixels_and_boxes_get_places_on_the_scan(
     np.testing.assert_allclose(lines[1]["utm"][:2], CENTER[:2], atol=0.01)
     collection = json.loads((folder / "out.geojson").read_text())
     assert [f["properties"].get("bbox") for f in collection["features"]] == [None, box["bbox"]]
+    # Nothing says that the answer's heights of an unknown datum are the scan's.
+    assert all("both of an unknown datum" in line["detail"] for line in lines)
+
+
+def test_heights_of_a_map_that_a_scan_placed_are_the_scan_s(
+    folder: Path, command: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    database, maps = Database.open(str(folder / "db")), {}
+    for seed, method in ((1, "lidar"), (2, "gps")):
+        made = random_map(seed)
+        maps[method] = replace(
+            made, placement=replace(made.placement, method=method), generation=0, parents=()
+        )
+    database.commit_maps(list(maps.values()))
+    for method, doubts in (("lidar", False), ("gps", True)):
+        line = json.dumps({**answer(), "maps": [maps[method].map_id]})
+        (folder / f"{method}.json").write_text(line)
+        words = ["locate", "photo.png", "--database", "db", "--answer", f"{method}.json", "--json"]
+        assert main([*words, "--pixel", "100,90"]) == 0
+        assert ("both of an unknown datum" in capsys.readouterr().out) is doubts
 
 
 def test_what_pose_and_lens_have_in_common_does_not_move_a_place() -> None:
@@ -126,14 +149,69 @@ def test_what_pose_and_lens_have_in_common_does_not_move_a_place() -> None:
 def test_mistakes_end_before_the_photo_is_read(
     folder: Path, command: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    base = ["locate", "missing.jpg", "--database", "db", "--answer", "answer.json"]
+    base = ["locate", "photo.png", "--database", "db", "--answer", "answer.json"]
+    assert main(["locate", "missing.jpg", "--database", "db", "--pixel", "1,2"]) == 2
+    assert "missing.jpg: expected a photo" in capsys.readouterr().err
     for words, said in (
         ([], "--pixel U,V or --boxes"),
         (["--pixel", "1;2"], "expected U,V"),
         (["--pixel", "1,2", "--scan-sigma=-1"], "--scan-sigma"),
+        (["--pixel", "1,2", "--geojson", "no/folder.geojson"], "--geojson"),
     ):
         assert main([*base, *words]) == 2
         assert said in capsys.readouterr().err
+    assert main(["locate", "other.png", *base[2:], "--pixel", "1,2"]) == 2
+    assert "expected one answer about other.png" in capsys.readouterr().err
+
+
+def test_boxes_of_a_turned_picture_are_refused_or_spoken_of(
+    folder: Path, command: None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation.value] = 6
+    Image.new("RGB", (640, 480)).save(folder / "turned.jpg", exif=exif)
+    (folder / "turned.json").write_text(json.dumps({**answer(), "image": "turned.jpg"}))
+    words = ["locate", "turned.jpg", "--database", "db", "--answer", "turned.json", "--boxes", "boxes.json"]
+    box = {"image_id": 3, "bbox": [300.0, 200.0, 40.0, 40.0]}
+    image = {"id": 3, "file_name": "turned.jpg"}
+    for size, code, said in (
+        ({}, 0, "EXIF turns the picture (orientation 6)"),
+        ({"width": 640, "height": 480}, 0, ""),
+        ({"width": 480, "height": 640}, 2, "found those of 480x640"),
+    ):
+        coco = {"images": [{**image, **size}], "annotations": [box]}
+        (folder / "boxes.json").write_text(json.dumps(coco))
+        assert main(words) == code
+        told = capsys.readouterr().err
+        assert said in told
+        assert said or not told
+
+
+def test_a_drawing_replaces_no_photo_and_is_of_the_photo_that_was_answered(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(folder)
+    place = {"type": "Point", "coordinates": [9.0, 48.0, 100.0]}
+    (folder / "place.geojson").write_text(
+        json.dumps({"type": "Feature", "properties": {}, "geometry": place})
+    )
+    (folder / "turned").mkdir()
+    cv2.imwrite(str(folder / "turned/photo.png"), np.zeros((640, 480, 3), np.uint8))
+    before = (folder / "photo.png").read_bytes()
+    with only_command(monkeypatch, "draw", "reloc.cli.draw:register"):
+        for photo, out, said in (
+            ("photo.png", "./photo.png", "expected another file than the image"),
+            ("photo.png", "drawn.xyz", "expected a picture such as"),
+            ("photo.png", "no/drawn.png", "in a folder that is there"),
+            ("missing.png", "drawn.jpg", "expected a photo"),
+            ("turned/photo.png", "drawn.jpg", "of the shape of 640x480 pixels, found 480x640"),
+        ):
+            words = ["draw", photo, "place.geojson", "--database", "db", "--answer", "answer.json"]
+            assert main([*words, "--out", out]) == 2
+            assert said in capsys.readouterr().err
+        for name in ("xyz", "jpg"):
+            assert not (folder / f"drawn.{name}").exists()
+    assert (folder / "photo.png").read_bytes() == before
 
 
 def test_a_layer_is_drawn_where_the_answer_sees_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

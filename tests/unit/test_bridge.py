@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import socket
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pymavlink.dialects.v20 import common
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from featuredb.cli.main import main
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.arrays import FloatArray
@@ -21,6 +23,7 @@ from reloc.bridge.mavlink import MavlinkSender, UdpLink
 from reloc.bridge.nmea import sentences
 from reloc.bridge.robot_pose import RobotPose, read_answers
 from reloc.bridge.ros2 import McapLog, messages
+from tests.support.command_line import only_command
 
 ORIGIN = LocalFrame(latitude_deg=-33.86, longitude_deg=151.2, height_m=20.0)
 PLACE = np.array([12.0, 345.0, 6.0])  # east, north, up of the origin
@@ -145,6 +148,52 @@ def test_packets_arrive_at_an_autopilot_s_port() -> None:
     assert (found[0].x, found[0].y, found[0].z) == (0.0, 0.0, 0.0)  # the first pose is the origin
     with pytest.raises(InvalidValueError, match="udpout"):
         UdpLink("serial:/dev/ttyS0")
+
+
+def test_a_host_is_known_before_any_answer_and_a_lost_packet_ends_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def unknown(*args: object, **more: object) -> None:
+        raise socket.gaierror(-2, "Name or service not known")
+
+    with monkeypatch.context() as without_names:
+        without_names.setattr(socket, "getaddrinfo", unknown)
+        with pytest.raises(InvalidValueError, match=r"--to: .*no\.such\.host"):
+            UdpLink("udpout:no.such.host:1")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
+        autopilot.bind(("127.0.0.1", 0))
+        autopilot.settimeout(5.0)
+        with UdpLink(f"udpout:127.0.0.1:{autopilot.getsockname()[1]}") as link:
+            link.send(bytes(70_000))  # more than a datagram holds: the network refuses it
+            link.send(bytes(70_000))
+            link.send(b"next")
+            assert autopilot.recv(16) == b"next"
+        assert link.lost == 2
+    assert len(caplog.records) == 1
+    assert "a packet was not sent" in caplog.text
+
+
+def test_a_recording_is_not_written_over(tmp_path: Path) -> None:
+    there = tmp_path / "run.mcap"
+    there.write_bytes(b"an earlier flight")
+    for path in (there, tmp_path / "no/run.mcap"):
+        with pytest.raises(InvalidValueError, match="expected a new file"), McapLog(path):
+            pass
+    assert there.read_bytes() == b"an earlier flight"
+
+
+def test_help_says_what_ardupilot_takes_and_how_to_write_a_southern_origin(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    with only_command(monkeypatch, "bridge", "reloc.cli.bridge:register"):
+        assert main(["bridge", "mavlink", "--help"]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        assert "For ArduPilot: --message vision" in said
+        (origin,) = re.findall(r"--origin=-\S+,\S+,\S+\b", said)
+        monkeypatch.setattr("sys.stdin", io.StringIO(json.dumps(answer(body_from_angles()))))
+        assert main(["bridge", "ros2", "--out", "/dev/null/run.mcap", origin]) == 2
+    assert "/dev/null/run.mcap: expected a new file" in capsys.readouterr().err
 
 
 def test_a_camera_that_looks_down_is_on_a_level_vehicle() -> None:

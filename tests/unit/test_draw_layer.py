@@ -61,6 +61,19 @@ def test_what_stands_before_a_line_hides_it(tmp_path: Path) -> None:
     assert len(drawn(shapes, None)) > 50
 
 
+def test_only_what_has_no_height_is_laid_on_the_scan(tmp_path: Path) -> None:
+    """Two vertices ten metres up, joined by a straight line, and one without a height."""
+    places = lon_lat(np.array([[-20.0, 0.0, 0.0], [-12.0, 0.0, 0.0], [-4.0, 0.0, 0.0]]))
+    up = FRAME.height_m + 10.0
+    coordinates = [[*places[0], up], [*places[1], up], places[2]]
+    layer = read_layer(layer_file(tmp_path, {"type": "LineString", "coordinates": coordinates}))
+    (shape,) = laid_on(layer, FRAME, CLOUD)
+    in_air = shape.points[:, 0] < -12.0 + 1e-3
+    assert 10 < in_air.sum() < len(in_air) - 10
+    np.testing.assert_allclose(shape.points[in_air, 2], 10.0, atol=1e-3)
+    np.testing.assert_allclose(shape.points[~in_air, 2], 0.0, atol=0.1)
+
+
 def test_a_file_may_name_its_reference_system(tmp_path: Path) -> None:
     place = np.array([-6.0, 1.5, 0.0])
     lat, lon, _ = FRAME.geodetic_from_enu(place)

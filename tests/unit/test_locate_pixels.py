@@ -17,7 +17,7 @@ from featuredb.render.levels import build_cloud
 from reloc.pixels.boxes import geojson, read_coco
 from reloc.pixels.locate import locate
 from reloc.pixels.patch import fit_patch
-from reloc.pixels.surfaces import MapSurface, ScanSurface, window_camera
+from reloc.pixels.surfaces import MapSurface, ScanSurface, resampled, window_camera
 from reloc.pixels.view import AnsweredView
 from tests.support.scanned_map import EPSG, FRAME
 
@@ -167,6 +167,42 @@ def test_a_window_shows_the_picture_around_a_pixel(zoom: float) -> None:
     assert (np.abs(middle - window.width / 2) <= 1.0).all()
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "SIMPLE_RADIAL"])
+def test_a_smaller_picture_of_any_shape_shows_the_same(model: str) -> None:
+    """Of a panorama, and of one that becomes a few pixels wide, where rows are not whole."""
+    points = np.array([[3.0, -0.1, 10.0], [-2.0, 0.1, 9.0]])
+    for width, height, zoom in ((12_000, 400, 0.083), (800, 600, 0.006)):
+        lens = Camera.from_focal(width, height, 0.9 * width, model)
+        small = resampled(lens, zoom)
+        scale = small.width / width
+        np.testing.assert_allclose(small.project(points), lens.project(points) * scale, atol=1e-9)
+        assert 0 <= small.height - height * scale < 1
+
+
+def test_a_doubt_of_the_surface_is_a_doubt_of_each_place() -> None:
+    scan = ScanSurface(cloud=CLOUD, doubt="heights of an unknown datum")
+    (place,) = locate(view_of(POSE), scan, [(200.0, 350.5)])
+    assert "heights of an unknown datum" in place.detail
+
+
+def test_boxes_of_another_photo_or_another_size_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "boxes.json"
+    box = {"image_id": "other.jpg", "bbox": [190.0, 300.0, 20.0, 50.0]}
+    file.write_text(json.dumps([box]))
+    with pytest.raises(InvalidValueError, match=r"boxes of a\.jpg, found none"):
+        read_coco(file, "a.jpg", "bottom", (800, 600))
+    file.write_text(json.dumps([{**box, "image_id": 17}]))
+    marks, says_size = read_coco(file, "a.jpg", "bottom", (800, 600))
+    assert (len(marks), says_size) == (1, False)
+    image = {"id": 3, "file_name": "a.jpg", "width": 600, "height": 800}
+    file.write_text(json.dumps({"images": [image], "annotations": [{**box, "image_id": 3}]}))
+    with pytest.raises(InvalidValueError, match=r"800x600 pixels, .* found those of 600x800"):
+        read_coco(file, "a.jpg", "bottom", (800, 600))
+    (mark,), says_size = read_coco(file, "a.jpg", "bottom", (600, 800))
+    assert says_size
+    assert mark.pixel == (200.0, 350.0)
+
+
 def test_boxes_come_as_coco_and_places_go_as_geojson(tmp_path: Path) -> None:
     box = {"id": 7, "image_id": 3, "category_id": 2, "bbox": [190.0, 300.0, 20.0, 50.5]}
     annotations = {
@@ -176,18 +212,18 @@ def test_boxes_come_as_coco_and_places_go_as_geojson(tmp_path: Path) -> None:
     }
     file = tmp_path / "boxes.json"
     file.write_text(json.dumps(annotations))
-    (mark,) = read_coco(file, "elsewhere/a.jpg", "bottom")
+    (mark,), _ = read_coco(file, "elsewhere/a.jpg", "bottom", (800, 600))
     assert mark.pixel == (200.0, 350.5)
     assert mark.properties["category"] == "car"
     file.write_text(json.dumps([{**box, "image_id": "a", "score": 0.5}, {**box, "image_id": "b"}]))
-    (mark,) = read_coco(file, "a.jpg", "centre")
+    (mark,), _ = read_coco(file, "a.jpg", "centre", (800, 600))
     assert mark.pixel == (200.0, 325.25)
     assert mark.properties["score"] == 0.5
     with pytest.raises(InvalidValueError, match=r"boxes of c\.jpg"):
-        read_coco(file, "c.jpg", "centre")
+        read_coco(file, "c.jpg", "centre", (800, 600))
     file.write_text('{"images": 3}')
     with pytest.raises(InvalidValueError, match="COCO"):
-        read_coco(file, "c.jpg", "centre")
+        read_coco(file, "c.jpg", "centre", (800, 600))
     view = view_of(POSE)
     places = locate(view, ScanSurface(cloud=CLOUD), [mark.pixel, (-1.0, 0.0)])
     document = geojson(places, [mark, mark], "a.jpg")
