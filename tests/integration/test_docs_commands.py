@@ -37,6 +37,7 @@ NOT_RUN = {
     "featuredb anchor film.db": _BY_HAND,
     "featuredb track film.db": _BY_HAND,
     "featuredb localise film.db": _BY_HAND,
+    "featuredb live /dev/video0": "needs a camera; tests/unit/test_bridge.py sends what it would",
     "featuredb demo": "tests/integration/test_demo.py runs it",
     "tools/check.py": "it runs these tests",
     "pip install": "installs; the extra is looked up",

@@ -79,7 +79,7 @@ def test_exif_orientation_is_not_applied(served):
     assert localiser.grays[-1].shape == (120, 160)
 
 
-def test_exif_gives_focal_length_key_and_on_request_the_prior(served):
+def test_exif_gives_focal_length_key_and_on_request_the_position(served):
     localiser, client = served
     exif = Image.Exif()
     exif[271], exif[272] = "Maker", "Model 1"
@@ -89,11 +89,12 @@ def test_exif_gives_focal_length_key_and_on_request_the_prior(served):
     client.localise(data)
     assert localiser.requests[-1].exif_focal_px == pytest.approx(36 / 43.2666 * 200.0, rel=1e-3)
     assert "maker|model 1" in (localiser.requests[-1].camera_key or "")
-    assert localiser.requests[-1].prior is None
+    assert localiser.requests[-1].own_position is None
     client.localise(data, exif_prior=True)
-    prior = localiser.requests[-1].prior
-    assert prior is not None
-    assert (prior.latitude_deg, prior.longitude_deg) == pytest.approx((49.5, -8.25))
+    assert localiser.requests[-1].prior is None
+    position = localiser.requests[-1].own_position
+    assert position is not None
+    assert (position.latitude_deg, position.longitude_deg) == pytest.approx((49.5, -8.25))
 
 
 def _random_json(rng: random.Random, depth: int = 0) -> object:

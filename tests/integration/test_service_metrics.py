@@ -5,7 +5,7 @@ from prometheus_client.parser import text_string_to_metric_families as families
 
 from reloc.service.metrics import metrics_page
 from tests.support.gateway import running_gateway
-from tests.support.live import LENS, localiser
+from tests.support.live import LENS, localiser, wait_until
 from tests.support.service import ScriptedLocaliser, client_of, photo, running_server
 
 
@@ -25,6 +25,7 @@ def test_the_page_says_what_the_status_does() -> None:
         running_gateway(server.endpoints[0]) as gateway,
     ):
         client.localise(photo())
+        wait_until(lambda: server.status().queue.ready == 2, "both workers are ready")
         own = _samples(requests.get(f"http://127.0.0.1:{port}/metrics", timeout=30).text)
         through = _samples(gateway.get("/metrics").text)
     assert own["featuredb_server_queries_total", ""] == 1

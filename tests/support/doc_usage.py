@@ -6,6 +6,7 @@ import runpy
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from importlib.metadata import entry_points, metadata
 from typing import Any, NoReturn
@@ -35,6 +36,10 @@ def check_usage(command: Command) -> None:
     Raises:
         UsageError: what is wrong with it.
     """
+    if not command.in_prose and " | " in command.text:
+        for text in command.text.split(" | "):
+            check_usage(replace(command, text=text))
+        return
     call = call_of(command)
     unknown = set(call.extras) - set(metadata("featuredb").get_all("Provides-Extra") or ())
     if unknown:
