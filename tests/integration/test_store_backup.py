@@ -164,6 +164,38 @@ def test_a_power_cut_leaves_the_backup_before_or_after(
     assert verify(Database.open(left)).ok
 
 
+@pytest.mark.parametrize("listed", ["in order", "by name"])
+def test_a_restore_that_was_cut_off_is_no_database(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: str
+) -> None:
+    """Also of a backup that was made in several runs, whose first files are those of an older state."""
+    database = Database.create(tmp_path / "two.db")
+    database.commit_maps([random_map(1, extent_m=10.0), random_map(2, extent_m=10.0)])
+    backup(database, target)
+    database.retire("map-2", "wrong")
+    copies = backup(database, target)
+    if listed == "by name":
+        place = CopyPlace(target, None)
+        found = place.read_list()
+        assert found is not None
+        place.write_list(replace(found, files=dict(sorted(found.files.items()))))
+    left, take, begun = Database(str(tmp_path / "left.db")), CopyPlace.take, list[str]()
+
+    def cut(self: CopyPlace, path: str, *args: object) -> object:
+        begun.append(path)
+        with pytest.raises(StoreError):  # its tables alone are not one either
+            left.snapshot()
+        for enter in (Database.open, Database.create):
+            with pytest.raises(StoreError, match=r"restore from .* run the same restore again$"):
+                enter(left.url)
+        return take(self, path, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(CopyPlace, "take", cut)
+    restore(target, left)
+    assert len(begun) == copies.files + copies.kept
+    assert [m.map_id for m in Database.open(left.url).snapshot().maps()] == ["map-1"]
+
+
 def test_damage_is_found_while_copying(database: Database, target: str, tmp_path: Path) -> None:
     backup(database, target)
     truth = seen(database)

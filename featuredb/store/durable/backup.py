@@ -145,13 +145,9 @@ def _consistent(database: Database) -> Iterator[Table]:
 
 
 def _files_of(table: Table) -> dict[str, str | None]:
-    """The files of a table at its version, relative to it, with the SHA-256 of those whose log has it.
-
-    The log comes last and backwards: before its first entry there is no table.
-    """
+    """The files of a table at its version, relative to it, with the SHA-256 of those whose log has it."""
     kept_from = oldest_kept_version(table.commits()) if table.spec.name == MAPS else table.version
     files: dict[str, str | None] = {}
-    log: dict[str, str | None] = {}
     for version in range(table.version + 1):
         content = entry_bytes(table.storage, version)
         actions = read_actions(content)
@@ -160,8 +156,8 @@ def _files_of(table: Table) -> dict[str, str | None]:
                 files.pop(path, None)
         for add in (a["add"] for a in actions if "add" in a):
             files[unquote(add["path"])] = (add.get("tags") or {}).get(DIGEST)
-        log[f"{LOG}/{entry_name(version)}"] = hashlib.sha256(content).hexdigest()
-    return files | dict(reversed(log.items()))
+        files[f"{LOG}/{entry_name(version)}"] = hashlib.sha256(content).hexdigest()
+    return files
 
 
 def _list_of(place: CopyPlace, purpose: str, source: str) -> CopyList:
@@ -189,7 +185,7 @@ def _copy(
     """Make a place hold these files and no others; what it held stays whole until they are there.
 
     Args:
-        wanted: the SHA-256 of each file, where it is known, by path, in the order to copy them.
+        wanted: the SHA-256 of each file, where it is known, by path.
         before: what the place holds.
     """
     sizes = place.sizes()
@@ -197,13 +193,14 @@ def _copy(
     _check_same_history(kept, place, sizes)
     mine = replace(before, source=source.url, began=datetime.now(UTC), attempt=uuid.uuid4().hex, whole=False)
     place.write_list(mine)
-    copied = {path: place.take(path, source, wanted[path]) for path in wanted if path not in kept}
+    order = sorted(wanted, key=_turn)
+    copied = {path: place.take(path, source, wanted[path]) for path in order if path not in kept}
     place.flush_folders(wanted)
     now = place.read_list()
     if now is None or now.attempt != mine.attempt:
         raise StoreError(f"another copy to {place.url} is at work: let it finish, and run this again")
     version = _acknowledge(place, wanted)
-    done = replace(mine, files=kept | copied)
+    done = replace(mine, files={path: (kept | copied)[path] for path in order})
     place.write_list(done)
     removed = superfluous(place.sizes(), done.files)
     place.remove(removed)
@@ -215,6 +212,16 @@ def _copy(
         kept=len(kept),
         removed=len(removed),
     )
+
+
+def _turn(path: str) -> tuple[bool, bool, int, str]:
+    """When a file is copied: data before logs, `maps` last.
+
+    A log is copied backwards: before its first entry there is no table.
+    """
+    table, *_, name = path.split("/")
+    log = f"/{LOG}/" in path
+    return table == MAPS, log, -int(Path(name).stem) if log else 0, path
 
 
 def _there(

@@ -170,11 +170,31 @@ class CopyPlace:
 
 
 def cut_off(url: str, storage_options: dict[str, str] | None) -> str | None:
-    """What a copy that is not whole says about itself; None where there is no such thing."""
-    found = CopyPlace(url, storage_options).read_list()
-    if found is None or found.whole:
-        return None
-    return f"a {found.purpose} from {found.source} to here was cut off, or is at work: run it again"
+    """What is wrong with the list of a copy, or why that copy is not whole; None where neither is so."""
+    try:
+        found = CopyPlace(url, storage_options).read_list()
+    except StoreError as error:
+        return str(error)
+    return None if found is None or found.whole else _unfinished(found)
+
+
+def check_restored(url: str, storage_options: dict[str, str] | None) -> None:
+    """Refuse a place where a restore is not done: what is there may be an older state.
+
+    Raises:
+        StoreError: so it is.
+    """
+    try:
+        found = CopyPlace(url, storage_options).read_list()
+    except (StoreError, OSError):  # whoever opens the tables is told of the store; of the list `verify` tells
+        return
+    if found is not None and found.purpose == "restore" and not found.whole:
+        raise StoreError(f"cannot open {url}: {_unfinished(found)}")
+
+
+def _unfinished(found: CopyList) -> str:
+    what = f"a {found.purpose} from {found.source} to here was cut off, or is at work"
+    return f"{what}: run the same {found.purpose} again"
 
 
 def superfluous(paths: Iterable[str], files: Mapping[str, CopiedFile]) -> list[str]:
