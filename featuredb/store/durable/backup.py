@@ -22,7 +22,7 @@ from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database, normal_url
 from featuredb.store.delta import Table
 from featuredb.store.durable.copies import LIST, PART, CopiedFile, CopyList, CopyPlace, superfluous
-from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_bytes, entry_name, read_actions
+from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
 from featuredb.store.tables import (
     CANARIES,
@@ -149,8 +149,7 @@ def _files_of(table: Table) -> dict[str, str | None]:
     kept_from = oldest_kept_version(table.commits()) if table.spec.name == MAPS else table.version
     files: dict[str, str | None] = {}
     for version in range(table.version + 1):
-        content = entry_bytes(table.storage, version)
-        actions = read_actions(content)
+        content, actions = whole_entry(table.storage, version)
         if version <= kept_from:
             for path in (unquote(a["remove"]["path"]) for a in actions if "remove" in a):
                 files.pop(path, None)
