@@ -213,11 +213,31 @@ def test_damage_is_found_while_copying(database: Database, target: str, tmp_path
     held = next(Path(target, "points").rglob("*.parquet"))
     content = held.read_bytes()
     held.write_bytes(content[:90] + bytes([content[90] ^ 1]) + content[91:])
-    with pytest.raises(StoreError, match=f"{held.name}: its bytes are not those"):
+    with pytest.raises(StoreError, match=f"{held.name}: its bytes are not those .*back up again"):
         restore(target, Database(str(tmp_path / "other.db")))
     held.unlink()
     with pytest.raises(StoreError, match=f"damaged .*{held.name}.*another one"):
         restore(target, Database(str(tmp_path / "another.db")))
+
+
+def test_the_next_backup_heals_damaged_files(database: Database, target: str, tmp_path: Path) -> None:
+    backup(database, target)
+    entry = Path(target, "maps", "_delta_log", f"{1:020d}.json")
+    for held in (next(Path(target, "points").rglob("*.parquet")), entry):
+        content = held.read_bytes()
+        held.write_bytes(content[:90] + bytes([content[90] ^ 1]) + content[91:])
+        assert backup(database, target).files == 1
+        assert held.read_bytes() == content
+    assert seen(restored(target, tmp_path / "restored.db")) == seen(database)
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"[]"])
+def test_a_damaged_list_is_a_problem_of_the_backup(database: Database, target: str, content: bytes) -> None:
+    backup(database, target)
+    Path(target, LIST).write_bytes(content)
+    (problem,) = verify(Database.open(target)).problems
+    assert problem.where == LIST
+    assert "is damaged" in problem.what
 
 
 def test_what_is_there_is_not_overwritten(database: Database, target: str, tmp_path: Path) -> None:
@@ -262,6 +282,22 @@ def test_two_backups_at_once(database: Database, target: str, monkeypatch: pytes
     with pytest.raises(StoreError, match="at work: let it finish"):
         backup(database, target)
     assert verify(Database.open(target)).ok
+
+
+def test_two_backups_that_write_one_file(
+    database: Database, target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other has shown what this one was writing: no file of the database is lost."""
+    real = CopyPlace._show
+
+    def show(self: CopyPlace, path: str) -> None:
+        real(self, path)
+        if path.endswith(".parquet"):
+            real(self, path)
+
+    monkeypatch.setattr(CopyPlace, "_show", show)
+    with pytest.raises(StoreError, match=r"another copy to .* is at work: let it finish"):
+        backup(database, target)
 
 
 def test_the_commands(
