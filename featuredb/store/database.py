@@ -24,6 +24,7 @@ from featuredb.store.commits import (
     read_rows,
 )
 from featuredb.store.delta import Commit, Table
+from featuredb.store.durable.copies import check_restored
 from featuredb.store.encode import EncodedMap, Row, content_digest, encode_map
 from featuredb.store.retry import retry_stale
 from featuredb.store.snapshot import Snapshot
@@ -54,9 +55,11 @@ class Database:
         """Make the tables at a URL, `maps` last, and open the database.
 
         Raises:
-            StoreError: a database is there and `exist_ok` is false, or the place cannot be written.
+            StoreError: a database is there and `exist_ok` is false, one is being restored there, or the place
+                cannot be written.
         """
         database = cls(str(url), storage_options)
+        check_restored(database.url, database._storage_options)
         if not exist_ok and Table.exists(database.table_url(MAPS), database._storage_options):
             raise StoreError(f"there is a database at {database.url} already")
         for name in (*CHILD_TABLES, MAPS):
@@ -70,9 +73,10 @@ class Database:
 
         Raises:
             DatabaseNotFoundError: there is none.
-            StoreError: it cannot be read, or has another format.
+            StoreError: it cannot be read, has another format, or is being restored.
         """
         database = cls(str(url), storage_options)
+        check_restored(database.url, database._storage_options)
         database.table(MAPS)
         return database
 

@@ -255,22 +255,25 @@ class Table:
             raise StoreError(f"{self._url}: expected version {expected}, found {found}")
         return expected
 
-    def delete_writes(self, write_ids: Iterable[str]) -> None:
-        """Remove the rows of these write ids in one commit."""
-        self.delete_rows("write_id", write_ids)
-
     def delete_rows(
         self, column: str, values: Iterable[str], metadata: Mapping[str, str] | None = None
     ) -> None:
-        """Remove the rows with these values (ids in hexadecimal) in one commit.
+        """Remove the rows with these values (ids in hexadecimal) in one commit, or none where there are none.
 
         Their bytes stay in files of earlier versions until a vacuum.
         """
-        predicate = _is_in(column, values)
+        wanted = pa.array(values, pa.string())
+        predicate = _is_in(column, wanted.to_pylist())
         properties = CommitProperties(custom_metadata=dict(metadata or {}))
         none = self.spec.schema.empty_table()
+
         # Not deltalake's `delete`: what it keeps has types that Arrow cannot filter, and other encodings.
-        self._maintain(lambda delta: self._write(delta, none, "overwrite", properties, predicate=predicate))
+        def delete(delta: Any) -> None:
+            batches = self.dataset().to_batches(columns=[column], use_threads=False)
+            if any(pc.any(pc.is_in(batch[column], wanted)).as_py() for batch in batches):
+                self._write(delta, none, "overwrite", properties, predicate=predicate)
+
+        self._maintain(delete)
 
     def rewrite(self, rows_of: Callable[["Table"], pa.Table | None]) -> bool:
         """Write rows anew in one commit; `rows_of` gives all rows of some write ids, or None."""

@@ -119,7 +119,7 @@ def _remove_orphans(table: Table, named: set[str], before: datetime, dry_run: bo
     orphans = {write_id: paths for write_id, paths in write_ids_in(table).items() if write_id not in named}
     found = {write_id for write_id, time in write_times(orphans, table.storage).items() if time <= before}
     if found and not dry_run:
-        table.delete_writes(found)
+        table.delete_rows("write_id", found)
     return found
 
 

@@ -17,7 +17,7 @@ from featuredb.geometry.arrays import FloatArray
 from featuredb.store.canaries import list_canaries
 from featuredb.store.candidates.events import has_candidates
 from featuredb.store.candidates.photos import count_candidates
-from featuredb.store.candidates.upkeep import check_canaries, check_candidates, growth_tables, named_writes
+from featuredb.store.candidates.upkeep import check_growth_tables, growth_tables, named_writes
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database
 from featuredb.store.decode import has_place
@@ -129,8 +129,7 @@ def verify(database: Database) -> VerifyReport:
         problems += check_map(snapshot, row)
     for scan in scans:
         problems += check_scan(database, scan)
-    for where, what in (*check_candidates(database), *check_canaries(database)):
-        problems.append(DatabaseProblem(where=where, what=what))
+    problems += [DatabaseProblem(where=where, what=what) for where, what in check_growth_tables(database)]
     orphans = [] if problems else _orphans(database)
     return VerifyReport(
         version=snapshot.version,
@@ -154,8 +153,20 @@ def check_logs(database: Database) -> Iterator[DatabaseProblem]:
             yield DatabaseProblem(where=f"{name}/{LOG}/{problem.name}", what=what)
 
 
-def check_files(table: Table) -> Iterator[DatabaseProblem]:
-    """Does every file open, has it as many rows as the log says, and the bytes that were written?"""
+def check_files(table: Table) -> list[DatabaseProblem]:
+    """Does every file open, has it as many rows as the log says, and the bytes that were written?
+
+    Where there are problems the table moves to its newest version: files that others have replaced meanwhile,
+    and may have deleted, do not count.
+    """
+    found = list(_file_problems(table))
+    if found:
+        table.refresh()
+    live = {f"{table.spec.name}/{file.path}" for file in table.files()} if found else set()
+    return [problem for problem in found if problem.where in live]
+
+
+def _file_problems(table: Table) -> Iterator[DatabaseProblem]:
     expected = {file.path: file.rows for file in table.files()}
     try:
         digests = file_digests(table.storage)
@@ -165,6 +176,8 @@ def check_files(table: Table) -> Iterator[DatabaseProblem]:
         where = f"{table.spec.name}/{fragment.path}"
         try:
             found = fragment.metadata.num_rows
+            digest = digests.get(fragment.path)
+            same = digest is None or digest == _sha256(table.storage, fragment.path)
         except (OSError, pa.ArrowException) as error:
             yield DatabaseProblem(where=where, what=f"cannot be opened: {_one_line(error)}")
             continue
@@ -172,8 +185,7 @@ def check_files(table: Table) -> Iterator[DatabaseProblem]:
             yield DatabaseProblem(
                 where=where, what=f"expected {expected[fragment.path]} rows by the log, found {found}"
             )
-        digest = digests.get(fragment.path)
-        if digest is not None and digest != _sha256(table.storage, fragment.path):
+        if not same:
             yield DatabaseProblem(
                 where=where, what="its bytes are not those that were written: hashes differ"
             )

@@ -4,6 +4,7 @@ import random
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -11,7 +12,9 @@ import pytest
 
 from featuredb.errors import StoreError
 from featuredb.store import Database
+from featuredb.store import verify as verify_module
 from featuredb.store.canaries import add_canary, list_canaries, load_canary_image
+from featuredb.store.candidates import upkeep
 from featuredb.store.candidates.events import append_events
 from featuredb.store.candidates.photos import contribute, list_candidates, withdraw
 from featuredb.store.commits import new_write_id
@@ -121,6 +124,48 @@ def test_a_withdrawal_that_was_interrupted(database: Database, monkeypatch: pyte
     no_grace = VacuumOptions(orphan_grace_h=0)
     assert vacuum(database, no_grace).candidate_images == (other,)
     assert verify(database).ok
+
+
+@pytest.mark.parametrize("between", ["events and images", "files and their footers"])
+def test_a_withdrawal_while_it_is_verified(
+    database: Database, monkeypatch: pytest.MonkeyPatch, between: str
+) -> None:
+    one, _ = contribute(database, [contribution(1), contribution(2)])
+    place = upkeep if between == "events and images" else verify_module
+    name = "_stored_digests" if between == "events and images" else "file_digests"
+    real, calls = getattr(place, name), list[object]()
+
+    def meanwhile(value: Any) -> Any:
+        if not calls and (between == "events and images" or "candidate_images" in value.base_path):
+            calls.append(withdraw(database, [one], "asked"))
+        return real(value)
+
+    monkeypatch.setattr(place, name, meanwhile)
+    assert verify(database).problems == ()
+    assert calls
+
+
+def test_an_image_that_is_lost_is_found_while_others_commit(
+    database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (one,) = contribute(database, [contribution(1)])
+    database.table(CANDIDATE_IMAGES).delete_rows("candidate_id", [one])
+    real, seeds = upkeep._stored_digests, iter(range(2, 9))
+
+    def meanwhile(database: Database) -> Any:
+        contribute(database, [contribution(next(seeds))])
+        return real(database)
+
+    monkeypatch.setattr(upkeep, "_stored_digests", meanwhile)
+    assert f"candidate {one}" in {problem.where for problem in verify(database).problems}
+
+
+def test_removing_what_is_not_there_commits_nothing(database: Database) -> None:
+    (one,) = contribute(database, [contribution(1)])
+    images = database.table(CANDIDATE_IMAGES)
+    for values in (["f" * 32], [one], [one]):
+        images.delete_rows("candidate_id", values)
+    assert database.table(CANDIDATE_IMAGES).version == images.version == 2
 
 
 def test_images_without_an_event_are_orphans(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -164,6 +164,38 @@ def test_a_power_cut_leaves_the_backup_before_or_after(
     assert verify(Database.open(left)).ok
 
 
+@pytest.mark.parametrize("listed", ["in order", "by name"])
+def test_a_restore_that_was_cut_off_is_no_database(
+    target: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, listed: str
+) -> None:
+    """Also of a backup that was made in several runs, whose first files are those of an older state."""
+    database = Database.create(tmp_path / "two.db")
+    database.commit_maps([random_map(1, extent_m=10.0), random_map(2, extent_m=10.0)])
+    backup(database, target)
+    database.retire("map-2", "wrong")
+    copies = backup(database, target)
+    if listed == "by name":
+        place = CopyPlace(target, None)
+        found = place.read_list()
+        assert found is not None
+        place.write_list(replace(found, files=dict(sorted(found.files.items()))))
+    left, take, begun = Database(str(tmp_path / "left.db")), CopyPlace.take, list[str]()
+
+    def cut(self: CopyPlace, path: str, *args: object) -> object:
+        begun.append(path)
+        with pytest.raises(StoreError):  # its tables alone are not one either
+            left.snapshot()
+        for enter in (Database.open, Database.create):
+            with pytest.raises(StoreError, match=r"restore from .* run the same restore again$"):
+                enter(left.url)
+        return take(self, path, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(CopyPlace, "take", cut)
+    restore(target, left)
+    assert len(begun) == copies.files + copies.kept
+    assert [m.map_id for m in Database.open(left.url).snapshot().maps()] == ["map-1"]
+
+
 def test_damage_is_found_while_copying(database: Database, target: str, tmp_path: Path) -> None:
     backup(database, target)
     truth = seen(database)
@@ -181,11 +213,31 @@ def test_damage_is_found_while_copying(database: Database, target: str, tmp_path
     held = next(Path(target, "points").rglob("*.parquet"))
     content = held.read_bytes()
     held.write_bytes(content[:90] + bytes([content[90] ^ 1]) + content[91:])
-    with pytest.raises(StoreError, match=f"{held.name}: its bytes are not those"):
+    with pytest.raises(StoreError, match=f"{held.name}: its bytes are not those .*back up again"):
         restore(target, Database(str(tmp_path / "other.db")))
     held.unlink()
     with pytest.raises(StoreError, match=f"damaged .*{held.name}.*another one"):
         restore(target, Database(str(tmp_path / "another.db")))
+
+
+def test_the_next_backup_heals_damaged_files(database: Database, target: str, tmp_path: Path) -> None:
+    backup(database, target)
+    entry = Path(target, "maps", "_delta_log", f"{1:020d}.json")
+    for held in (next(Path(target, "points").rglob("*.parquet")), entry):
+        content = held.read_bytes()
+        held.write_bytes(content[:90] + bytes([content[90] ^ 1]) + content[91:])
+        assert backup(database, target).files == 1
+        assert held.read_bytes() == content
+    assert seen(restored(target, tmp_path / "restored.db")) == seen(database)
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"[]"])
+def test_a_damaged_list_is_a_problem_of_the_backup(database: Database, target: str, content: bytes) -> None:
+    backup(database, target)
+    Path(target, LIST).write_bytes(content)
+    (problem,) = verify(Database.open(target)).problems
+    assert problem.where == LIST
+    assert "is damaged" in problem.what
 
 
 def test_what_is_there_is_not_overwritten(database: Database, target: str, tmp_path: Path) -> None:
@@ -230,6 +282,22 @@ def test_two_backups_at_once(database: Database, target: str, monkeypatch: pytes
     with pytest.raises(StoreError, match="at work: let it finish"):
         backup(database, target)
     assert verify(Database.open(target)).ok
+
+
+def test_two_backups_that_write_one_file(
+    database: Database, target: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The other has shown what this one was writing: no file of the database is lost."""
+    real = CopyPlace._show
+
+    def show(self: CopyPlace, path: str) -> None:
+        real(self, path)
+        if path.endswith(".parquet"):
+            real(self, path)
+
+    monkeypatch.setattr(CopyPlace, "_show", show)
+    with pytest.raises(StoreError, match=r"another copy to .* is at work: let it finish"):
+        backup(database, target)
 
 
 def test_the_commands(

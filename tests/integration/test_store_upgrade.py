@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 from deltalake import DeltaTable
@@ -13,6 +14,7 @@ from featuredb.store.canaries import list_canaries, load_canary_image
 from featuredb.store.candidates.photos import list_candidates, load_images
 from featuredb.store.delta import Table
 from featuredb.store.durable import making
+from featuredb.store.durable import upgrade as upgrade_module
 from featuredb.store.durable.log import acknowledged
 from featuredb.store.durable.making import is_of_an_older_release
 from featuredb.store.durable.upgrade import upgrade
@@ -82,6 +84,34 @@ def test_what_an_older_release_made_unreadable_comes_back(tmp_path: Path) -> Non
     assert dict(load_images(old, [waiting.candidate_id])) == {waiting.candidate_id: contribution(1).image}
     images = {c.name: load_canary_image(old, c) for c in list_canaries(old)}
     assert images == {"gate": contribution(7).image, "sea": contribution(8).image}
+
+
+@pytest.mark.parametrize(("commit_bytes", "commits"), [(2**30, 1), (1, 6)])
+def test_old_files_are_written_anew_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, commit_bytes: int, commits: int
+) -> None:
+    database = Database.create(tmp_path / "many.db")
+    for seed in range(6):
+        database.commit_map(random_map(seed, extent_m=10.0))
+    for row in database.snapshot().rows():  # leaves types that are not written any more, in a file each
+        one = f"write_id = '{row['write_id']}' AND point_index = 0"
+        DeltaTable(f"{database.url}/points").delete(one)
+    number = len(old_files(database))
+    assert number == 6
+    looked, before = list[str](), database.table("points").version
+
+    def look(fragment: Any) -> bool:
+        looked.append(fragment.path)
+        return is_of_an_older_release(fragment)
+
+    monkeypatch.setattr(upgrade_module, "is_of_an_older_release", look)
+    monkeypatch.setattr(upgrade_module, "_COMMIT_BYTES", commit_bytes)
+    rows = database.table("points").dataset().count_rows()
+    assert upgrade(database) == [f"points: {number} files of an older release written anew"]
+    assert len(looked) == len(set(looked))
+    assert database.table("points").version == before + commits
+    assert old_files(database) == []
+    assert database.table("points").dataset().count_rows() == rows
 
 
 def test_an_upgrade_that_was_cut_off_goes_on(

@@ -11,6 +11,9 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 
 from featuredb.store import Database
+from featuredb.store.durable import local
+from featuredb.store.durable import log as log_module
+from featuredb.store.durable.log import log_problems
 from featuredb.store.verify import verify
 from tests.support.maps import random_map
 
@@ -147,3 +150,23 @@ def test_rows_of_an_unknown_write_are_orphans_and_no_damage(database: Database) 
     assert report.orphans == ("0" * 32,)
     points = database.snapshot().dataset("points").to_table(["write_id"])
     assert pc.count_distinct(points["write_id"]).as_py() == 1
+
+
+def test_each_log_entry_is_read_once(database: Database, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "CHECKPOINT_INTERVAL", 2)
+    for _ in range(6):
+        database.table("maps").compact()
+        database.retire("map-1", "wrong")
+        database.rollback(1)
+    files = database.table("maps").storage
+    log = Path(database.url, "maps", "_delta_log")
+    assert len(list(log.glob("*.checkpoint.parquet"))) > 3
+    read, real = list[str](), log_module._read
+    monkeypatch.setattr(log_module, "_read", lambda files, path: read.append(path) or real(files, path))
+    assert list(log_problems(files)) == []
+    assert sorted(Path(path).name for path in read) == sorted(
+        path.name for path in log.iterdir() if path.suffix != ".parquet"
+    )
+    read.clear()
+    assert log_module.whole_entry(files, 3)[0] == (log / log_module.entry_name(3)).read_bytes()
+    assert len(read) == 1

@@ -54,8 +54,27 @@ def superfluous_images(
     return (found & {row["candidate_id"] for row in stored}) - fresh
 
 
-def check_candidates(database: Database) -> Iterator[tuple[str, str]]:
-    """What is wrong with contributed photos: where, and what. Reads every image once."""
+def check_growth_tables(database: Database) -> list[tuple[str, str]]:
+    """What is wrong with contributed photos and known queries: where, and what. Reads every image.
+
+    Where others commit meanwhile, as a withdrawal does, it looks again for what it has found.
+    """
+
+    def look() -> tuple[list[int], list[tuple[str, str]]]:
+        versions = [database.table(name).version for name in growth_tables(database)]
+        return versions, [*_check_candidates(database), *_check_canaries(database)]
+
+    versions, found = look()
+    while found and versions != [database.table(name).version for name in growth_tables(database)]:
+        versions, again = look()
+        lasting = [problem for problem in found if problem in again]
+        if lasting == found:
+            break
+        found = lasting
+    return found
+
+
+def _check_candidates(database: Database) -> Iterator[tuple[str, str]]:
     if not has_candidates(database):
         return
     try:
@@ -86,8 +105,7 @@ def check_candidates(database: Database) -> Iterator[tuple[str, str]]:
             yield where, "its image is not the one that was contributed: hashes differ"
 
 
-def check_canaries(database: Database) -> Iterator[tuple[str, str]]:
-    """What is wrong with known queries: where, and what. Reads every image once."""
+def _check_canaries(database: Database) -> Iterator[tuple[str, str]]:
     try:
         canaries = list_canaries(database)
     except FeatureDbError as error:

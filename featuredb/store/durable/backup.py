@@ -21,8 +21,17 @@ from featuredb.errors import StoreError
 from featuredb.store.commits import oldest_kept_version
 from featuredb.store.database import Database, normal_url
 from featuredb.store.delta import Table
-from featuredb.store.durable.copies import LIST, PART, CopiedFile, CopyList, CopyPlace, superfluous
-from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_bytes, entry_name, read_actions
+from featuredb.store.durable.copies import (
+    LIST,
+    PART,
+    CopiedFile,
+    CopyList,
+    CopyPlace,
+    DamagedFileError,
+    others_at_work,
+    superfluous,
+)
+from featuredb.store.durable.log import DIGEST, LOG, acknowledge, entry_name, whole_entry
 from featuredb.store.retry import StaleVersionError, retry_stale
 from featuredb.store.tables import (
     CANARIES,
@@ -107,8 +116,11 @@ def restore(source: str, target: Database, storage_options: Mapping[str, str] | 
         wanted = {path: file.sha256 for path, file in found.files.items()}
         try:
             report = _copy(wanted, backup_place, place, begun)
-        except FileNotFoundError as error:
-            raise StoreError(f"the backup at {url} is damaged ({error}): use another one") from error
+        except (FileNotFoundError, DamagedFileError) as error:
+            raise StoreError(
+                f"the backup at {url} is damaged ({error}): delete the named file and back up again, or use "
+                "another one"
+            ) from error
         place.remove([LIST])
     return report
 
@@ -126,6 +138,8 @@ def _back_up(database: Database, source: CopyPlace, place: CopyPlace, before: Co
                 f"a file of the database is lost ({error}); `featuredb verify {database.url}` says which"
             ) from error
         raise StaleVersionError(f"a vacuum has removed files of {database.url}") from error
+    except DamagedFileError as error:
+        raise StoreError(f"{error}; `featuredb verify {database.url}` says what is damaged") from error
 
 
 def _consistent(database: Database) -> Iterator[Table]:
@@ -145,23 +159,18 @@ def _consistent(database: Database) -> Iterator[Table]:
 
 
 def _files_of(table: Table) -> dict[str, str | None]:
-    """The files of a table at its version, relative to it, with the SHA-256 of those whose log has it.
-
-    The log comes last and backwards: before its first entry there is no table.
-    """
+    """The files of a table at its version, relative to it, with the SHA-256 of those whose log has it."""
     kept_from = oldest_kept_version(table.commits()) if table.spec.name == MAPS else table.version
     files: dict[str, str | None] = {}
-    log: dict[str, str | None] = {}
     for version in range(table.version + 1):
-        content = entry_bytes(table.storage, version)
-        actions = read_actions(content)
+        content, actions = whole_entry(table.storage, version)
         if version <= kept_from:
             for path in (unquote(a["remove"]["path"]) for a in actions if "remove" in a):
                 files.pop(path, None)
         for add in (a["add"] for a in actions if "add" in a):
             files[unquote(add["path"])] = (add.get("tags") or {}).get(DIGEST)
-        log[f"{LOG}/{entry_name(version)}"] = hashlib.sha256(content).hexdigest()
-    return files | dict(reversed(log.items()))
+        files[f"{LOG}/{entry_name(version)}"] = hashlib.sha256(content).hexdigest()
+    return files
 
 
 def _list_of(place: CopyPlace, purpose: str, source: str) -> CopyList:
@@ -189,21 +198,23 @@ def _copy(
     """Make a place hold these files and no others; what it held stays whole until they are there.
 
     Args:
-        wanted: the SHA-256 of each file, where it is known, by path, in the order to copy them.
+        wanted: the SHA-256 of each file, where it is known, by path.
         before: what the place holds.
     """
     sizes = place.sizes()
     kept = {path: file for path in wanted if (file := _there(path, wanted[path], place, sizes, before))}
-    _check_same_history(kept, place, sizes)
+    same = {path for path, file in before.files.items() if file.sha256 == wanted.get(path)}
+    _check_same_history(same.union(kept), place, sizes)
     mine = replace(before, source=source.url, began=datetime.now(UTC), attempt=uuid.uuid4().hex, whole=False)
     place.write_list(mine)
-    copied = {path: place.take(path, source, wanted[path]) for path in wanted if path not in kept}
+    order = sorted(wanted, key=_turn)
+    copied = {path: place.take(path, source, wanted[path]) for path in order if path not in kept}
     place.flush_folders(wanted)
     now = place.read_list()
     if now is None or now.attempt != mine.attempt:
-        raise StoreError(f"another copy to {place.url} is at work: let it finish, and run this again")
+        raise others_at_work(place.url)
     version = _acknowledge(place, wanted)
-    done = replace(mine, files=kept | copied)
+    done = replace(mine, files={path: (kept | copied)[path] for path in order})
     place.write_list(done)
     removed = superfluous(place.sizes(), done.files)
     place.remove(removed)
@@ -217,28 +228,46 @@ def _copy(
     )
 
 
+def _turn(path: str) -> tuple[bool, bool, int, str]:
+    """When a file is copied: data before logs, `maps` last.
+
+    A log is copied backwards: before its first entry there is no table.
+    """
+    table, *_, name = path.split("/")
+    log = f"/{LOG}/" in path
+    return table == MAPS, log, -int(Path(name).stem) if log else 0, path
+
+
 def _there(
     path: str, expected: str | None, place: CopyPlace, sizes: Mapping[str, int], before: CopyList
 ) -> CopiedFile | None:
-    """A file that need not be copied, since it is at the place with the right bytes."""
+    """A file that need not be copied, since it is at the place with the right bytes.
+
+    In an object store, where reading costs as much as copying, one of the right size is taken for whole.
+    """
     known = before.files.get(path)
     if path not in sizes:
         return None
-    if known is None or known.size_bytes != sizes[path]:
+    if expected is None and known is not None:
+        expected = known.sha256
+    if place.local or known is None or known.size_bytes != sizes[path]:
         if expected is None:
             return None
         known = CopiedFile(size_bytes=sizes[path], sha256=place.sha256(path))
-    return known if expected in (None, known.sha256) else None
+    return known if expected == known.sha256 else None
 
 
-def _check_same_history(kept: Collection[str], place: CopyPlace, sizes: Iterable[str]) -> None:
+def _check_same_history(same: Collection[str], place: CopyPlace, sizes: Iterable[str]) -> None:
     """Refuse to overwrite commits that the source does not have.
+
+    Args:
+        same: files that are the source's, or were when they were copied.
 
     Raises:
         StoreError: the place has a log entry that is not the source's.
     """
     for path in sorted(sizes):
-        if f"/{LOG}/" in path and path.endswith(".json") and path not in kept:
+        if f"/{LOG}/" in path and path.endswith(".json") and path not in same:
             raise StoreError(
                 f"{place.url}/{path} is not what the source has there: it is damaged, or of another "
                 "database or a later state; choose another folder or URL"

@@ -27,6 +27,10 @@ _FORMAT = 1
 _BLOCK_BYTES = 2**20
 
 
+class DamagedFileError(StoreError):
+    """A file that shall be copied has not the bytes that were written."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CopiedFile:
     """Bytes of a file: how many, and their SHA-256 in hex digits."""
@@ -61,7 +65,8 @@ class CopyPlace:
 
     def __init__(self, url: str, storage_options: dict[str, str] | None) -> None:
         self.url = url
-        self._root = None if "://" in url else Path(url)
+        self.local = "://" not in url
+        self._root = Path(url) if self.local else None
         self.files = table_files(url, storage_options)
 
     def sizes(self) -> dict[str, int]:
@@ -84,7 +89,8 @@ class CopyPlace:
 
         Raises:
             FileNotFoundError: it is not there.
-            StoreError: its bytes are others; nothing of them stays.
+            DamagedFileError: its bytes are others; nothing of them stays.
+            StoreError: another copy to this place is at work.
         """
         digest, size = hashlib.sha256(), 0
         try:
@@ -94,10 +100,7 @@ class CopyPlace:
                     size += len(block)
                     out.write(block)
             if expected is not None and digest.hexdigest() != expected:
-                raise StoreError(
-                    f"{source.url}/{path}: its bytes are not those that were written; `featuredb verify "
-                    f"{source.url}` says what is damaged"
-                )
+                raise DamagedFileError(f"{source.url}/{path}: its bytes are not those that were written")
         except BaseException:
             with suppress(FileNotFoundError):
                 self.files.delete_file(path if self._root is None else path + PART)
@@ -165,16 +168,44 @@ class CopyPlace:
     def _show(self, path: str) -> None:
         if self._root is not None:
             part = self._root / (path + PART)
-            flush(part)
-            part.replace(self._root / path)
+            try:
+                flush(part)
+                part.replace(self._root / path)
+            except FileNotFoundError as error:
+                raise others_at_work(self.url) from error
 
 
 def cut_off(url: str, storage_options: dict[str, str] | None) -> str | None:
-    """What a copy that is not whole says about itself; None where there is no such thing."""
-    found = CopyPlace(url, storage_options).read_list()
-    if found is None or found.whole:
-        return None
-    return f"a {found.purpose} from {found.source} to here was cut off, or is at work: run it again"
+    """What is wrong with the list of a copy, or why that copy is not whole; None where neither is so."""
+    try:
+        found = CopyPlace(url, storage_options).read_list()
+    except StoreError as error:
+        return str(error)
+    return None if found is None or found.whole else _unfinished(found)
+
+
+def check_restored(url: str, storage_options: dict[str, str] | None) -> None:
+    """Refuse a place where a restore is not done: what is there may be an older state.
+
+    Raises:
+        StoreError: so it is.
+    """
+    try:
+        found = CopyPlace(url, storage_options).read_list()
+    except (StoreError, OSError):  # whoever opens the tables is told of the store; of the list `verify` tells
+        return
+    if found is not None and found.purpose == "restore" and not found.whole:
+        raise StoreError(f"cannot open {url}: {_unfinished(found)}")
+
+
+def _unfinished(found: CopyList) -> str:
+    what = f"a {found.purpose} from {found.source} to here was cut off, or is at work"
+    return f"{what}: run the same {found.purpose} again"
+
+
+def others_at_work(url: str) -> StoreError:
+    """The error for a place to which two copies are made at once."""
+    return StoreError(f"another copy to {url} is at work: let it finish, and run this again")
 
 
 def superfluous(paths: Iterable[str], files: Mapping[str, CopiedFile]) -> list[str]:

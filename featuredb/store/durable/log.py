@@ -116,27 +116,32 @@ def read_entry(files: fs.FileSystem, version: int) -> list[Action]:
     Raises:
         StoreError: it is missing, empty or torn.
     """
-    return read_actions(entry_bytes(files, version))
+    return whole_entry(files, version)[1]
 
 
-def entry_bytes(files: fs.FileSystem, version: int) -> bytes:
-    """A table's log entry, as it is written.
+def whole_entry(files: fs.FileSystem, version: int) -> tuple[bytes, list[Action]]:
+    """A table's log entry as it is written, and its actions.
 
     Raises:
         StoreError: it is missing, empty or torn.
     """
-    problem = entry_problem(files, version)
-    if problem is not None:
-        raise StoreError(f"log entry {entry_name(version)}: {problem}; run `featuredb verify`")
-    return _read(files, f"{LOG}/{entry_name(version)}")
-
-
-def entry_problem(files: fs.FileSystem, version: int) -> str | None:
-    """What is wrong with a log entry, or None."""
     try:
-        read_actions(_read(files, f"{LOG}/{entry_name(version)}"))
+        return _entry(files, version)
+    except ValueError as error:
+        raise StoreError(f"log entry {entry_name(version)}: {error}; run `featuredb verify`") from error
+
+
+def _entry(files: fs.FileSystem, version: int) -> tuple[bytes, list[Action]]:
+    try:
+        content = _read(files, f"{LOG}/{entry_name(version)}")
     except FileNotFoundError:
-        return "it is missing"
+        raise ValueError("it is missing") from None
+    return content, read_actions(content)
+
+
+def _entry_problem(files: fs.FileSystem, version: int) -> str | None:
+    try:
+        _entry(files, version)
     except ValueError as error:
         return str(error)
     return None
@@ -198,9 +203,9 @@ def check_end(url: str, files: fs.FileSystem, version: int) -> None:
     if "://" in url:
         return
     head = acknowledged(files)
-    if head is not None and head > version and (problem := entry_problem(files, head)) is not None:
+    if head is not None and head > version and (problem := _entry_problem(files, head)) is not None:
         raise damaged(url, LogProblem(entry_name(head), f"{problem}, though it was acknowledged", head))
-    if (problem := entry_problem(files, version)) is not None:
+    if (problem := _entry_problem(files, version)) is not None:
         raise damaged(url, LogProblem(entry_name(version), problem, version))
 
 
@@ -212,60 +217,80 @@ def damaged(url: str, problem: LogProblem) -> StoreError:
 
 
 def log_problems(files: fs.FileSystem) -> Iterator[LogProblem]:
-    """What is wrong with a table's log; reads every entry."""
-    head, versions = acknowledged(files), list(list_entries(files))
-    newest = max(versions, default=-1)
+    """What is wrong with a table's log; reads every entry once."""
+    # What was written last is read first: others may commit meanwhile.
+    pointer, checkpoints = _pointer(files), _checkpoints(files)
+    head, newest = acknowledged(files), max(list_entries(files), default=-1)
+    columns: Action = {}
+    live: dict[str, Action] = {}
+    whole, of_checkpoints = True, list[LogProblem]()
     for version in range(max(newest, -1 if head is None else head) + 1):
-        problem = entry_problem(files, version)
-        if problem is not None:
+        try:
+            actions = _entry(files, version)[1]
+        except ValueError as error:
+            whole = False
             late = (
                 f", though version {head} was acknowledged" if head is not None and version > newest else ""
             )
-            yield LogProblem(entry_name(version), problem + late, version)
-    yield from _checkpoint_problems(files, newest)
+            yield LogProblem(entry_name(version), f"{error}{late}", version)
+        else:
+            columns = next((a["metaData"] for a in actions if "metaData" in a), columns)
+            for path in (a["remove"]["path"] for a in actions if "remove" in a):
+                live.pop(path, None)
+            live |= {a["add"]["path"]: a["add"] for a in actions if "add" in a}
+        for name in checkpoints.get(version, ()) if version <= newest else ():
+            what = _checkpoint_problem(files, name, columns, live.values(), whole=whole)
+            of_checkpoints += [LogProblem(name, what)] if what else []
+    yield from of_checkpoints
+    for version, names in checkpoints.items():
+        if version > newest:
+            yield from (LogProblem(n, f"it is of version {version}, which has no entry") for n in names)
+    if pointer is None:
+        return
+    if (named := named_checkpoint(pointer)) is None:
+        yield LogProblem(LAST_CHECKPOINT, "it is empty or torn")
+    elif named > newest or named not in checkpoints:
+        yield LogProblem(LAST_CHECKPOINT, f"it names checkpoint {named}, which is not there")
 
 
-def _checkpoint_problems(files: fs.FileSystem, newest: int) -> Iterator[LogProblem]:
-    """Checkpoints repeat what the entries say; one that is broken hinders readers all the same."""
-    checkpoints = [version for version, _ in _numbered(files, LOG, _CHECKPOINT)]
+def _pointer(files: fs.FileSystem) -> bytes | None:
+    try:
+        return _read(files, f"{LOG}/{LAST_CHECKPOINT}")
+    except FileNotFoundError:
+        return None
+
+
+def _checkpoints(files: fs.FileSystem) -> dict[int, list[str]]:
+    """Names of the files of checkpoints, by version."""
+    found: dict[int, list[str]] = {}
     for info in files.get_file_info(fs.FileSelector(LOG, allow_not_found=True)):
-        if info.base_name == LAST_CHECKPOINT:
-            named = named_checkpoint(_read(files, info.path))
-            if named is None:
-                yield LogProblem(info.base_name, "it is empty or torn")
-            elif named not in checkpoints or named > newest:
-                yield LogProblem(info.base_name, f"it names checkpoint {named}, which is not there")
-        elif (match := _CHECKPOINT.fullmatch(info.base_name)) is not None:
-            if int(match[1]) > newest:
-                yield LogProblem(info.base_name, f"it is of version {int(match[1])}, which has no entry")
-                continue
-            try:
-                same = _says(pq.read_table(info.path, filesystem=files)) == _replayed(files, int(match[1]))
-            except StoreError:  # said of the entry
-                continue
-            except (OSError, pa.ArrowException, KeyError, ValueError, TypeError) as error:
-                yield LogProblem(info.base_name, f"it cannot be read: {' '.join(str(error).split())[:200]}")
-            else:
-                if not same:
-                    yield LogProblem(info.base_name, "it says something else than the entries")
+        if match := _CHECKPOINT.fullmatch(info.base_name):
+            found.setdefault(int(match[1]), []).append(info.base_name)
+    return found
+
+
+def _checkpoint_problem(
+    files: fs.FileSystem, name: str, columns: Action, adds: Iterable[Action], *, whole: bool
+) -> str | None:
+    """What is wrong with a checkpoint: it repeats what the entries say, and a broken one hinders readers.
+
+    Args:
+        columns, adds: what the entries say.
+        whole: False where entries are damaged: then the checkpoint need only be one that can be read.
+    """
+    try:
+        said = _says(pq.read_table(f"{LOG}/{name}", filesystem=files))
+        return (
+            None if not whole or said == _state(columns, adds) else "it says something else than the entries"
+        )
+    except (OSError, pa.ArrowException, KeyError, ValueError, TypeError) as error:
+        return f"it cannot be read: {' '.join(str(error).split())[:200]}"
 
 
 def _says(checkpoint: pa.Table) -> dict[str, Any]:
     """What a checkpoint says of columns, and of each live file."""
     (columns,) = filter(None, checkpoint["metaData"].to_pylist())
     return _state(columns, filter(None, checkpoint["add"].to_pylist()))
-
-
-def _replayed(files: fs.FileSystem, version: int) -> dict[str, Any]:
-    """The same by the entries up to a version."""
-    columns: Action = {}
-    live: dict[str, Action] = {}
-    for actions in (read_entry(files, v) for v in range(version + 1)):
-        columns = next((a["metaData"] for a in actions if "metaData" in a), columns)
-        for path in (a["remove"]["path"] for a in actions if "remove" in a):
-            live.pop(path, None)
-        live |= {a["add"]["path"]: a["add"] for a in actions if "add" in a}
-    return _state(columns, live.values())
 
 
 def _state(columns: Action, adds: Iterable[Action]) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """A database of an older release made one of today's. Each step is one commit; what was cut off goes on."""
 
+from collections.abc import Collection
+
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -11,6 +13,8 @@ from featuredb.store.durable.making import is_of_an_older_release
 from featuredb.store.encode import map_rows_table
 from featuredb.store.retry import retry_stale
 from featuredb.store.tables import FORMAT_VERSION, MAPS, SPECS
+
+_COMMIT_BYTES = 256 * 2**20  # of old files whose rows one commit writes anew: they are in memory at once
 
 
 def upgrade(database: Database) -> list[str]:
@@ -42,9 +46,7 @@ def _upgrade_table(database: Database, name: str) -> list[str]:
         )
         retry_stale(f"upgrade of {name}", lambda: _to_newest_format(database.table(name)))
     if name != MAPS:  # whose rows are never removed
-        rewritten = 0
-        while database.table(name).rewrite(_old_rows):
-            rewritten += 1
+        rewritten = _rewrite_old_files(database, name)
         if rewritten:
             steps.append(f"{name}: {rewritten} files of an older release written anew")
     if record is None:
@@ -61,17 +63,30 @@ def _to_newest_format(table: Table) -> None:
         table.upgrade()
 
 
-def _old_rows(table: Table) -> pa.Table | None:
-    """All rows of the writes that the first file of an older release has rows of, or None."""
-    schema = table.dataset().schema
+def _rewrite_old_files(database: Database, name: str) -> int:
+    """Write the files of older releases anew; returns how many there were."""
+    fragments = database.table(name).dataset().get_fragments()
+    old = {fragment.path for fragment in fragments if is_of_an_older_release(fragment)}
+    while database.table(name).rewrite(lambda table: _some_rows(table, old)):
+        pass
+    return len(old)
+
+
+def _some_rows(table: Table, old: Collection[str]) -> pa.Table | None:
+    """All rows of the writes in the first of these files, as many as one commit takes, or None."""
+    schema, files = table.dataset().schema, table.files()
     fragments = {fragment.path: fragment for fragment in table.dataset().get_fragments()}
-    old = next((f for f in fragments.values() if is_of_an_older_release(f)), None)
-    if old is None:
+    taken, size_bytes = list[pa.ChunkedArray](), 0
+    for file in files:
+        if file.path in old and (not taken or size_bytes + file.size_bytes <= _COMMIT_BYTES):
+            taken.append(fragments[file.path].to_table(schema, ["write_id"])["write_id"])
+            size_bytes += file.size_bytes
+    if not taken:
         return None
-    ids = pc.unique(old.to_table(schema, ["write_id"])["write_id"])
+    ids = pc.unique(pa.chunked_array([chunk for ids in taken for chunk in ids.chunks]))
     return pa.concat_tables(
         rows.filter(pc.is_in(rows["write_id"], ids))
-        for file in table.files()
+        for file in files
         if any((file.min_write_id or i) <= i <= (file.max_write_id or i) for i in ids.to_pylist())
         for rows in [fragments[file.path].to_table(schema)]
     )
