@@ -30,7 +30,7 @@ from ingest.growth.place.component import grow_component
 from ingest.growth.place.localised import QUERY, localise_photos
 from ingest.growth.run_record import GrowthOptions, grown_entry
 from ingest.growth.trust.examined import recall, remember
-from ingest.growth.trust.scan_check import checked_by_scan
+from ingest.growth.trust.scan_check import NOT_ASKED, checked_by_scan
 from ingest.growth.values import LEAST_PHOTOS, GrownMap, Refused
 from ingest.map_builder import MapIdentity
 from ingest.photos.photo import Photo
@@ -77,7 +77,7 @@ def place_unplaced_maps(
                 placed.append(done)
                 continue
             refused = done
-            if refused.reason != "CONFLICT":
+            if refused.reason not in ("CONFLICT", NOT_ASKED):
                 remember(work, summary.map_id, asked, refused.reason, refused.message, refused.gates)
         unplaced.append(_unplaced_entry(summary, refused))
     return Placed(placed=tuple(placed), unplaced=tuple(unplaced), notes=tuple(dict.fromkeys(notes)))

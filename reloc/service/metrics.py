@@ -66,11 +66,12 @@ class ServerMetrics:
 
 
 @contextmanager
-def metrics_page(port: int, status: Callable[[], StatusReply]) -> Iterator[int]:
+def metrics_page(port: int, status: Callable[[], StatusReply | None]) -> Iterator[int]:
     """Within the block `http://127.0.0.1:PORT/metrics` says what the server's status does; the port.
 
     Args:
         port: 0 takes a free one.
+        status: None while the server does not answer yet.
 
     Raises:
         ServiceStartError: the port is taken.
@@ -93,7 +94,7 @@ def metrics_page(port: int, status: Callable[[], StatusReply]) -> Iterator[int]:
 
 
 class _Status(Collector):
-    def __init__(self, status: Callable[[], StatusReply]) -> None:
+    def __init__(self, status: Callable[[], StatusReply | None]) -> None:
         self._status = status
 
     def collect(self) -> Iterator[Metric]:

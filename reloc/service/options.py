@@ -94,6 +94,10 @@ class ServeOptions:
         ):
             if not value > 0:
                 raise InvalidValueError(f"ServeOptions.{name}: expected > 0, found {value}")
+        if self.metrics_port is not None and not 0 <= self.metrics_port < 65_536:
+            raise InvalidValueError(
+                f"ServeOptions.metrics_port: expected 0..65535, found {self.metrics_port}"
+            )
         if not self.listen and self.config_path is None:
             raise InvalidValueError("ServeOptions: expected endpoints to listen on, or a Zenoh configuration")
         if self.name:

@@ -13,6 +13,7 @@ from reloc.service.database_source import DatabaseSource
 from reloc.service.metrics import metrics_page
 from reloc.service.options import ServeOptions, wire_name_of
 from reloc.service.server import Server
+from reloc.wire.server import StatusReply
 
 _TURN_S = 1.0  # of waiting for a signal
 
@@ -45,14 +46,17 @@ def serve(
         As `start_server`.
     """
     stop = threading.Event()
-    with (
-        on_stop_signals(stop.set),
-        start_server(database, options, localise_options) as server,
-        ExitStack() as stack,
-    ):
+    started: list[Server] = []
+
+    def status() -> StatusReply | None:
+        return started[0].status() if started else None
+
+    with on_stop_signals(stop.set), ExitStack() as stack:
         if options is not None and options.metrics_port is not None:
-            stack.enter_context(metrics_page(options.metrics_port, server.status))
-        on_ready(server)
+            # Before the maps are loaded: that takes long, and the port may be taken.
+            stack.enter_context(metrics_page(options.metrics_port, status))
+        started.append(stack.enter_context(start_server(database, options, localise_options)))
+        on_ready(started[0])
         # A signal that a library's thread receives does not end a wait: its handler runs at the next.
         while not stop.wait(_TURN_S):
             pass

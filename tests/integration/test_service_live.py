@@ -466,6 +466,21 @@ def test_a_frame_that_crashes_or_hangs_costs_itself_alone(how: signal.Signals) -
         assert live_status(server).open == 1
 
 
+def test_a_client_that_goes_takes_the_process_of_its_session_with_it() -> None:
+    options = ServeOptions(live=_LIVE, deadline_s=2.5 * SOON_S)
+    with running_server(localiser(), options) as server, client_of(server) as client:
+        with client.track(LENS) as live:
+            exchange(live, range(1))
+            pid = live_worker(server)
+            os.kill(pid, signal.SIGSTOP)  # as a frame that takes as long as it may
+            live.send(jpeg(1), 0.1)
+            wait_until(lambda: live_status(server).frames.received == 2, "the frame")
+        wait_until(lambda: live_status(server).open == 0, "the session's end")
+        assert not Path(f"/proc/{pid}").exists()
+        wait_until(lambda: live_status(server).ended == {"CLIENT_GONE": 1}, "its end's count")
+        assert not live_status(server).frames.refused
+
+
 def test_a_frame_beyond_its_memory_is_refused() -> None:
     options = ServeOptions(live=replace(_LIVE, limits=DecodeLimits()), query_memory_bytes=100 << 20)
     with (

@@ -1,14 +1,22 @@
 """A map is where the scan has the ground, or it is not; the gate of growth that asks."""
 
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.rotation import so3_exp
+from featuredb.geometry.sim3 import Sim3
 from featuredb.render.cloud import PointCloud
 from ingest.growth.gates import Gate
-from ingest.growth.trust.scan_check import cloud_gate
-from tests.support.scanned_map import ground_points, plain_cloud, scan
+from ingest.growth.map_places import growth_of
+from ingest.growth.trust import scan_check
+from ingest.growth.trust.scan_check import checked_by_scan, cloud_gate
+from tests.support.scanned_map import ground_points, plain_cloud, scan, scanned_map
 
 pytest.importorskip("small_gicp")
 
@@ -78,3 +86,23 @@ def test_flat_ground_holds_heights_alone() -> None:
 def test_where_there_is_no_scan_nothing_is_said(cloud: PointCloud) -> None:
     assert cloud_gate(cloud, _ground((500.0, 0.0, 0.0)), _claim(0.05)) is None
     assert cloud_gate(cloud, _ground()[:50], _claim(0.05)) is None
+
+
+def test_without_the_extra_a_map_with_a_scan_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = scanned_map(placed_by=Sim3.identity())
+    known = replace(world.feature_map, height_datum=world.cloud.height_datum)
+    database: Any = None
+    monkeypatch.setattr(scan_check, "has_scans", lambda _: True)
+    monkeypatch.setattr(scan_check, "load_cloud", lambda *_: world.cloud)
+    gate = checked_by_scan(database, known)[1]
+    assert gate is not None
+    assert gate.passes
+    monkeypatch.setitem(sys.modules, "small_gicp", None)
+    checked, gate, why = checked_by_scan(database, known)
+    assert gate is not None
+    assert not gate.passes
+    assert (gate.reason, why) == ("SCAN_NOT_ASKED", "")
+    assert "featuredb[lidar]" in gate.message
+    assert not growth_of(checked.placement.evidence)["gates"]["scan"]["passes"]
+    monkeypatch.setattr(scan_check, "load_cloud", lambda *_: SimpleNamespace(xyz=()))
+    assert checked_by_scan(database, known)[1] is None

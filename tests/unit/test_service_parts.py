@@ -55,6 +55,12 @@ def test_options_must_be_positive(field):
         ServeOptions(**{field: 0})
 
 
+@pytest.mark.parametrize("port", [-1, 70_000])
+def test_a_page_of_figures_needs_a_port(port):
+    with pytest.raises(InvalidValueError, match=r"metrics_port: expected 0\.\.65535"):
+        ServeOptions(metrics_port=port)
+
+
 def test_a_server_must_listen_somewhere():
     with pytest.raises(InvalidValueError, match="listen"):
         ServeOptions(listen=())

@@ -32,6 +32,8 @@ from ingest.register.structure.surface_fit import (
     surface_near,
 )
 
+NOT_ASKED = "SCAN_NOT_ASKED"  # reason of a gate that another installation may pass
+
 _LOG = logging.getLogger(__name__)
 _NARROW, _WIDE_TO_NARROW = 0.0, (2.0, 1.0, 0.5, 0.0)  # metres; 0: `SIGMAS`
 _ROUNDS = 5  # of nearest planes, each cut
@@ -55,7 +57,8 @@ def checked_by_scan(database: Database, feature_map: FeatureMap) -> tuple[Featur
         feature_map: with the covariance of its placement on Earth.
 
     Returns:
-        The third is why a scan that is there could not be compared, "" otherwise.
+        The third is why a scan that is there could not be compared, "" otherwise. Where the extra `lidar` is
+        missing, the gate does not pass: the scan might refuse the map.
 
     Raises:
         StoreError: the scans cannot be read.
@@ -71,7 +74,11 @@ def checked_by_scan(database: Database, feature_map: FeatureMap) -> tuple[Featur
             why = f"its heights are {feature_map.height_datum}, theirs {cloud.height_datum}"
         elif len(cloud.xyz):
             gate = cloud_gate(cloud, points, feature_map.placement.covariance)
-    except (MissingExtraError, ScanError) as error:  # no small_gicp; heights of several datums
+    except MissingExtraError as error:
+        text = f"a scan is there that could not be asked; it waits until it can be ({error})"
+        limit = sigmas_limit(6)
+        gate = Gate(name="scan", reason=NOT_ASKED, figure=np.inf, limit=limit, passes=False, message=text)
+    except ScanError as error:  # heights of several datums
         why = str(error)
     if gate is not None:
         told = {**growth_of(feature_map.placement.evidence).get("gates", {}), gate.name: gate.as_json()}

@@ -29,8 +29,12 @@ class FrameError(RequestError):
         self.sequence = sequence
 
 
+class FollowerStoppedError(Exception):
+    """The follower was told to stop."""
+
+
 class Follower:
-    """Answers the frames of one session, in their order, from one thread. A context manager.
+    """Answers the frames of one session, in their order, from one thread but for `stop`. A context manager.
 
     The track lives in the process. A frame that the process does not survive is refused; with the next one a
     new process begins, in which the track is looked for anew.
@@ -56,14 +60,27 @@ class Follower:
         self._last: TrackFrame | None = None  # whose header was in order
         self._last_time_s: float | None = None  # of the last frame that was tracked
         self._looked_at = 0
+        self._stopped = False
 
     def __enter__(self) -> Self:
-        """Raises WorkerEndedError: no process comes up."""
-        self._ready()
+        """Raises WorkerEndedError: no process comes up; FollowerStoppedError: as told."""
+        try:
+            self._ready()
+        except WorkerEndedError as error:
+            self._close()
+            self._check_not_stopped(error)
+            raise
         return self
 
     def __exit__(self, *failed: object) -> None:
         self._close()
+
+    def stop(self) -> None:
+        """Kill the process, whatever it is at; returns at once."""
+        self._stopped = True
+        process = self._process
+        if process is not None:
+            process.kill()
 
     def answer(self, arrival: Arrival) -> TrackPose:
         """The pose of a frame, or that the track is lost.
@@ -71,6 +88,7 @@ class Follower:
         Raises:
             FrameError: a header that is none or goes back, what `FrameAnswerer.answer` refuses, or a frame
                 that is beyond the limits or ends the process.
+            FollowerStoppedError: as told.
         """
         clock = StageClock(start=arrival.received)
         header = self._header(arrival)
@@ -89,6 +107,7 @@ class Follower:
             raise FrameError(ErrorCode(error.code), error.message, header.sequence) from error
         except (WorkerEndedError, WorkerDefectError) as error:
             self._close()
+            self._check_not_stopped(error)
             logger.exception("a frame failed", extra={"fields": {"event": "frame_failed"}})
             code, why = self._failure(error)
             raise FrameError(code, why, header.sequence) from error
@@ -131,8 +150,14 @@ class Follower:
         if self._process is None or not self._process.is_alive():
             self._close()
             self._process = WorkerProcess(self._limits, self._answerer)
+            if self._stopped:  # while it was started
+                self._process.kill()
         self._process.open(self._files())
         return self._process
+
+    def _check_not_stopped(self, error: Exception) -> None:
+        if self._stopped:
+            raise FollowerStoppedError from error
 
     def _close(self) -> None:
         if self._process is not None:

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 
 from pydantic import BaseModel
 
-from reloc.service.live.follower import Follower, FrameError
+from reloc.service.live.follower import Follower, FollowerStoppedError, FrameError
 from reloc.service.live.latest import Arrival, LatestFrame
 from reloc.service.live.metrics import LiveMetrics
 from reloc.wire.track import EndReason, TrackEvent
@@ -22,6 +22,8 @@ _END_TEXT = {
     EndReason.SHUTTING_DOWN: "the server is stopping; open a session of another one or later",
     EndReason.INTERNAL: "the server failed on this session; its log says why under the session's name",
 }
+# For these nobody waits for the frame in hand, and its process is wanted for somebody else.
+_AT_ONCE = (EndReason.CLIENT_GONE, EndReason.MADE_ROOM)
 
 
 class LiveSession:
@@ -68,10 +70,15 @@ class LiveSession:
         self._metrics.frame_received(dropped=not self._inbox.put(arrival))
 
     def end(self, reason: EndReason) -> None:
-        """Take no more frames; the first reason counts. Returns at once."""
+        """Take no more frames; the first reason counts. Returns at once.
+
+        The frame in hand is answered, but for a client that is gone or has to make room.
+        """
         with self._lock:
             self._reason = self._reason or reason
         self._inbox.close()
+        if reason in _AT_ONCE:
+            self._follower.stop()
 
     @property
     def ending(self) -> bool:
@@ -86,6 +93,8 @@ class LiveSession:
         try:
             with self._follower:
                 self._answer_frames()
+        except FollowerStoppedError:
+            pass
         except Exception:
             logger.exception(
                 "live session failed", extra={"fields": {"event": "internal", "session": self.name}}

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from contextlib import ExitStack
 from datetime import UTC, datetime
 
 import zenoh
@@ -47,7 +48,8 @@ _JSON = zenoh.Encoding.APPLICATION_JSON
 class LiveSessions:
     """Opens and ends sessions; at most `LiveOptions.max_sessions` at a time, shared by who asks.
 
-    Where all are open, the asker who has most gives up his newest for one who has at least two fewer.
+    Where all are open, the asker who has most gives up his newest for one who has at least two fewer. With
+    those that are ending there are at most twice as many.
     """
 
     def __init__(
@@ -159,7 +161,7 @@ class LiveSessions:
         answerer, area = FrameAnswerer(name, request, self._options), self._area()
         asker = client if self._authenticates else session_of(query)
         _check_comparable(area)
-        with self._lock:
+        with ExitStack() as undo, self._lock:
             self._make_room(key, asker)
             session = LiveSession(
                 name,
@@ -175,11 +177,11 @@ class LiveSessions:
                 self._on_frame(session, sample)
 
             # Called by Zenoh's own thread, not by one behind an unbounded queue of samples.
-            self._frames[key] = self._session.declare_subscriber(
-                f"{key}/frames", Callback(take, indirect=False)
-            )
-            self._open[key] = session
+            frames = self._session.declare_subscriber(f"{key}/frames", Callback(take, indirect=False))
+            undo.callback(frames.undeclare)
             session.start()
+            undo.pop_all()
+            self._frames[key], self._open[key] = frames, session
         self._metrics.opened()
         limits = self._options.limits
         return TrackOpened(
@@ -208,16 +210,19 @@ class LiveSessions:
                 ErrorCode.BAD_REQUEST,
                 f"session: {key.rpartition('/')[2]!r} is open; choose another name, at random",
             )
+        # Each has its process until it is forgotten, those that are ending as well.
+        full = len(self._open) >= 2 * self._options.max_sessions
         running = [session for session in self._open.values() if not session.ending]
-        if len(running) < self._options.max_sessions:
+        if not full and len(running) < self._options.max_sessions:
             return
         held = Counter(session.asker for session in running)
-        most = max(held, key=lambda name: held[name])
-        if held[most] <= held[asker] + 1:
+        most = max(held, key=lambda name: held[name], default=asker)
+        own = sum(session.asker == asker for session in self._open.values())
+        if full or held[most] <= own + 1:
             raise RequestError(
                 ErrorCode.BUSY,
-                f"{len(running)} live sessions are open, as many as this server takes; try again later, "
-                "ask another server, or start it with more --live-sessions",
+                f"{len(self._open)} live sessions are open or ending, as many as this server takes; "
+                "try again later, ask another server, or start it with more --live-sessions",
             )
         [session for session in running if session.asker == most][-1].end(EndReason.MADE_ROOM)
 
@@ -240,7 +245,10 @@ class LiveSessions:
         """Nothing is left of the session; called by its thread."""
         with self._lock:
             frames = self._frames.pop(key)
-        frames.undeclare()
+        try:
+            frames.undeclare()
+        except zenoh.ZError:
+            logger.exception("a live session's frames could not be undeclared")
         with self._lock:
             del self._open[key]
 
