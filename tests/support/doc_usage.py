@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 from unittest.mock import patch
 
 from featuredb.cli.main import COMMAND_GROUP, build_parser
-from tests.support.doc_commands import ROOT, Call, Command, call_of
+from tests.support.doc_commands import ROOT, Call, Command, begins_with_program, call_of
 
 # What the documentation writes where the reader has a number of his own.
 _NUMBERS = {"N": "3", "K": "3", "V": "1", "M": "1.5"}
@@ -36,8 +36,9 @@ def check_usage(command: Command) -> None:
     Raises:
         UsageError: what is wrong with it.
     """
-    if not command.in_prose and " | " in command.text:
-        for text in command.text.split(" | "):
+    parts = [] if command.in_prose else command.text.split(" | ")
+    if len(parts) > 1 and all(map(begins_with_program, parts)):
+        for text in parts:
             check_usage(replace(command, text=text))
         return
     call = call_of(command)
