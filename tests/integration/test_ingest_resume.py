@@ -94,6 +94,13 @@ def _kill_when(process: "subprocess.Popen[bytes]", condition: Callable[[], bool]
     return True
 
 
+def _is_there(database: Path, pattern: str) -> bool:
+    try:
+        return any(database.glob(pattern))
+    except FileNotFoundError:  # a scratch folder that went while it was looked into
+        return False
+
+
 def _wait_for_workers(group: int) -> None:
     """The workers of a killed command end by themselves."""
     end = time.monotonic() + 30.0
@@ -128,7 +135,7 @@ def test_killed_at_a_stage(
     if not pattern.startswith("_work/"):
         shutil.copytree(whole / "_work", database / "_work")
     process = _start(database, photos, workers=2 if pattern.startswith("_work/") else 1)
-    killed = _kill_when(process, lambda: any(database.glob(pattern)))
+    killed = _kill_when(process, lambda: _is_there(database, pattern))
     if killed:
         _wait_for_workers(process.pid)
     committed = killed and pattern.startswith("maps/")
