@@ -27,7 +27,7 @@ import requests
 from featuredb.store import Database
 from reloc.service.options import wire_name_of
 from tools.attacks import ATTACKS, Target, attack
-from tools.figures import add_json_option, write_figures
+from tools.figures import write_figures
 from tools.service_world import (
     ATTACKER,
     MemoryWatch,
@@ -37,6 +37,7 @@ from tools.service_world import (
     honest_clients,
     photos_of,
     running_service,
+    study_parser,
 )
 
 _CONTEXT = multiprocessing.get_context("spawn")
@@ -195,15 +196,11 @@ def _say(m: Measured) -> None:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("db", type=Path)
-    parser.add_argument("photos", type=Path, help="folder of the map's photos")
-    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
+    parser = study_parser(__doc__)
     parser.add_argument("--points", type=int, default=200_000)
     parser.add_argument("--seconds", type=float, default=30.0, help="for each attack")
     parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
     parser.add_argument("--attack", action="append", choices=sorted(ATTACKS), help="only this one")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -25,7 +25,7 @@ from featuredb.errors import ServiceError
 from featuredb.store import Database
 from reloc.client import Client
 from reloc.client.replies import NO_SERVER, TIMEOUT
-from tools.figures import add_json_option, write_figures
+from tools.figures import write_figures
 from tools.service_world import (
     ATTACKER,
     MemoryWatch,
@@ -35,6 +35,7 @@ from tools.service_world import (
     moved,
     photos_of,
     running_service,
+    study_parser,
 )
 
 _EVENT_S = 5.0  # between two of what happens beside the queries
@@ -122,13 +123,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("db", type=Path)
-    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser = study_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
     parser.add_argument("--deadline", type=float, default=8.0, metavar="SECONDS", help="the server's")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

@@ -21,9 +21,9 @@ from pathlib import Path
 from featuredb.errors import ServiceError
 from reloc.client import Client
 from reloc.client.replies import TIMEOUT
-from tools.figures import add_json_option, write_figures
+from tools.figures import write_figures
 from tools.serve_process import ServeProcess, children
-from tools.service_world import photos_of
+from tools.service_world import photos_of, study_parser
 
 _CLIENTS = 4
 _STOP_S = 30.0  # ten for queries in hand, ten for live sessions, ten for the inbox
@@ -102,12 +102,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _arguments(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("db", type=Path)
-    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser = study_parser(__doc__)
     parser.add_argument("--stops", type=int, default=200)
-    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
-    add_json_option(parser)
     return parser.parse_args(argv)
 
 

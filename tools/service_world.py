@@ -1,5 +1,6 @@
 """What studies of the service ask: a real map, made larger, a server with keys, and honest clients."""
 
+import argparse
 import io
 import socket
 import threading
@@ -18,10 +19,21 @@ from featuredb.maps.feature_map import FeatureMap
 from featuredb.store import Database
 from reloc.authority.folder import Authority
 from reloc.client import Client, LocaliseReply
+from tools.figures import add_json_option
 from tools.serve_process import CommandProcess, ServeProcess
 
 HONEST, ATTACKER, WEB = ("alice", "bob", "carol"), "mallory", "web"
 _SAME_M = 0.5  # two answers to one photo
+
+
+def study_parser(doc: str | None) -> argparse.ArgumentParser:
+    """What all of these studies are told; `doc`: of the program's module."""
+    parser = argparse.ArgumentParser(description=(doc or "").split("\n")[0])
+    parser.add_argument("db", type=Path)
+    parser.add_argument("photos", type=Path, help="folder of the map's photos")
+    parser.add_argument("--side", type=int, default=1024, metavar="PX", help="longer one of what is sent")
+    add_json_option(parser)
+    return parser
 
 
 def enlarged(database: Database, points: int) -> list[str]:

@@ -31,6 +31,14 @@ from reloc.localiser import Localiser
 from tests.support import planar_map as field
 from tests.support.planar_map import CAMERA, EASTING, EPSG, HEIGHT, NORTHING, field_texture, render, view
 
+UNSURE = LensUncertainty(
+    focal_rel=0.003,
+    aspect=0.001,
+    center_rel=(2e-4, 2e-4),
+    radial=(1e-4, 1e-4),
+    tangential=(1e-5, 1e-5),
+    dilution=50.0,
+)
 KNOWN = LocaliseRequest(camera=CAMERA)
 POSE = view(5.0, -6.0, 40.0, 8.0, 33.0)
 
@@ -108,11 +116,7 @@ def test_a_camera_told_as_exact_is_as_sure_as_the_lenses_of_the_map(
 ) -> None:
     """From above a lens that is 0.3 % off passes for a height that is."""
     truth = view(0, 0, 45, 10, 20)
-    uncertainty = LensUncertainty(
-        focal_rel=0.003, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
-        tangential=(1e-5,) * 2, dilution=50.0,
-    )  # fmt: skip
-    knows = replace(field_map, provenance=field_map.provenance | uncertainty.as_provenance())
+    knows = replace(field_map, provenance=field_map.provenance | UNSURE.as_provenance())
     photo, exact = render(texture, truth, seed=5), replace(KNOWN, camera_is_exact=True)
     plain, told = (localise(photo, exact, [indexed(one)]) for one in (field_map, knows))
     assert plain.pose is not None
@@ -134,11 +138,7 @@ def test_a_camera_told_as_exact_that_made_the_map_goes_with_its_points(
     """A map whose lens is 1 % too long has its ground 1 % too deep, for photos of its camera, too."""
     truth = view(0, 0, 45, 10, 20)
     longer = replace(CAMERA, params=(*(1.01 * f for f in CAMERA.params[:2]), *CAMERA.params[2:]))
-    uncertainty = LensUncertainty(
-        focal_rel=0.005, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
-        tangential=(1e-5,) * 2, dilution=50.0,
-    )  # fmt: skip
-    provenance = field_map.provenance | uncertainty.as_provenance()
+    provenance = field_map.provenance | replace(UNSURE, focal_rel=0.005).as_provenance()
     made = replace(field_map, cameras=(longer,), camera_keys=("DJI",), provenance=provenance)
     photo, exact = render(texture, truth, seed=5), replace(KNOWN, camera_is_exact=True)
     heights = {}
@@ -164,12 +164,8 @@ def test_a_map_lends_a_lens_of_fewer_parameters_than_its_uncertainty(
     field_map: FeatureMap, texture: NDArray[np.uint8]
 ) -> None:
     truth = view(0, 0, 45, 10, 20)
-    uncertainty = LensUncertainty(
-        focal_rel=0.003, aspect=0.001, center_rel=(2e-4,) * 2, radial=(1e-4,) * 2,
-        tangential=(1e-5,) * 2, dilution=50.0,
-    )  # fmt: skip
     assert CAMERA.model == "PINHOLE"
-    provenance = field_map.provenance | uncertainty.as_provenance()
+    provenance = field_map.provenance | UNSURE.as_provenance()
     made = replace(field_map, camera_keys=("DJI",), provenance=provenance)
     asked = replace(KNOWN, camera=None, camera_key="DJI")
     pose = localise(render(texture, truth, seed=5), asked, [indexed(made)]).pose

@@ -5,6 +5,9 @@ from tools.scoreboard.row import Limit, Row
 from tools.scoreboard.simulated_rows import SIMULATED
 from tools.scoreboard.words import BRIGHTON, OUT, same
 
+# A database of `brighton`, which the next command uses.
+_MADE = ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet")
+
 SPEED: tuple[Row, ...] = (
     Row(
         name="query-time",
@@ -12,7 +15,7 @@ SPEED: tuple[Row, ...] = (
         form="quick",
         claim="one 12-megapixel photo of `brighton` with its GPS over Zenoh (medians)",
         commands=(
-            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            _MADE,
             (
                 *("tools.query_benchmark", "{work}/db", f"{BRIGHTON}/DJI_0020.JPG"),
                 *(f"{BRIGHTON}/DJI_0033.JPG", *OUT),
@@ -32,7 +35,7 @@ SPEED: tuple[Row, ...] = (
         claim="a real map of `brighton` with copies of it to 200,000 points, served with keys: honest "
         "clients' answer times and the server's memory under eleven attacks (tools/attacks.py)",
         commands=(
-            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            _MADE,
             ("tools.attacks_benchmark", "{work}/db", BRIGHTON, *OUT),
         ),
         figures=same("points", "asked", "quiet_mib", "after_mib", "worst_http_p99_s", "failures_by_kills"),
@@ -54,7 +57,7 @@ SPEED: tuple[Row, ...] = (
         claim="a server for an hour: queries with and without priors, commits, reloads, killed workers, "
         "broken messages",
         commands=(
-            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            _MADE,
             ("tools.service_soak", "{work}/db", BRIGHTON, "--minutes", "60", *OUT),
         ),
         figures=same("failed", "p99_s", "late_mib", "exit_code"),
@@ -75,7 +78,7 @@ SPEED: tuple[Row, ...] = (
         form="full",
         claim="a server told to stop in the middle of its load, 200 times",
         commands=(
-            ("featuredb.cli", "ingest", "photos", "{work}/db", BRIGHTON, "--quiet"),
+            _MADE,
             ("tools.service_stops", "{work}/db", BRIGHTON, *OUT),
         ),
         figures=same("stops", "slowest_s"),
