@@ -63,10 +63,6 @@ FORMATS: dict[str, Format] = {
         text="a folder for each map as OpenSfM and OpenDroneMap have it",
         write="formats.opensfm:write_opensfm",
     ),
-    "kapture": Format(
-        text="a folder for each map, placed or not, as kapture 1.1 has it",
-        write="formats.kapture:write_kapture",
-    ),
     "exif": Format(
         text="copies of the photos with their pose in EXIF and XMP",
         write="formats.exif:write_exif",

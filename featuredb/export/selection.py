@@ -72,7 +72,7 @@ def selected_maps(database: Database, snapshot: Snapshot, selection: Selection) 
     return placed
 
 
-KEEP_UNPLACED = ("colmap", "kapture", "ply")  # formats that have a frame of their own
+KEEP_UNPLACED = ("colmap", "ply")  # formats that have a frame of their own
 
 
 def selected_any(

@@ -20,8 +20,7 @@ import pytest
 from pyproj import Transformer
 
 from featuredb.errors import ExportError
-from featuredb.export.formats.colmap import write_colmap
-from featuredb.export.formats.colmap_model import keypoint_rows
+from featuredb.export.formats.colmap import keypoint_rows, write_colmap
 from featuredb.export.job import ExportJob
 from featuredb.export.selection import Selection
 from featuredb.features.extractor import extract

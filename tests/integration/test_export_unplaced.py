@@ -25,18 +25,15 @@ def _export(url: str, out: Path, kind: str, *more: str) -> int:
     return main(["export", url, str(out), "--format", kind, *more])
 
 
-def test_colmap_and_kapture_have_the_own_frame(url: str, tmp_path: Path) -> None:
+def test_colmap_has_the_own_frame(url: str, tmp_path: Path) -> None:
     unplaced = Database.open(url).snapshot().load_unplaced("map-1")
-    assert _export(url, tmp_path / "colmap", "colmap", "--maps", "map-1") == 0
+    assert _export(url, tmp_path / "colmap", "colmap", "--status", "unplaced") == 0
     model = pycolmap.Reconstruction(str(tmp_path / "colmap" / "map-1" / "sparse"))
     assert np.allclose([model.points3D[k + 1].xyz for k in range(60)], unplaced.points.xyz)
     told = json.loads((tmp_path / "colmap" / "map-1" / "georeference.json").read_text())
     assert (told["placement"], told["frame"]["origin"], told["frame"]["upright"]) == (None, None, True)
     assert told["no_place"]["ways"] == ["place it by picks"]
     assert "utm" not in told
-    assert _export(url, tmp_path / "kapture", "kapture", "--status", "unplaced") == 0
-    rows = (tmp_path / "kapture" / "map-1" / "reconstruction" / "points3d.txt").read_text().splitlines()[2:]
-    assert np.allclose([[float(v) for v in r.split(",")[:3]] for r in rows], unplaced.points.xyz)
 
 
 def test_ply_keeps_them_apart_from_places_on_earth(url: str, tmp_path: Path) -> None:
@@ -59,7 +56,7 @@ def test_formats_that_need_a_place_say_so(
     error = capsys.readouterr().err
     assert "map-1 has no place" in error
     assert "place it by picks" in error
-    assert "colmap, kapture, ply" in error
+    assert "colmap, ply" in error
     assert not (tmp_path / "out").exists()
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from featuredb.errors import ExportError, FeatureDbError, ImageError
 from featuredb.export.attribution import Attribution, attribution_of, folder_name, write_attribution
-from featuredb.export.formats.colmap_model import image_names
+from featuredb.export.formats.colmap import image_names
 from featuredb.export.job import Exported, ExportJob, whole_or_nothing, write_csv
 from featuredb.export.shots import PosedPhoto, altitude_of, shots_of
 from featuredb.export.tally import ExportTally

@@ -12,7 +12,7 @@ from typing import IO, Any
 import numpy as np
 
 from featuredb.export.attribution import attribution_of, write_attribution
-from featuredb.export.formats.colmap_model import image_names
+from featuredb.export.formats.colmap import image_names
 from featuredb.export.formats.opensfm_camera import opensfm_camera
 from featuredb.export.georeference import GEOREFERENCE, georeference_text
 from featuredb.export.job import Exported, ExportJob, write_json
