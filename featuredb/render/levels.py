@@ -1,7 +1,5 @@
 """Orders the points of a scan into levels of detail and nodes that are drawn together."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,21 +13,12 @@ from featuredb.render.compiled import compiled_module
 _NEIGHBOURS = 8
 _CODE_BITS = 21  # per axis in a 63-bit code
 _PROBE_POINTS = 16.0  # points per probing cell: enough that its spacing is known to an eighth or so
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DetailLevelOptions:
-    """How points are ordered.
-
-    Attributes:
-        coarsest_points: levels are added until the coarsest has at most this many points.
-        node_bits: a node is a cell of 2^node_bits spacings of its level along each edge.
-    """
-
-    # Drawing this many costs less than a millisecond: nothing is gained by a coarser level.
-    coarsest_points: int = 4000
-    # 32 spacings: about a thousand points of a surface, cheap to cull and small beside a camera's view.
-    node_bits: int = 5
+# Levels are added until the coarsest has at most this many points: drawing them costs less than a
+# millisecond.
+_COARSEST_POINTS = 4000
+# A node is a cell of 2^5 spacings of its level along each edge: about a thousand points of a surface, cheap
+# to cull and small beside a camera's view.
+_NODE_BITS = 5
 
 
 def build_cloud(
@@ -39,7 +28,6 @@ def build_cloud(
     rgb: ArrayLike | None = None,
     intensity: ArrayLike | None = None,
     classification: ArrayLike | None = None,
-    options: DetailLevelOptions | None = None,
 ) -> PointCloud:
     """A cloud whose points are ordered into levels, each with half the spacing of the one before.
 
@@ -58,13 +46,12 @@ def build_cloud(
         InvalidValueError: no points, wrong shapes, coordinates that are not finite.
         MissingExtraError: numba is not installed.
     """
-    options = options or DetailLevelOptions()
     points = np.ascontiguousarray(xyz, dtype=np.float32)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0:
         raise InvalidValueError(f"build_cloud: expected points (n, 3) with n >= 1, found {points.shape}")
     if not np.isfinite(points).all():
         raise InvalidValueError("build_cloud: expected finite coordinates, found NaN or infinity")
-    order, nodes, spacing = _order(points, options)
+    order, nodes, spacing = _order(points)
     n = len(points)
     classes = np.full(n, UNCLASSIFIED, np.uint8) if classification is None else classification
     return PointCloud(
@@ -110,19 +97,16 @@ def _bytes(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.ui
 
 
 def _order(
-    points: NDArray[np.float32], options: DetailLevelOptions
+    points: NDArray[np.float32],
 ) -> tuple[NDArray[np.int64], CloudNodes, NDArray[np.float32]]:
     """The rows in drawing order, the nodes, and the spacing around each row in that order."""
     loops = compiled_module("featuredb.render.loops.level_loops")
     origin = points.min(axis=0).astype(np.float64)
     extent = float((points.max(axis=0) - origin).max())
     by_code, codes, cell_m = _sorted_by_code(points, origin, extent)
-    finest = _level_count(codes, extent, cell_m, options.coarsest_points)
+    finest = _level_count(codes)
     level = loops.assign_levels(points[by_code], codes, origin, cell_m, finest)
-    runs = [
-        loops.node_runs(codes, level, current, finest, options.node_bits, cell_m)
-        for current in range(finest + 1)
-    ]
+    runs = [loops.node_runs(codes, level, k, finest, _NODE_BITS, cell_m) for k in range(finest + 1)]
     by_level = np.argsort(level, kind="stable")
     order = by_code[by_level]
     count = np.concatenate([counts for counts, _ in runs])
@@ -164,10 +148,10 @@ def _sorted_by_code(
     return by_code, codes[by_code], cell_m
 
 
-def _level_count(codes: NDArray[np.int64], extent: float, cell_m: float, coarsest_points: int) -> int:
+def _level_count(codes: NDArray[np.int64]) -> int:
     """The number of the finest level, when level 0 has at most that many points."""
     loops = compiled_module("featuredb.render.loops.level_loops")
     finest = 0
-    while finest < _CODE_BITS and loops.occupied(codes, 3 * finest) > coarsest_points:
+    while finest < _CODE_BITS and loops.occupied(codes, 3 * finest) > _COARSEST_POINTS:
         finest += 1
     return finest

@@ -1,6 +1,6 @@
 """Draws a point cloud as a camera with distortion sees it."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
 from featuredb.render.rendering import Rendering
-from featuredb.render.splats import BlockPlanes, SplatOptions, draw_splats, project_points
-from featuredb.render.surfaces import SurfaceOptions, apart_px, block_planes, close_holes, surfaces_of
+from featuredb.render.splats import FINEST_PX, NEAR_M, BlockPlanes, draw_splats, project_points
+from featuredb.render.surfaces import apart_px, block_planes, close_holes, surfaces_of
 from featuredb.render.threads import over_rows, thread_count
 
 # Splats wider than this show which way they lie; then there are few, and drawing them again is cheap.
@@ -30,8 +30,6 @@ class RenderOptions:
 
     attributes: bool = True
     threads: int = 0
-    splats: SplatOptions = field(default_factory=SplatOptions)
-    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
 
 def render(
@@ -49,21 +47,17 @@ def render(
     """
     options = options or RenderOptions()
     threads = thread_count(options.threads)
-    near_m, finest_px = options.splats.near_m, options.splats.finest_px
-    rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=near_m, finest_px=finest_px)
-    points = project_points(
-        cloud, rows, camera, cam_from_local, options.splats, threads, attributes=options.attributes
-    )
-    splats = draw_splats(points, camera, options.splats, threads)
+    rows = visible_nodes(cloud.nodes, camera, cam_from_local, near_m=NEAR_M, finest_px=FINEST_PX)
+    points = project_points(cloud, rows, camera, cam_from_local, threads, attributes=options.attributes)
+    splats = draw_splats(points, camera, threads)
     focal_px, planes = camera.focal_px, BlockPlanes.unknown()
     apart = apart_px(splats, focal_px)
-    if options.surfaces.tilt_splats and len(apart):
+    if len(apart):
         planes = block_planes(splats, float(np.median(apart)), threads)
         if np.quantile(apart, 0.95) > _WORTH_REDRAWING_PX:
-            splats = draw_splats(points, camera, options.splats, threads, planes)
+            splats = draw_splats(points, camera, threads, planes)
     surfaces = surfaces_of(splats, planes, focal_px, threads)
-    if options.surfaces.close_holes:
-        surfaces = close_holes(surfaces, splats, planes, focal_px, options.surfaces, threads)
+    surfaces = close_holes(surfaces, splats, planes, focal_px, threads)
     rgb, intensity = _painted(surfaces.paint, cloud, options.attributes, threads)
     return Rendering(
         camera=camera,

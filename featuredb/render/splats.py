@@ -14,26 +14,16 @@ from featuredb.render.compiled import compiled_module
 from featuredb.render.lens import lens_numbers
 from featuredb.render.threads import mapped, over_rows
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SplatOptions:
-    """Sizes of splats.
-
-    Attributes:
-        near_m: nothing closer is drawn.
-        finest_px: points closer together than this in the picture are left to coarser levels.
-        radius_per_spacing: radius of a splat, as a share of the distance between points.
-        max_radius_px: of a splat.
-    """
-
-    near_m: float = 0.3  # a camera does not stand in a wall
-    # Two to three points a pixel at most: more cost time and show nothing.
-    finest_px: float = 0.6
-    # Half a spacing leaves pinholes in a square lattice (0.71 would not), and widens silhouettes least;
-    # holes are closed afterwards, where it is known on which side the surface ends.
-    radius_per_spacing: float = 0.5
-    # A point that would be larger stands for nothing that a camera so near would see.
-    max_radius_px: float = 24.0
+NEAR_M = 0.3  # nothing closer is drawn: a camera does not stand in a wall
+# Points closer together than this in the picture are left to coarser levels: two to three points a pixel at
+# most, more cost time and show nothing.
+FINEST_PX = 0.6
+# Radius of a splat as a share of the distance between points. Half a spacing leaves pinholes in a square
+# lattice (0.71 would not), and widens silhouettes least; holes are closed afterwards, where it is known on
+# which side the surface ends.
+_RADIUS_PER_SPACING = 0.5
+# A point that would be larger stands for nothing that a camera so near would see.
+_MAX_RADIUS_PX = 24.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -88,7 +78,6 @@ def project_points(
     rows: NDArray[np.intp],
     camera: Camera,
     cam_from_local: Rigid3,
-    options: SplatOptions,
     threads: int,
     *,
     attributes: bool = True,
@@ -102,20 +91,20 @@ def project_points(
     room = int(ends[-1]) if len(ends) else 0
     seen, shows = np.empty((room, 4), np.float32), np.empty((room, 2), np.uint32)
     pose = tuple(cam_from_local.matrix()[:3].ravel().tolist())
-    lens, widest = lens_numbers(camera), options.max_radius_px
+    lens, widest = lens_numbers(camera), _MAX_RADIUS_PX
     bounds = (-widest, camera.width + widest, -widest, camera.height + widest)
     spacing = nodes.spacing_m[rows] if cloud.spacing_m is None else cloud.spacing_m
     none = np.empty(0, np.uint8)
     rgb = cloud.rgb if attributes and cloud.rgb is not None else none.reshape(0, 3)
     intensity = cloud.intensity if attributes and cloud.intensity is not None else none
     # Nodes of points less than this apart are not drawn, so what is drawn may be twice as far apart.
-    finest = 2.0 * options.finest_px
+    finest = 2.0 * FINEST_PX
 
     def project(part: slice) -> NDArray[np.int64]:
         own = spacing[part] if by_run else spacing
         kept: NDArray[np.int64] = loops.project_runs(
             *(cloud.xyz, runs[part], first[part], own, by_run, pose, lens),
-            *(options.near_m, finest, bounds, rgb, intensity, seen, shows),
+            *(NEAR_M, finest, bounds, rgb, intensity, seen, shows),
         )
         return kept
 
@@ -124,11 +113,7 @@ def project_points(
 
 
 def draw_splats(
-    points: ProjectedPoints,
-    camera: Camera,
-    options: SplatOptions,
-    threads: int,
-    surface: BlockPlanes | None = None,
+    points: ProjectedPoints, camera: Camera, threads: int, surface: BlockPlanes | None = None
 ) -> Splats:
     """Draw projected points; the result does not depend on the number of threads.
 
@@ -141,7 +126,7 @@ def draw_splats(
         nearest = np.full((camera.height, camera.width), loops.NOTHING)
         loops.draw(
             *(points.seen, points.first[part], points.count[part], known.planes, known.side),
-            *(camera.focal_px, options.radius_per_spacing, options.max_radius_px, nearest),
+            *(camera.focal_px, _RADIUS_PER_SPACING, _MAX_RADIUS_PX, nearest),
         )
         return nearest
 

@@ -17,20 +17,9 @@ _DENSE_PX = 2.0  # where nearly every pixel shows a point of its own, every four
 _RADII_PX = (1, 2, 3, 5, 8, 13, 21, 32)  # of closings; each is tried from the largest down
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SurfaceOptions:
-    """How splats become surfaces.
-
-    Attributes:
-        close_holes: close what lies between the splats of one surface.
-        tilt_splats: lay splats into the surface that the points around them make.
-        reach_per_spacing: holes are closed within this share of the distance between points.
-    """
-
-    close_holes: bool = True
-    tilt_splats: bool = True
-    # Points thrown at random leave holes of up to about two spacings between them; half of that on each side.
-    reach_per_spacing: float = 1.0
+# Holes are closed within this share of the distance between points. Points thrown at random leave holes of up
+# to about two spacings between them; half of that on each side.
+_REACH_PER_SPACING = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,12 +59,7 @@ def surfaces_of(splats: Splats, planes: BlockPlanes, focal_px: float, threads: i
 
 
 def close_holes(
-    surfaces: Surfaces,
-    splats: Splats,
-    planes: BlockPlanes,
-    focal_px: float,
-    options: SurfaceOptions,
-    threads: int,
+    surfaces: Surfaces, splats: Splats, planes: BlockPlanes, focal_px: float, threads: int
 ) -> Surfaces:
     """The surfaces with holes closed; depth and index are changed in place.
 
@@ -85,26 +69,15 @@ def close_holes(
     behind it. The pixel may be empty, or show a point farther off through the surface.
     """
     loops = compiled_module("featuredb.render.loops.hole_loops")
-    s, reach = surfaces, options.reach_per_spacing
-    radii = _radii(splats, reach, focal_px)
+    s = surfaces
+    radii = _radii(splats, focal_px)
     closed = _closings(s.nearness, radii, threads)
     widest = _widest_m(s.apart_m, radii, threads)
     paint = np.empty_like(s.paint)
     over_rows(
         lambda first, end: loops.close_holes(
-            *(
-                s.nearness,
-                s.apart_m,
-                s.paint,
-                planes.planes,
-                planes.side,
-                closed,
-                radii,
-                widest,
-                focal_px,
-                reach,
-            ),
-            *(s.depth, s.index, paint, first, end),
+            *(s.nearness, s.apart_m, s.paint, planes.planes, planes.side, closed, radii, widest, focal_px),
+            *(_REACH_PER_SPACING, s.depth, s.index, paint, first, end),
         ),
         len(paint),
         threads,
@@ -144,9 +117,9 @@ def block_planes(splats: Splats, typical_px: float, threads: int) -> BlockPlanes
     return BlockPlanes(planes=planes, side=side)
 
 
-def _radii(splats: Splats, reach_per_spacing: float, focal_px: float) -> NDArray[np.int32]:
+def _radii(splats: Splats, focal_px: float) -> NDArray[np.int32]:
     """Radii of closings, up to what the widest spacing in the picture asks for."""
-    widest = reach_per_spacing * float(apart_px(splats, focal_px).max(initial=0.0))
+    widest = _REACH_PER_SPACING * float(apart_px(splats, focal_px).max(initial=0.0))
     return np.array([r for r in _RADII_PX if r == _RADII_PX[0] or r < widest + 0.5], np.int32)
 
 

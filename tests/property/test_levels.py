@@ -1,5 +1,7 @@
 """Levels of detail for any cloud: a permutation, nodes that hold what they say, levels with their spacing."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,10 +11,17 @@ from scipy.spatial import cKDTree
 
 from featuredb.errors import InvalidValueError
 from featuredb.geo.local_frame import LocalFrame
-from featuredb.render.levels import DetailLevelOptions, build_cloud, point_spacing
+from featuredb.render import levels
+from featuredb.render.levels import build_cloud, point_spacing
 
 FRAME = LocalFrame(latitude_deg=-33.0, longitude_deg=151.0, height_m=20.0)
-SMALL = DetailLevelOptions(coarsest_points=20)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def many_levels() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(levels, "_COARSEST_POINTS", 20)
+        yield
 
 
 @settings(deadline=None, max_examples=40)
@@ -30,7 +39,6 @@ def test_levels_are_a_permutation_and_nodes_hold_their_points(xyz: np.ndarray) -
         "unknown",
         xyz,
         rgb=np.column_stack([number & 255, number >> 8, 0 * number]).astype(np.uint8),
-        options=SMALL,
     )
     assert cloud.rgb is not None
     rows = cloud.rgb[:, 0].astype(int) + 256 * cloud.rgb[:, 1].astype(int)
@@ -53,7 +61,6 @@ def test_each_level_halves_the_spacing() -> None:
         FRAME,
         "unknown",
         np.column_stack([xy, np.sin(xy[:, 0] / 5)]),
-        options=DetailLevelOptions(coarsest_points=100),
     )
     nodes = cloud.nodes
     level = np.repeat(nodes.level, nodes.count)

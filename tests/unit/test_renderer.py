@@ -11,6 +11,7 @@ from featuredb.errors import InvalidValueError, MissingExtraError
 from featuredb.geo.local_frame import LocalFrame
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rays import pixel_rays
+from featuredb.render import renderer, shading, splats
 from featuredb.render.cloud import PointCloud
 from featuredb.render.compiled import compiled_module
 from featuredb.render.culling import visible_nodes
@@ -18,9 +19,8 @@ from featuredb.render.lens import lens_numbers
 from featuredb.render.levels import build_cloud
 from featuredb.render.loops.draw_loops import project
 from featuredb.render.renderer import RenderOptions, render
-from featuredb.render.shading import ReliefOptions, shaded_relief
-from featuredb.render.splats import SplatOptions
-from featuredb.render.surfaces import SurfaceOptions
+from featuredb.render.shading import shaded_relief
+from featuredb.render.splats import BlockPlanes
 from featuredb.simworld.camera.raster import render as cast_rays
 from featuredb.simworld.camera.shot import look_pose
 from featuredb.simworld.town.scene import Ellipsoids, Faces
@@ -118,7 +118,9 @@ def test_index_names_the_point_that_a_pixel_shows() -> None:
     assert np.median(distance) < 0.45 * spacing_px
 
 
-def test_holes_of_a_near_surface_show_neither_nothing_nor_what_is_behind() -> None:
+def test_holes_of_a_near_surface_show_neither_nothing_nor_what_is_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     near, far = lattice(0.45, 3.0, 8.0), lattice(0.05, 16.0, 0.0, seed=1)
     cloud = cloud_of(near, far)
     rendering = render(cloud, CAMERA, DOWN)
@@ -131,7 +133,8 @@ def test_holes_of_a_near_surface_show_neither_nothing_nor_what_is_behind() -> No
     assert rendering.intensity is not None
     assert (rendering.intensity[inside] == 50).mean() > 0.985
     assert (rendering.intensity[outside] == 100).all()
-    bare = render(cloud, CAMERA, DOWN, RenderOptions(surfaces=SurfaceOptions(close_holes=False)))
+    monkeypatch.setattr(renderer, "close_holes", lambda surfaces, *_: surfaces)
+    bare = render(cloud, CAMERA, DOWN)
     assert (np.abs(bare.depth[inside] - 12.0) < 0.05).mean() < 0.95  # there is something to close
 
 
@@ -179,12 +182,13 @@ def test_what_is_not_there_stays_empty() -> None:
     assert (rendering.index[~rendering.valid] == -1).all()
 
 
-def test_a_slope_has_its_depth_between_the_points_too() -> None:
+def test_a_slope_has_its_depth_between_the_points_too(monkeypatch: pytest.MonkeyPatch) -> None:
     points = lattice(0.5, 14.0, 0.0)
     points[:, 2] = 0.8 * points[:, 0]
     cloud = cloud_of(points)
     tilted = render(cloud, CAMERA, DOWN)
-    flat = render(cloud, CAMERA, DOWN, RenderOptions(surfaces=SurfaceOptions(tilt_splats=False)))
+    monkeypatch.setattr(renderer, "block_planes", lambda *_: BlockPlanes.unknown())
+    flat = render(cloud, CAMERA, DOWN)
     x, y = pixel_rays(CAMERA)
     exact = 20.0 / (1.0 + 0.8 * x)  # z = 20 - 0.8 * east, east = x * z
     middle = np.hypot(x, y) < 0.4
@@ -192,7 +196,7 @@ def test_a_slope_has_its_depth_between_the_points_too() -> None:
     assert np.nanquantile(np.abs(flat.depth - exact)[middle], 0.95) > 0.1
 
 
-def test_distant_detail_is_left_out_and_the_picture_stays_whole() -> None:
+def test_distant_detail_is_left_out_and_the_picture_stays_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = cloud_of(lattice(0.1, 30.0, 0.0))
     far = look_pose((0.0, 0.0, 300.0), 0.0, -90.0)
     rendering = render(cloud, CAMERA, far)
@@ -200,7 +204,9 @@ def test_distant_detail_is_left_out_and_the_picture_stays_whole() -> None:
     x, y = pixel_rays(CAMERA)
     inside = (np.abs(300.0 * x) < 28.0) & (np.abs(300.0 * y) < 28.0)
     assert rendering.valid[inside].all()
-    everything = render(cloud, CAMERA, far, RenderOptions(splats=SplatOptions(finest_px=0.0)))
+    for module in (renderer, splats):
+        monkeypatch.setattr(module, "FINEST_PX", 0.0)
+    everything = render(cloud, CAMERA, far)
     assert everything.points_drawn == len(cloud)
     assert np.abs(rendering.depth - everything.depth)[inside].max() < 0.01
 
@@ -263,24 +269,26 @@ def test_half_the_pixels_show_the_same_scene() -> None:
 
 
 @pytest.mark.parametrize(("east_slope", "azimuth"), [(0.0, 315.0), (0.5, 90.0), (0.5, 270.0), (-0.3, 45.0)])
-def test_relief_follows_lamberts_law(east_slope: float, azimuth: float) -> None:
+def test_relief_follows_lamberts_law(
+    east_slope: float, azimuth: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     points = lattice(0.15, 14.0, 0.0)
     points[:, 2] = east_slope * points[:, 0]
     rendering = render(cloud_of(points), CAMERA, DOWN)
-    options = ReliefOptions(light_azimuth_deg=azimuth, ambient=0.2)
-    picture = shaded_relief(rendering, options)
+    monkeypatch.setattr(shading, "_LIGHT_AZIMUTH_DEG", azimuth)
+    picture = shaded_relief(rendering)
     normal = np.array([-east_slope, 0.0, 1.0]) / np.hypot(1.0, east_slope)
-    a, e = np.radians(azimuth), np.radians(options.light_elevation_deg)
+    a, e = np.radians(azimuth), np.radians(45.0)
     lit = normal @ [np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)]
     x, y = pixel_rays(CAMERA)
     middle = np.hypot(x, y) < 0.3
-    assert np.median(picture[middle]) == pytest.approx(255 * (0.2 + 0.8 * max(lit, 0.0)), abs=4)
+    assert np.median(picture[middle]) == pytest.approx(255 * (0.25 + 0.75 * max(lit, 0.0)), abs=4)
 
 
 def test_relief_sees_no_slope_across_a_step() -> None:
     """The flat roof and the flat ground are equally bright up to the step; only normals across it are not."""
     cloud = cloud_of(lattice(0.15, 3.0, 8.0), lattice(0.1, 16.0, 0.0, seed=1))
-    picture = shaded_relief(render(cloud, CAMERA, DOWN), replace(ReliefOptions(), threads=1))
+    picture = shaded_relief(render(cloud, CAMERA, DOWN))
     x, y = pixel_rays(CAMERA)
     flat = 255 * (0.25 + 0.75 * np.sin(np.radians(45.0)))
     assert (np.abs(picture[np.hypot(x, y) < 0.6].astype(float) - flat) < 12).mean() > 0.98
