@@ -11,33 +11,11 @@ from featuredb.simworld.town.texture import Image8, to_image
 NegativeKind = Literal["other_town", "blank", "noise", "text", "mirrored", "blurred"]
 NEGATIVE_KINDS: tuple[NegativeKind, ...] = get_args(NegativeKind)
 
-_WORDS = [
-    "bridge",
-    "river",
-    "market",
-    "street",
-    "house",
-    "stone",
-    "window",
-    "garden",
-    "tower",
-    "signal",
-    "north",
-    "east",
-    "height",
-    "record",
-    "camera",
-    "survey",
-    "harbour",
-    "station",
-    "letter",
-    "number",
-    "morning",
-    "evening",
-    "window",
-    "yellow",
-    "copper",
-]
+_WORDS = (
+    "bridge", "river", "market", "street", "house", "stone", "window", "garden", "tower", "signal",
+    "north", "east", "height", "record", "camera", "survey", "harbour", "station", "letter",
+    "number", "morning", "evening", "window", "yellow", "copper",
+)  # fmt: skip
 _BLUR_SHARE = 0.035  # of the width: nothing smaller than a house front survives
 
 

@@ -10,7 +10,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
 from featuredb.geometry.arrays import FloatArray
 from featuredb.geometry.camera import Camera
 from featuredb.geometry.rigid3 import Rigid3
@@ -57,17 +56,6 @@ class OrthoOptions:
     day: DayOptions = field(
         default_factory=lambda: DayOptions(seed=3, to_sun=(0.52, -0.24, 0.66), leaf_tint=(1.25, 1.0, 0.7))
     )
-
-    def __post_init__(self) -> None:
-        if not (
-            0.02 <= self.pixel_m <= 5
-            and self.flight_height_m >= 200
-            and self.spacing_m >= 20
-            and self.margin_m >= 0
-            and 0.2 <= self.contrast <= 2
-            and 0.2 <= self.gamma <= 3
-        ):
-            raise InvalidValueError(f"OrthoOptions: value out of range in {self}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -117,12 +117,7 @@ def read_truth(folder: Path) -> Truth:
 def _image_json(image: TrueImage) -> dict[str, Any]:
     return {
         "name": image.name,
-        "camera": {
-            "model": image.camera.model,
-            "width": image.camera.width,
-            "height": image.camera.height,
-            "params": list(image.camera.params),
-        },
+        "camera": asdict(image.camera),
         "cam_from_local": {
             "quaternion_xyzw": image.cam_from_local.quaternion_xyzw.tolist(),
             "translation_m": image.cam_from_local.translation.tolist(),
@@ -136,12 +131,7 @@ def _image_value(entry: dict[str, Any]) -> TrueImage:
     camera, pose, error = entry["camera"], entry["cam_from_local"], entry["gps_error_m"]
     return TrueImage(
         name=entry["name"],
-        camera=Camera(
-            model=camera["model"],
-            width=camera["width"],
-            height=camera["height"],
-            params=tuple(camera["params"]),
-        ),
+        camera=Camera(**{**camera, "params": tuple(camera["params"])}),
         cam_from_local=Rigid3.from_quaternion(pose["quaternion_xyzw"], pose["translation_m"]),
         utm=np.asarray(entry["utm"]),
         gps_error_m=None if error is None else np.asarray(error),

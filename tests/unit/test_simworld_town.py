@@ -185,8 +185,6 @@ def test_vignetting_and_exposure() -> None:
         for i in range(200)
     ]
     assert np.std(np.log2(np.array(means) / 120)) == pytest.approx(0.2, rel=0.15)
-    with pytest.raises(InvalidValueError, match="SensorOptions"):
-        SensorOptions(jpeg_quality=100)
 
 
 def test_survey_overlaps_as_asked(town: Scene) -> None:
@@ -289,13 +287,6 @@ def test_exif_position_is_exact_to_under_a_millimetre(
     assert degrees(tags.GPSLatitude) == pytest.approx(abs(lat_lon_h[0]), abs=1.5e-9)
     assert degrees(tags.GPSLongitude) == pytest.approx(abs(lat_lon_h[1]), abs=1.5e-9)
     assert float(gps[tags.GPSAltitude]) == pytest.approx(abs(lat_lon_h[2]), abs=0.00051)
-
-
-def test_flight_options_are_checked() -> None:
-    with pytest.raises(InvalidValueError, match="gps_error"):
-        FlightOptions(gps_error="perfect")  # type: ignore[arg-type]
-    with pytest.raises(InvalidValueError, match="out of range"):
-        FlightOptions(forward_overlap=1.0)
 
 
 @pytest.mark.evaluation

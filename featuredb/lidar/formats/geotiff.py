@@ -6,8 +6,6 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
-
 
 def write_geotiff(
     path: Path,
@@ -26,11 +24,8 @@ def write_geotiff(
         nodata: value that means "nothing here".
 
     Raises:
-        InvalidValueError: not an image.
         OSError: the file cannot be written.
     """
-    if image.ndim != 3 or not image.size:
-        raise InvalidValueError(f"write_geotiff: expected an image (h, w, bands), found shape {image.shape}")
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width, bands = image.shape
     with rasterio.open(

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from featuredb.errors import InvalidValueError
 from featuredb.simworld.town.texture import Image8, to_image
 
 
@@ -34,10 +33,6 @@ class SensorOptions:
     read_noise: float = 1.0
     shot_noise: float = 2.2
     jpeg_quality: int = 90
-
-    def __post_init__(self) -> None:
-        if not (self.blur_px >= 0 and 0 <= self.vignetting < 1 and 1 <= self.jpeg_quality <= 95):
-            raise InvalidValueError(f"SensorOptions: value out of range in {self}")
 
 
 def expose(rgb: Image8, rng: np.random.Generator, options: SensorOptions) -> Image8:

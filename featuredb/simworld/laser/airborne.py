@@ -1,6 +1,6 @@
 """The town scanned by a laser from an aircraft: strips, several returns, classes, outliers, exact truth."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,14 +149,7 @@ def _aside(beams: Beams, divergence_rad: float, rng: np.random.Generator) -> Bea
     # A Gaussian beam's full divergence at 1/e^2 is four standard deviations.
     direction = beams.direction + rng.normal(0, divergence_rad / 4, beams.direction.shape) * [1, 1, 0]
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-    return Beams(
-        x0=beams.x0,
-        dx=beams.dx,
-        height=beams.height,
-        angles=beams.angles,
-        direction=direction,
-        sway=beams.sway + 2 * divergence_rad,
-    )
+    return replace(beams, direction=direction, sway=beams.sway + 2 * divergence_rad)
 
 
 def _scan_strip(

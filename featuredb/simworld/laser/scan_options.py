@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field
 
-from featuredb.errors import InvalidValueError
 from featuredb.simworld.town.days import DayOptions
 
 
@@ -43,16 +42,3 @@ class AirborneScanOptions:
     multipath: float = 2e-4
     noise_labelled: float = 0.7
     day: DayOptions = field(default_factory=lambda: DayOptions(seed=2))
-
-    def __post_init__(self) -> None:
-        shares = (self.birds, self.multipath, self.noise_labelled)
-        if not (
-            self.height_m >= 100
-            and 1 <= self.max_scan_angle_deg <= 45
-            and 0 <= self.overlap < 0.9
-            and 0 < self.density_per_m2 <= 200
-            and min(self.margin_m, self.range_noise_m, self.strip_shift_m, self.divergence_mrad) >= 0
-            and 0 <= self.sway_deg <= 2
-            and all(0 <= s <= 1 for s in shares)
-        ):
-            raise InvalidValueError(f"AirborneScanOptions: value out of range in {self}")

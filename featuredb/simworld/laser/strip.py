@@ -1,6 +1,6 @@
 """What the surfaces of a strip make of its beams: which echoes there are, how strong, of what class."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,8 +58,8 @@ def with_outliers(
     replaced = np.where(is_bird, ground - rng.uniform(25, 160, n), ground + rng.uniform(1.5, 12.0, n))
     outlier &= np.isfinite(ground)
     none = np.full(n, NOTHING, dtype=np.int32)
-    changed = Echoes(
-        beam=echoes.beam,
+    changed = replace(
+        echoes,
         distance=np.where(outlier, replaced, echoes.distance),
         energy=np.where(outlier, 1.0, echoes.energy),
         face=np.where(outlier, none, echoes.face),

@@ -3,11 +3,8 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from featuredb.errors import InvalidValueError
-from featuredb.geometry.arrays import FloatArray
-from featuredb.simworld.town.scene import Ellipsoids, Faces, Scene, texture_index
+from featuredb.simworld.town.scene import Faces, Scene, texture_index
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,28 +27,19 @@ class DayOptions:
     cars_swapped: float = 0.8
     leaf_tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
-    def __post_init__(self) -> None:
-        if not (0 <= self.cars_gone <= 1 and 0 <= self.cars_swapped <= 1):
-            raise InvalidValueError(f"DayOptions: expected shares of cars from 0 to 1, found {self}")
-        if self.to_sun is not None and not self.to_sun[2] > 0.05 * np.linalg.norm(self.to_sun):
-            raise InvalidValueError(
-                f"DayOptions.to_sun: expected a sun above the horizon, found {self.to_sun}"
-            )
-
 
 def another_day(scene: Scene, options: DayOptions) -> Scene:
     """The scene on that day; what does not move is the same to the last bit."""
     faces, plan = _other_cars(scene, options), scene.plan
     crowns = scene.ellipsoids
     if options.leaf_tint != (1.0, 1.0, 1.0):
-        columns = {name: getattr(crowns, name) for name in ("center", "radii", "texture_uv", "object_id")}
-        crowns = Ellipsoids(**columns, tint=crowns.tint * np.asarray(options.leaf_tint))
+        crowns = replace(crowns, tint=crowns.tint * np.asarray(options.leaf_tint))
     if options.to_sun is not None:
         sun = np.asarray(options.to_sun) / np.linalg.norm(options.to_sun)
         old, new = (
             faces.sunlight(scene.enu_from_town @ direction) for direction in (np.asarray(plan.to_sun), sun)
         )
-        faces = _with(faces, tint=faces.tint * (new / old)[:, None])
+        faces = replace(faces, tint=faces.tint * (new / old)[:, None])
         plan = replace(plan, to_sun=(float(sun[0]), float(sun[1]), float(sun[2])))
     return replace(scene, faces=faces, ellipsoids=crowns, plan=plan)
 
@@ -71,10 +59,5 @@ def _other_cars(scene: Scene, options: DayOptions) -> Faces:
         elif swapped:
             origin[mine, :2] += shift
             tint[mine] *= factors
-    return _with(faces, rows=keep, origin=origin, tint=tint)
-
-
-def _with(faces: Faces, rows: NDArray[np.bool_] | None = None, **changes: FloatArray) -> Faces:
-    """The faces of `rows` with some columns replaced."""
-    columns = {name: changes.get(name, getattr(faces, name)) for name in Faces.__dataclass_fields__}
-    return Faces(**(columns if rows is None else {name: value[rows] for name, value in columns.items()}))
+    changed = replace(faces, origin=origin, tint=tint)
+    return Faces(**{name: getattr(changed, name)[keep] for name in Faces.__dataclass_fields__})

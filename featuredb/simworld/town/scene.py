@@ -4,7 +4,7 @@ Everything that a sensor can meet is one of two primitives, so any camera, LiDAR
 intersections only, and both have a closed form.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -93,18 +93,16 @@ class Faces:
     def moved(self, rotation: ArrayLike, translation: ArrayLike) -> "Faces":
         """The same faces at rotation @ x + translation; textures move with them."""
         turn, shift = np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64)
-        return Faces(
+        return replace(
+            self,
             origin=self.origin @ turn.T + shift,
             edge_s=self.edge_s @ turn.T,
             edge_t=self.edge_t @ turn.T,
-            **{n: getattr(self, n) for n, _, _ in _FACE_COLUMNS[3:]},
         )
 
     def shaded(self, to_sun: ArrayLike) -> "Faces":
         """The same faces with Lambert's light from the unit vector `to_sun` multiplied into `tint`."""
-        light = self.sunlight(to_sun)
-        columns = {n: getattr(self, n) for n, _, _ in _FACE_COLUMNS}
-        return Faces(**{**columns, "tint": self.tint * light[:, None]})
+        return replace(self, tint=self.tint * self.sunlight(to_sun)[:, None])
 
     def sunlight(self, to_sun: ArrayLike) -> FloatArray:
         """Lambert's light (n,) from the unit vector `to_sun`, between 0.55 and 1.1."""
