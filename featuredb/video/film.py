@@ -24,7 +24,6 @@ class VideoOptions:
     """How a film is read.
 
     Attributes:
-        every: only each n-th frame is delivered, the first one included; all are decoded.
         start_s, end_s: only frames with start_s <= time_s < end_s; None for the film's own start and end.
         max_side_px: frames are made smaller so that no side is longer; None for full size.
         threads: of the decoder. One leaves the other cores to the caller, who has more to do, and loses the
@@ -32,26 +31,23 @@ class VideoOptions:
             and delays a live source by a frame.
         timeout_s: how long a URL or a device may be silent, when it is opened and between its packets.
         fps: frames per second of a folder that has no file of times.
-        input_format: libav's name of the format, where it cannot tell itself (e.g. "v4l2").
-        input_options: libav's options of that format, e.g. {"video_size": "1280x720"}.
+        input_options: libav's options of the format, e.g. {"video_size": "1280x720"}.
         max_full_side_px, max_full_pixels: larger films are refused before anything is allocated for them.
     """
 
-    every: int = 1
     start_s: float | None = None
     end_s: float | None = None
     max_side_px: int | None = None
     threads: int = 1
     timeout_s: float = 10.0
     fps: float | None = None
-    input_format: str | None = None
     input_options: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
     # Panoramic cameras reach 11520x5760; a frame of the most pixels takes 200 MB as 4:2:0.
     max_full_side_px: int = 16_384
     max_full_pixels: int = 16_384 * 8_192
 
     def __post_init__(self) -> None:
-        for name in ("every", "threads", "max_side_px", "max_full_side_px", "max_full_pixels"):
+        for name in ("threads", "max_side_px", "max_full_side_px", "max_full_pixels"):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < 1):
                 raise InvalidValueError(f"{name}: expected a whole number of at least 1, found {value!r}")
@@ -128,7 +124,7 @@ class VideoFrame:
 
     Attributes:
         index: 0 for the first frame at or after the start that was asked for, and counting all frames from
-            there that could be decoded, also those that `every` leaves out.
+            there that could be decoded.
         time_s: seconds on the film's own clock, from the frame's own time stamp.
         gray: (h, w) uint8, 0 black to 255 white, read-only.
         damaged: whether the decoder had to make up parts of the picture.
@@ -229,8 +225,7 @@ def chosen(timed: Iterable[tuple[float, _T]], options: VideoOptions) -> Iterator
             continue
         if options.end_s is not None and time_s >= options.end_s:
             return
-        if index % options.every == 0:
-            yield index, time_s, item
+        yield index, time_s, item
         index += 1
 
 

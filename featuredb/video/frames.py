@@ -1,6 +1,6 @@
 """Frames of a film, a folder of pictures, a network stream or a camera, with their times, by one function.
 
-with open_video("flight.mp4", VideoOptions(every=5, max_side_px=1600)) as video:
+with open_video("flight.mp4", VideoOptions(max_side_px=1600)) as video:
     for frame in video:
         track(frame.gray, frame.time_s)
 print(video.report.complaints())

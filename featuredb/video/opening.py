@@ -43,7 +43,8 @@ class Opening:
         name: for messages, without password.
         target: what `av.open` takes.
         path: the regular file that it is, or None.
-        input_format, input_options: libav's, see VideoOptions.
+        input_format: libav's name of the format where it cannot tell itself, or None.
+        input_options: libav's, see VideoOptions.
         live: whether it is read once from its start, with a timeout.
     """
 
@@ -70,7 +71,7 @@ def opening_of(source: Source, options: VideoOptions) -> Opening:
         name=str(getattr(source, "name", "the open file")),
         target=source,
         path=None,
-        input_format=options.input_format,
+        input_format=None,
         input_options={"format_whitelist": _FILE_FORMATS, **options.input_options},
         live=not (callable(seekable) and seekable()),
     )
@@ -92,7 +93,7 @@ def _address(url: str, options: VideoOptions) -> Opening:
         name=name,
         target=url,
         path=None,
-        input_format=options.input_format,
+        input_format=None,
         input_options={**given, **options.input_options},
         live=True,
     )
@@ -114,7 +115,7 @@ def _file_or_device(path: Path, options: VideoOptions) -> Opening:
         # Without the scheme a name like "tcp:2.mp4" would be taken for an address.
         target=str(path) if device else f"file:{path.absolute()}",
         path=path if regular else None,
-        input_format=options.input_format or ("v4l2" if device else None),
+        input_format="v4l2" if device else None,
         input_options={**given, **options.input_options},
         live=not regular,
     )

@@ -39,25 +39,16 @@ class VideoWriterOptions:
     Attributes:
         crf: x264's constant rate factor, 0 (lossless) to 51.
         preset: x264's preset; slower ones make smaller files of the same quality.
-        threads: of the encoder; with one, the same frames give the same bytes.
-        rotation_deg: 0, 90, 180 or 270 degrees clockwise by which players are told to turn the pictures,
-            as a phone's films say.
         tags: text tags of the container, e.g. creation_time (ISO 8601) or com.apple.quicktime.model.
     """
 
     crf: int = 18  # hardly told from the original by eye
     preset: str = "medium"
-    threads: int = 1
-    rotation_deg: int = 0
     tags: Mapping[str, str] = field(default_factory=lambda: NO_TAGS)
 
     def __post_init__(self) -> None:
         if not 0 <= self.crf <= _MAX_CRF:
             raise InvalidValueError(f"crf: expected 0 to {_MAX_CRF}, found {self.crf}")
-        if self.threads < 1:
-            raise InvalidValueError(f"threads: expected at least 1, found {self.threads}")
-        if self.rotation_deg not in (0, 90, 180, 270):
-            raise InvalidValueError(f"rotation_deg: expected 0, 90, 180 or 270, found {self.rotation_deg}")
 
 
 _DEFAULT = VideoWriterOptions()
@@ -201,15 +192,14 @@ class VideoWriter:
         stream.width, stream.height, stream.pix_fmt = self.width, self.height, "yuv420p"
         context = stream.codec_context
         context.time_base = self._time_base
-        context.thread_count = self.options.threads
+        context.thread_count = 1  # so that the same frames give the same bytes
         context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
         context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
         if self.codec == _H264:
-            context.options = {"crf": str(self.options.crf), "preset": self.options.preset}
-            if self.options.threads == 1:
-                # x264's macroblock tree reads memory that it has not set (seen with core 165, most often with
-                # small pictures): without it the same frames give the same bytes.
-                context.options |= {"x264-params": "mbtree=0"}
+            # x264's macroblock tree reads memory that it has not set (seen with core 165, most often with
+            # small pictures): without it the same frames give the same bytes.
+            given = {"crf": str(self.options.crf), "preset": self.options.preset, "x264-params": "mbtree=0"}
+            context.options = given
             if self._rate is None:
                 # With frames reordered, uneven times make an mp4 too short: its length is of decoding times.
                 context.options |= {"bf": "0"}
@@ -217,8 +207,6 @@ class VideoWriter:
             best, worst = _MPEG4_SCALES
             # Libav's fixed scale is set on each picture, which PyAV does not let us do.
             context.qmin = context.qmax = round(best + self.options.crf / _MAX_CRF * (worst - best))
-        if self.options.rotation_deg:
-            stream.set_display_rotation(-self.options.rotation_deg)  # PyAV's angle is counterclockwise
         return stream
 
     def _finish(self) -> None:

@@ -81,11 +81,13 @@ def test_files_that_are_missing_or_folders(tmp_path: Path) -> None:
         telemetry_of_video(tmp_path / "missing.mp4")
 
 
-def test_absurd_sizes_are_refused(tmp_path: Path) -> None:
+def test_absurd_sizes_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = put(tmp_path, "a.srt", SRT)
+    monkeypatch.setattr(telemetry_text, "MAX_TEXT_BYTES", len(SRT) - 1)
     with pytest.raises(TelemetryError, match="found more"):
-        telemetry_text.read_bytes(path, limit=len(SRT) - 1)
-    assert telemetry_text.read_bytes(path, limit=len(SRT)) == SRT.encode()
+        telemetry_text.read_bytes(path)
+    monkeypatch.setattr(telemetry_text, "MAX_TEXT_BYTES", len(SRT))
+    assert telemetry_text.read_bytes(path) == SRT.encode()
     check_count(MAX_SAMPLES, "a")
     with pytest.raises(TelemetryError, match="more than 2000000 samples"):
         check_count(MAX_SAMPLES + 1, "a")

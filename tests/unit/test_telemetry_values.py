@@ -94,12 +94,10 @@ def test_beyond_the_ends_a_value_holds_for_half_a_sample() -> None:
 
 def test_gaps_longer_than_the_limit_stay_empty() -> None:
     value = telemetry([0.0, 1.0, 2.0, 8.0, 9.0])
-    there = value.at([2.4, 2.6, 5.0, 7.4, 7.5, 8.5], max_gap_s=5.0)
+    there = value.at([2.4, 2.6, 5.0, 7.4, 7.5, 8.5])
     assert there.has_position.tolist() == [True, False, False, False, True, True]
     assert there.longitude_deg[0] == 8.002
-    assert value.at(5.0, max_gap_s=6.0).longitude_deg[0] == pytest.approx(8.0025)
-    with pytest.raises(InvalidValueError, match="0 s or more"):
-        value.at(1.0, max_gap_s=-1.0)
+    assert telemetry([0.0, 1.0, 2.0, 5.0]).at(3.5).longitude_deg[0] == pytest.approx(8.0025)
     with pytest.raises(InvalidValueError, match="finite"):
         value.at([NAN])
 
@@ -114,7 +112,10 @@ def test_a_sample_without_a_fix_is_bridged_and_its_other_values_kept() -> None:
     there = value.at(1.0)
     assert there.latitude_deg[0] == pytest.approx(47.001, abs=1e-12)
     assert there.relative_height_m[0] == 99.0
-    assert np.isnan(value.at(1.0, max_gap_s=1.5).latitude_deg[0])
+    far = telemetry(
+        [0.0, 2.0, 4.0], latitude_deg=np.array([47.0, NAN, 47.002]), longitude_deg=value.longitude_deg
+    )
+    assert np.isnan(far.at(2.0).latitude_deg[0])
 
 
 def test_longitude_goes_over_the_date_line() -> None:

@@ -70,12 +70,6 @@ def test_a_transport_stream_begins_anywhere(tmp_path: Path) -> None:
     assert frames[-1].time_s - frames[0].time_s == pytest.approx(11 / 25)
 
 
-def test_every_third_frame(tmp_path: Path) -> None:
-    frames = read(film(tmp_path, "mp4"), every=3, start_s=0.2)
-    assert [shown(frame.gray) for frame in frames] == list(range(5, 30, 3))
-    assert [frame.index for frame in frames] == list(range(0, 25, 3))
-
-
 def test_a_stretch_past_the_end_is_empty(tmp_path: Path) -> None:
     assert read(film(tmp_path, "mp4"), start_s=50.0) == []
 
@@ -148,8 +142,8 @@ def test_karma(shared_data: Path) -> None:
     assert count == 362
     assert times == pytest.approx([i * 1001 / 30_000 for i in range(362)], abs=1e-4)
     assert report.whole, report.complaints()
-    later = read(path, start_s=6.0, end_s=6.5, every=5, max_side_px=400)
-    assert [f.time_s for f in later] == [t for t in times if 6.0 <= t < 6.5][::5]
+    later = read(path, start_s=6.0, end_s=6.5, max_side_px=400)
+    assert [f.time_s for f in later] == [t for t in times if 6.0 <= t < 6.5]
     assert later[0].gray.shape == (225, 400)
 
 
@@ -208,8 +202,7 @@ def test_memory_stays_bounded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"every": 0},
-        {"every": 1.5},
+        {"threads": 1.5},
         {"threads": 0},
         {"max_side_px": 0},
         {"fps": 0.0},

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,10 +26,7 @@ SIDECAR_SUFFIXES = (".srt", ".gpx", ".csv")
 _SNIFFED_BYTES = 65_536
 
 
-@dataclass(frozen=True, slots=True)
-class _Candidate:
-    name: str
-    read: Callable[[], Telemetry]
+_Candidate = tuple[str, Callable[[], Telemetry]]  # its name, and what reads it
 
 
 def read_telemetry(path: Path) -> Telemetry:
@@ -109,15 +106,15 @@ def telemetry_of_video(path: Path) -> Telemetry | None:
 
 def _embedded(tracks: TelemetryTracks, name: str) -> list[_Candidate]:
     """Readers of the tracks that hold telemetry, best first."""
-    found = []
+    found: list[_Candidate] = []
     for index, packets in tracks.gpmf.items():
         if has_positions(packets):
             label = f"{name}, GPMF track {index}"
-            found.append(_Candidate(label, partial(read_gpmf, packets, label)))
+            found.append((label, partial(read_gpmf, packets, label)))
     for index, blocks in tracks.subtitles.items():
         if any(looks_like_telemetry(block.text) for block in blocks):
             label = f"{name}, subtitle track {index}"
-            found.append(_Candidate(label, partial(telemetry_of_blocks, blocks, label)))
+            found.append((label, partial(telemetry_of_blocks, blocks, label)))
     return found
 
 
@@ -128,14 +125,14 @@ def _sidecars(path: Path) -> list[_Candidate]:
     except OSError as error:
         raise TelemetryError(f"{path.parent}: cannot be listed ({error.strerror or error})") from error
     stem = path.stem.casefold() if not path.is_dir() else path.name.casefold()
-    found = []
+    found: list[_Candidate] = []
     for suffix in SIDECAR_SUFFIXES:
         for file in beside:
             if file.suffix.lower() != suffix or file.stem.casefold() != stem or not file.is_file():
                 continue
             if suffix == ".srt" and _is_dialogue(file):
                 continue
-            found.append(_Candidate(file.name, partial(read_telemetry, file)))
+            found.append((file.name, partial(read_telemetry, file)))
     return found
 
 
@@ -152,14 +149,14 @@ def _first_readable(
     name: str, candidates: list[_Candidate], refused: list[str], damage: list[str]
 ) -> Telemetry:
     """The first candidate that can be read, with what else there was in its warnings."""
-    for row, candidate in enumerate(candidates):
+    for row, (_, read) in enumerate(candidates):
         try:
-            telemetry = candidate.read()
+            telemetry = read()
         except TelemetryError as error:
             refused.append(str(error))
             continue
         notes = [*damage, *(f"not used: {reason}" for reason in refused)]
-        notes += [f"also there, not used: {other.name}" for other in candidates[row + 1 :]]
+        notes += [f"also there, not used: {other}" for other, _ in candidates[row + 1 :]]
         return replace(telemetry, warnings=(*notes, *telemetry.warnings)[:MAX_WARNINGS])
     raise TelemetryError(f"{name}: no telemetry can be read: " + "; ".join(refused))
 

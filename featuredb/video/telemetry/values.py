@@ -9,14 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 from featuredb.errors import InvalidValueError
 from featuredb.geo.datum import HeightDatum, check_datum
 from featuredb.geometry.arrays import FloatArray, frozen_array
-from featuredb.video.telemetry.interpolate import interpolate, interpolate_angles
+from featuredb.video.telemetry.interpolate import interpolate
 
 Clock = Literal["utc", "local", "none"]
 CLOCKS: tuple[Clock, ...] = get_args(Clock)
 
 # Between samples so far apart a straight line errs by a T^2 / 8: a drone that turns with 3 m/s2 strays 3.4 m
 # in 3 s, as much as its receiver does.
-DEFAULT_MAX_GAP_S = 3.0
+_MAX_GAP_S = 3.0
 
 _SCALARS = ("height_m", "relative_height_m", "sigma_m", "clock_s", "focal_35mm")
 _ANGLES = ("gimbal_ypr_deg", "aircraft_ypr_deg")
@@ -127,10 +127,10 @@ class Telemetry(TelemetrySamples):
         """Seconds from the first sample to the last."""
         return float(self.times_s[-1] - self.times_s[0])
 
-    def at(self, times_s: ArrayLike, max_gap_s: float = DEFAULT_MAX_GAP_S) -> TelemetrySamples:
+    def at(self, times_s: ArrayLike) -> TelemetrySamples:
         """Samples at other times, each column by itself.
 
-        Linear between neighbouring samples that know the value and are at most `max_gap_s` apart; angles and
+        Linear between neighbouring samples that know the value and are at most 3 s apart; angles and
         longitude go around the circle by the shorter way. Beyond the ends, and at the edges of longer gaps, a
         value holds for half the usual distance of two samples; farther away it is NaN. Yaw, pitch and roll
         are interpolated one by one, which is right where the camera turns little between samples and does
@@ -138,29 +138,25 @@ class Telemetry(TelemetrySamples):
 
         Args:
             times_s: (m,) seconds on the clock of `self.times_s`, finite, any order.
-            max_gap_s: seconds, not negative.
 
         Raises:
-            InvalidValueError: times not finite, or a negative gap.
+            InvalidValueError: times not finite.
         """
         wanted = frozen_array("Telemetry.at", np.atleast_1d(np.asarray(times_s)), (None,))
-        if not max_gap_s >= 0.0:
-            raise InvalidValueError(f"Telemetry.at: expected a gap of 0 s or more, found {max_gap_s}")
         reach = 0.5 * float(np.median(np.diff(self.times_s))) if len(self) > 1 else 0.0
 
-        def line(values: FloatArray) -> FloatArray:
-            return interpolate(self.times_s, values, wanted, max_gap_s=max_gap_s, reach_s=reach)
-
-        def circle(degrees: FloatArray) -> FloatArray:
-            return interpolate_angles(self.times_s, degrees, wanted, max_gap_s=max_gap_s, reach_s=reach)
+        def line(values: FloatArray, circle: bool = False) -> FloatArray:
+            return interpolate(
+                self.times_s, values, wanted, max_gap_s=_MAX_GAP_S, reach_s=reach, circle=circle
+            )
 
         def turned(degrees: FloatArray) -> FloatArray:
-            return np.stack([circle(degrees[:, axis]) for axis in range(3)], axis=1)
+            return np.stack([line(degrees[:, axis], circle=True) for axis in range(3)], axis=1)
 
         return TelemetrySamples(
             times_s=wanted,
             latitude_deg=line(self.latitude_deg),
-            longitude_deg=circle(self.longitude_deg),
+            longitude_deg=line(self.longitude_deg, circle=True),
             height_m=line(self.height_m),
             relative_height_m=line(self.relative_height_m),
             sigma_m=line(self.sigma_m),

@@ -64,7 +64,7 @@ def decode_text(data: bytes) -> str:
     return data.decode("utf-8-sig", errors="replace")
 
 
-def read_bytes(path: Path, limit: int = MAX_TEXT_BYTES) -> bytes:
+def read_bytes(path: Path) -> bytes:
     """The bytes of a file.
 
     Raises:
@@ -72,12 +72,12 @@ def read_bytes(path: Path, limit: int = MAX_TEXT_BYTES) -> bytes:
     """
     try:
         with path.open("rb") as file:
-            data = file.read(limit + 1)
+            data = file.read(MAX_TEXT_BYTES + 1)
     except OSError as error:
         raise TelemetryError(f"{path}: cannot be read ({error.strerror or error})") from error
-    if len(data) > limit:
+    if len(data) > MAX_TEXT_BYTES:
         raise TelemetryError(
-            f"{path}: expected telemetry of at most {limit // 2**20} MiB, found more; two hours of subtitles "
-            "at 60 frames a second are 130 MB. Cut the file to the part that belongs to the video"
+            f"{path}: expected telemetry of at most {MAX_TEXT_BYTES // 2**20} MiB, found more; two hours of "
+            "subtitles at 60 frames a second are 130 MB. Cut the file to the part that belongs to the video"
         )
     return data
